@@ -1,6 +1,7 @@
-"""What the wheel holds: `warp_lcp`, where `fluids`, `granular` and `benchmarks` are symbolic links to the folders beside it.
+"""Build settings for the wheel of `warp_lcp`.
 
-Git on Windows writes such a link as a file of text; then the folders are taken from where they are.
+`fluids`, `granular` and `benchmarks` in it are symbolic links to the folders beside it. Git on
+Windows writes such a link as a text file; then the packages are taken from these folders.
 """
 
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""What a type checker sees of an installed wheel: `make wheel-check` runs mypy on this file, for which each `ignore` must be of use."""
+"""Type-checking sample for an installed wheel.
+
+`make wheel-check` runs mypy on this file. Each `ignore` in it must be needed.
+"""
 
 from typing import assert_type
 
@@ -16,7 +19,7 @@ assert_type(result.status, wl.SolveStatus)
 
 
 def wrong(scene: LiquidScene, simulator: GranularSimulator) -> None:
-    """Hold what no type checker may let through."""
+    """List calls that a type checker must reject."""
     wl.solve(A, wl.MinimumMapNewton())  # type: ignore[arg-type]
     wl.solve(problem, wl.MinimumMapNewton(), tolerance=1e-6)  # type: ignore[arg-type]
     scene.viscosity_of_honey  # type: ignore[attr-defined]  # noqa: B018

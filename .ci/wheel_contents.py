@@ -1,7 +1,9 @@
-"""Build the wheel from a checkout, from its source distribution and from a checkout without symbolic links, as git makes it on Windows.
+"""Build the wheel in three ways and check its contents.
 
-All three must hold the sources, headers and tables of `warp_lcp`, and nothing else. Run in the
-repository by a Python with setuptools: `python .ci/wheel_contents.py FOLDER`; the wheel goes there.
+The wheel is built from a checkout, from the source distribution, and from a checkout without
+symbolic links, as git makes it on Windows. All three wheels must hold the sources, headers and
+tables of `warp_lcp`, and nothing else. Run this program in the repository by a Python with
+setuptools: `python .ci/wheel_contents.py FOLDER`; the wheel goes into FOLDER.
 """
 
 import shutil
@@ -16,7 +18,7 @@ SHIPPED = (".py", ".h", ".toml", ".html", ".typed")
 
 
 def tracked() -> list[Path]:
-    """Return the files that git knows and the working tree has."""
+    """Return the tracked files that exist in the working tree."""
     names = subprocess.run(
         ["git", "ls-files", "-z"], check=True, capture_output=True, text=True
     ).stdout.split("\0")
@@ -26,7 +28,7 @@ def tracked() -> list[Path]:
 
 
 def copied(tree: Path, *, links: bool) -> Path:
-    """Copy the tracked files; links become files of text unless they stay."""
+    """Copy the tracked files; links become text files unless `links` is set."""
     for name in tracked():
         (tree / name).parent.mkdir(parents=True, exist_ok=True)
         if name.is_symlink() and not links:
@@ -37,7 +39,7 @@ def copied(tree: Path, *, links: bool) -> Path:
 
 
 def built(tree: Path, kind: str, folder: Path) -> Path:
-    """Return the wheel or sdist of a tree, made in a new folder."""
+    """Build a wheel or sdist in a new folder and return its path."""
     folder.mkdir()
     code = f"from setuptools import build_meta; build_meta.build_{kind}({str(folder.resolve())!r})"
     done = subprocess.run(
@@ -49,7 +51,7 @@ def built(tree: Path, kind: str, folder: Path) -> Path:
 
 
 def main(folder: Path) -> None:
-    """Compare what three wheels hold with what git tracks."""
+    """Compare the contents of three wheels with the tracked files."""
     expected = set()
     for name in tracked():
         if (
@@ -69,14 +71,15 @@ def main(folder: Path) -> None:
     for kind, tree in trees.items():
         wheel = built(tree, "wheel", folder / f"wheel-{kind}")
         with ZipFile(wheel) as archive:
-            found = {name for name in archive.namelist() if ".dist-info/" not in name}
-        if found != expected:
+            contents = {name for name in archive.namelist() if ".dist-info/" not in name}
+        if contents != expected:
             sys.exit(
-                f"the wheel of the {kind} lacks {sorted(expected - found)} and has "
-                f"{sorted(found - expected)} besides"
+                f"the wheel of the {kind} lacks {sorted(expected - contents)} and has "
+                f"{sorted(contents - expected)} besides"
             )
     print(
-        f"{wheel.name}: {len(found)} files, all of warp_lcp; the same of a source distribution and "
+        f"{wheel.name}: {len(contents)} files, all of warp_lcp; the same of a source "
+        "distribution and "
         "without symbolic links"
     )
 

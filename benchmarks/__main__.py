@@ -1,4 +1,7 @@
-"""The process that measures: `python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it."""
+"""Benchmark process: measure one suite and write its files.
+
+Run it as `python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it.
+"""
 
 from __future__ import annotations
 
@@ -45,29 +48,29 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--scene", default="")
     parser.add_argument("--seed", type=int)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     suite, report = (
-        importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"),
+        importlib.import_module(f"warp_lcp.benchmarks.{arguments.suite}"),
         importlib.import_module("warp_lcp.benchmarks.harness.report"),
     )
     options = Options(
-        given.device,
-        tuple(given.size),
-        given.repeat,
+        arguments.device,
+        tuple(arguments.size),
+        arguments.repeat,
         lambda text: sys.stderr.write(f"{text}\n"),
-        given.scene,
-        given.seed,
+        arguments.scene,
+        arguments.seed,
     )
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     gc.collect()
-    # searches for arrays (`machine.array_bytes`) pass over the hundreds of thousands of objects
-    # that imports have made
+    # Imports create hundreds of thousands of objects. Frozen, they are skipped by searches for
+    # arrays (`machine.array_bytes`).
     gc.freeze()
     try:
-        results = suite.measure(options, given.out)
+        results = suite.measure(options, arguments.out)
     except MemoryError as error:
         sys.exit(f"out of memory: {error}")
-    for line in report.write(given.suite, suite.TITLE, results, given.out):
+    for line in report.write(arguments.suite, suite.TITLE, results, arguments.out):
         options.say(line)
     for line in results.failures:
         options.say(f"check failed: {line}")

@@ -1,7 +1,8 @@
-"""Digests of what solvers compute on grids, to the last bit: `python -m warp_lcp.benchmarks.bits --out before.txt`, then `diff`.
+"""Digests of solver results on grids, for bit-by-bit comparison.
 
-A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals
-of all iterates; or what it refuses.
+Run `python -m warp_lcp.benchmarks.bits --out before.txt`, and `diff` the file with that of another
+version. There is one line per solve: the problem, the method, its status, steps, a digest of x and
+one of the residuals of all iterates; or the message of a refusal.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SHAPES = {"2-D": (11, 38), "3-D": (9, 14, 21), "long rows": (4, 5, 300), "flat":
 PARTS = ("small", "other", "methods", "frames")
 PRECISIONS = ("mixed", "double", "single")
 STOPPING = wl.StoppingCriteria(rtol=1e-7, max_iterations=12)
-OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # that take other paths
+OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # settings that select other code paths
     "accelerated-projected-gradient": ({"lipschitz": 20.0},),
     "fischer-newton": (
         {"fischer_weight": 0.9},
@@ -53,20 +54,20 @@ OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # that take other pat
     "psor": ({"direction": "forward"}, {"direction": "symmetric", "omega": 1.5}),
     "subspace-minimization": ({"sweeps": 1},),
 }
-# resolution, seconds
+# Resolution and simulated seconds of each scene.
 SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse": (16, 0.02)}
 
 
-SEED = 0  # added to those of all problems
+SEED = 0  # added to the seeds of all problems
 
 
 def generator(seed: int) -> np.random.Generator:
-    """Return a generator of a problem's numbers."""
+    """Return a random generator for a problem."""
     return np.random.default_rng(seed + SEED)
 
 
 def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
-    """Return lower and upper bounds of each kind that kernels tell apart."""
+    """Return lower and upper bounds of each kind that the kernels distinguish."""
     rng = generator(2718)
     low, high, some = -rng.random(shape), rng.random(shape), rng.random(shape) < 0.3
     return {
@@ -83,7 +84,7 @@ def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
 
 
 def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
-    """Return coefficients of each form: one, a number an axis, arrays."""
+    """Return face coefficients of each form: 1, one number per axis, arrays."""
     rng, names = generator(31), "xyz"[: len(shape)]
     axes = enumerate(reversed(names))
     arrays = {
@@ -93,7 +94,10 @@ def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
 
 
 def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
-    """Yield name, problem, method and start on small random sets of cells: all forms of storage, sides and bounds."""
+    """Yield name, problem, method and start on small random sets of cells.
+
+    They cover all forms of storage, sides and bounds.
+    """
     for (name, shape), form, real in itertools.product(
         SHAPES.items(), ("unit", "number", "arrays"), (wp.float32, wp.float64)
     ):
@@ -118,7 +122,7 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                 periodic=periodic,
                 **({} if form == "arrays" else faces),
             )
-            for made in (
+            for solver in (
                 wl.ProjectedMultigrid(),
                 wl.MinimumMapNewton(),
                 wl.MinimumMapNewton(precision="single"),
@@ -126,13 +130,13 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                 yield (
                     f"{name} {form} {real.__name__} periodic {periodic}",
                     wl.LCP(A, b, *bounds["coded twice"]),
-                    made,
+                    solver,
                     None,
                 )
 
 
 def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
-    """Yield solves of what lies around those: splashes, closed boxes, low rank, other methods on the same kernels."""
+    """Yield solves of splashes, closed boxes, low-rank terms and other methods."""
     box, shape = np.full((8, 9, 20), wl.FLUID), (8, 9, 20)
     b = generator(5).standard_normal(shape)
     columns = np.zeros((*shape, 2))
@@ -145,14 +149,14 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
             wl.InteriorPoint,
             wl.FischerNewton,
         ):
-            made = method(precision=precision)
+            solver = method(precision=precision)
             for kind in ("walls", "everywhere", "linear"):
-                yield f"splash 32 {kind}", splash(32).lcp(kind, device="cpu"), made, None
-            yield "cut splash 32", cut_cells(splash(32)).lcp("walls", device="cpu"), made, None
+                yield f"splash 32 {kind}", splash(32).lcp(kind, device="cpu"), solver, None
+            yield "cut splash 32", cut_cells(splash(32)).lcp("walls", device="cpu"), solver, None
             yield (
                 "closed box",
                 wl.LCP(wl.GridPoisson(box, device="cpu"), b - b.mean(), 0.0),
-                made,
+                solver,
                 None,
             )
         low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu")
@@ -167,7 +171,10 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
 
 
 def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
-    """Yield every method on grids, matrices and user-made operators that are small enough for it, with bounds of each kind."""
+    """Yield every method on small grids, matrices and user-defined operators.
+
+    The bounds are of each kind. A method is left out where the problem is too large for it.
+    """
     for (what, make, shape), kind in itertools.product(
         _operators(), ("none", "number", "coded", "fields")
     ):
@@ -220,14 +227,14 @@ def _operators() -> Iterator[tuple[str, Any, tuple[int, ...]]]:
 
 
 def _variants(name: str, method: Any) -> list[Any]:
-    """Return a method with each precision, and with settings that take other paths."""
+    """Return a method in each precision, and with its OTHER_SETTINGS."""
     chosen = any(field.name == "precision" for field in dataclasses.fields(method))
     made = [method(precision=p) for p in PRECISIONS] if chosen else [method()]
     return made + [method(**settings) for settings in OTHER_SETTINGS.get(name, ())]
 
 
 def line(what: str, problem: wl.LCP, method: Any, start: Any) -> str:
-    """Solve, and return the line."""
+    """Solve a problem and return its line."""
     called = f"{type(method).__name__} {getattr(method, 'precision', '')}".strip()
     try:
         result = wl.solve(problem, method, stopping=STOPPING, x0=start)
@@ -242,7 +249,7 @@ def line(what: str, problem: wl.LCP, method: Any, start: Any) -> str:
 
 
 def frames(name: str, resolution: int, duration: float) -> str:
-    """Run a scene, and return a line with a digest of its frames."""
+    """Run a scene and return a line with a digest of its frames."""
     with tempfile.TemporaryDirectory() as out:
         scene = load_scene(name, [f"domain.resolution={resolution}", f"time.duration={duration}"])
         run_scene(
@@ -261,7 +268,7 @@ def _digest(*parts: Any) -> str:
 
 
 def main() -> None:
-    """Write the lines."""
+    """Write all lines."""
     parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.bits", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--part", choices=PARTS, action="append")

@@ -1,4 +1,4 @@
-"""One case of the suite `solvers`: a scene, bounds, a method, and everything that is measured of it."""
+"""One case of the suite `solvers`: scene, bounds, method and its measurements."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
 
 RTOL = 1e-6
-# a method alone may creep for hundreds of steps, and its residual rise for more than the usual
-# patience
+# A method without fallbacks may need hundreds of steps, and its residual may rise for more steps
+# than the default patience allows.
 STOPPING = wl.StoppingCriteria(rtol=RTOL, max_iterations=1000, patience=1000)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
-MIDST = 3  # iterations after which a method has made all of its buffers
+MIDST = 3  # iterations after which a method has allocated all of its buffers
 
 
 @dataclass
 class Case:
-    """A solve that is measured again and again."""
+    """Solve that is measured repeatedly."""
 
     form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`
     scene: Splash  # the scene
-    bounds: str  # which unknowns have p >= 0
+    bounds: str  # unknowns with p >= 0: a name of BOUNDS
     solver: Any  # settings of the method
     device: str  # Warp device
     full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
-    label: str = ""  # what the method is called; its class's name if empty
-    operator: Callable[..., Any] = wl.GridPoisson  # of cells, a device and coefficients of faces
+    label: str = ""  # display name of the method; its class name if empty
+    # Makes the operator from cells, a device and face coefficients.
+    operator: Callable[..., Any] = wl.GridPoisson
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)
@@ -44,26 +45,26 @@ class Case:
 
     @property
     def method(self) -> str:
-        """What the method is called."""
+        """Display name of the method."""
         return self.label or type(self.solver).__name__
 
     @property
     def size(self) -> str:
-        """Cells along a side to the number of axes."""
+        """Cells along a side to the power of the number of axes."""
         return f"{self.scene.n}^{self.scene.cells.ndim}"
 
     @property
     def name(self) -> str:
-        """Unique among the cases."""
+        """Name of the case, unique among the cases."""
         return f"{self.size} {self.form} {self.bounds} {self.method}"
 
     @property
     def cells(self) -> int:
-        """Cells of the grid, of all types."""
+        """Number of grid cells of all types."""
         return int(self.scene.cells.size)
 
     def cold(self, *, keep: bool) -> None:
-        """Build operator, problem and workspace from host arrays and solve: a user's first solve. All in one sample."""
+        """Solve cold, all in one sample: operator, problem and workspace from host arrays."""
         lower = self.scene.lower(self.bounds)
         times = [time.perf_counter()]
         A = self.operator(self.scene.cells, device=self.device, **self.scene.faces)
@@ -89,7 +90,7 @@ class Case:
             self.samples["total"].append(times[4] - times[0])
 
     def again(self, *, keep: bool) -> None:
-        """Solve with a workspace that has solved before: cold, and warm after b changed by 1 %."""
+        """Solve with a used workspace: cold, then warm after b changed by 1 %."""
         if self._warm is None:
             self._warm = self._solves()
         for label in ("reuse", "warm"):
@@ -99,7 +100,10 @@ class Case:
                 self.samples[label].append(seconds)
 
     def _solves(self) -> Iterator[tuple[float, int]]:
-        """Yield seconds and iterations of a cold solve, a warm solve, and so on, in place and with one workspace."""
+        """Yield seconds and iterations of cold and warm solves in turn.
+
+        The solves are in place and use one workspace.
+        """
         problem, b = self._in_place()
         work, fields = (
             self.solver.init(problem),
@@ -108,7 +112,7 @@ class Case:
         start, turn = wp.zeros_like(b), 0
         while True:
             for warm in (False, True):
-                begun = time.perf_counter()
+                start_time = time.perf_counter()
                 result = wl.solve(
                     problem,
                     self.solver,
@@ -117,14 +121,17 @@ class Case:
                     workspace=work,
                 )
                 wp.synchronize_device(self.device)
-                yield time.perf_counter() - begun, result.iterations
+                yield time.perf_counter() - start_time, result.iterations
                 if not warm:
                     wp.copy(start, result.x)
                     turn += 1
                     wp.copy(b, fields[turn % 2])
 
     def memory(self) -> None:
-        """Count the bytes of operator, problem and workspace, b and the bounds included: in the midst of a solve in place, and after it."""
+        """Count the bytes of operator, problem and workspace, b and the bounds included.
+
+        They are counted during a solve in place, and after it.
+        """
         forget_peak()
         before, resident, most = array_bytes(), resident_bytes(), list[int]()
         problem, _ = self._in_place()
@@ -140,7 +147,10 @@ class Case:
         self.counts["resident_per_cell"] = max(0, resident_bytes(peak=True) - resident) / self.cells
 
     def to_tolerances(self) -> None:
-        """Solve cold to the tightest tolerance and keep the history; set-up is added later."""
+        """Solve cold to the tightest tolerance and keep the history.
+
+        The time of the set-up is added later.
+        """
         problem = self.scene.lcp(self.bounds, device=self.device)
         work = self.solver.init(problem)
         result = wl.solve(
@@ -156,7 +166,7 @@ class Case:
                 self.samples[f"to_{tolerance:.0e}"].append(reached[0].seconds)
 
     def figures(self) -> dict[str, Figure]:
-        """Return what was measured."""
+        """Return all measured figures."""
         figures = {name: Figure.of(times, "s") for name, times in self.samples.items()}
         figures |= {
             name: Figure(value, "B" if "per_cell" in name else "")
@@ -165,7 +175,10 @@ class Case:
         return figures
 
     def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:
-        """Return the problem with b in the stored layout, as a time-stepping code has it, and b."""
+        """Return the problem with b in the stored layout, and b.
+
+        Time-stepping codes keep b in this layout.
+        """
         b = self._stored(self.scene.b)
         return self.scene.lcp(self.bounds, device=self.device, b=b), b
 

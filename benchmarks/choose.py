@@ -1,10 +1,10 @@
-"""Suite `choose`: rules of `wl.recommend` against every method that takes a problem, on random problems by kind and seed.
+"""Suite `choose`: rules of `wl.recommend` against all applicable methods.
 
-Each method solves each problem cold, set-up included, to the same relative residual. The methods of
-a problem take turns. A rule is judged by the share of its problems that its method solves, by that
-method's time over the best method's, and by what its alternatives add.
-`docs/generate/choice_figures.py` writes the table of docs/choosing-a-method.md from the kept
-results.
+The problems are random, drawn by kind and seed. Each method solves each problem cold, set-up
+included, to the same relative residual. The methods of a problem take turns. A rule is judged by
+three figures: the share of its problems that its method solves, the method's time over that of the
+best method, and the problems that only its alternatives solve. `docs/generate/choice_figures.py`
+writes the table of docs/choosing-a-method.md from the stored results.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from warp_lcp.recommend import Recommendation, memory_of
 from warp_lcp.rules import RULES, method_for, steps_allowed
 
 TITLE = "Rules that choose a method"
-SEED = 860  # first one; tests draw other seeds
+SEED = 860  # first seed; the tests draw other seeds
 RTOL = 1e-6
-LONGEST = 4.0  # [s] of one trial
+LONGEST = 4.0  # [s] limit of one trial
 ROUNDS = 2  # samples of each method after its first trial, which loads kernels
-# a method slower than NEAR times the fastest and than BRIEF [s] keeps its first trial's time
+# A method slower than NEAR times the fastest and than BRIEF [s] keeps the time of its first trial.
 NEAR, BRIEF = 4.0, 5e-3
-# a choice is right within this factor of the best method, or within so many seconds
+# A choice is right within this factor of the best method, or within this many seconds.
 SLOWER, NEGLIGIBLE = 2.0, 5e-4
 BUDGETS = (5, 20, 100)  # steps
-DEFAULT = "default"  # `wl.solve` without a method: the rule's method, then its alternatives
+DEFAULT = "default"  # `wl.solve` without a method: the method of the rule, then its alternatives
 
 
 @dataclass
@@ -56,7 +56,7 @@ class Trial:
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Solve `repeat` problems of each kind by every method that takes them."""
+    """Solve `repeat` problems of each kind by every applicable method."""
     seed = SEED if options.seed is None else options.seed
     records = [machine(options.device, repeat=options.repeat)]
     for kind in (*KINDS, *RARE):
@@ -69,7 +69,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def problem_record(name: str, problem: wl.LCP, device: str) -> Record:
-    """Return times and outcomes of all methods on a problem, and the rule that applies to it."""
+    """Return times and outcomes of all methods on a problem, and the applicable rule."""
     advice = wl.recommend(problem, accuracy=RTOL)
     trials = try_methods(problem, advice, device)
     t = advice.traits
@@ -96,12 +96,15 @@ def problem_record(name: str, problem: wl.LCP, device: str) -> Record:
 
 
 def rule_number(advice: Recommendation) -> int:
-    """Return the place of a recommendation's rule in the decision list, from 1 on."""
+    """Return the number of a recommendation's rule in the decision list, from 1 on."""
     return 1 + next(i for i, rule in enumerate(RULES) if advice.reasons[0] == f"{rule.reason}.")
 
 
 def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[str, Trial]:
-    """Return the trials by method: one each, then ROUNDS interleaved samples of those near the fastest."""
+    """Return the trials by method: one each, then ROUNDS interleaved samples.
+
+    Only methods near the fastest get interleaved samples.
+    """
     t = advice.traits
 
     def solver(name: str) -> Callable[[], wl.SolveResult]:
@@ -150,10 +153,10 @@ def sample(trial: Trial, solve: Callable[[], wl.SolveResult], device: str) -> No
 
 
 def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
-    """Return the method for each budget of steps, and for the memory that sweeps take."""
-    if advice.traits.affine:  # one method whatever the budget
+    """Return the method for each step budget, and for the memory of sweeps."""
+    if advice.traits.affine:  # the method does not depend on the budget
         return {}
-    found = {
+    recommended = {
         f"{steps} steps": wl.recommend(
             problem, accuracy=RTOL, budget=wl.Budget(iterations=steps)
         ).name
@@ -161,7 +164,7 @@ def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
     }
     lean = memory_of("psor", advice.traits)
     return {
-        **found,
+        **recommended,
         "memory of a sweep": wl.recommend(
             problem, accuracy=RTOL, budget=wl.Budget(bytes=lean)
         ).name,
@@ -169,7 +172,7 @@ def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
 
 
 def solved_by(record: Record) -> dict[str, float]:
-    """Return the seconds of the methods that solved a problem, the default apart."""
+    """Return the seconds of the methods that solved a problem, the default excluded."""
     status: Mapping[str, str] = record.facts["status"]
     names = (
         name for name, s in status.items() if s == wl.SolveStatus.CONVERGED.name and name != DEFAULT
@@ -178,7 +181,7 @@ def solved_by(record: Record) -> dict[str, float]:
 
 
 def over_best(record: Record, name: str) -> float | None:
-    """Return a method's time over the best method's; None if it has not solved the problem."""
+    """Return a method's time over that of the best method; None if it failed."""
     solved, status = solved_by(record), record.facts["status"]
     if status.get(name) != wl.SolveStatus.CONVERGED.name:
         return None
@@ -187,7 +190,7 @@ def over_best(record: Record, name: str) -> float | None:
 
 
 def is_right(record: Record, name: str) -> bool:
-    """Return whether a method solved a problem nearly as fast as the best."""
+    """Return whether a method solved a problem nearly as fast as the best method."""
     ratio = over_best(record, name)
     if ratio is None:
         return False
@@ -196,7 +199,11 @@ def is_right(record: Record, name: str) -> bool:
 
 
 def rule_row(number: int, records: Sequence[Record]) -> list[str]:
-    """Return a rule's row: problems, solved, time over the best, the best methods, what alternatives add, and the default."""
+    """Return the table row of a rule.
+
+    The columns are problems, solved, time over the best, the best methods, the gain of the
+    alternatives, and the default.
+    """
     own = [r for r in records if r.facts["rule"] == number]
     method = RULES[number - 1].method
     if not own:
@@ -277,7 +284,11 @@ def kind_table(records: Sequence[Record]) -> Table:
 
 
 def budget_table(records: Sequence[Record]) -> Table:
-    """Return a row for each budget: how often the method recommended for it solves within it, and how often any method can."""
+    """Return a row for each step budget.
+
+    The row says how often the recommended method solves within the budget, and how often any method
+    can.
+    """
     rows = []
     for budget in (*(f"{steps} steps" for steps in BUDGETS), "memory of a sweep"):
         own = [r for r in records if budget in r.facts["budgets"]]

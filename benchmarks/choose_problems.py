@@ -1,7 +1,6 @@
-"""Random problems by kind and seed, on which rules of `wl.recommend` are measured and tested.
+"""Random problems by kind and seed, to measure and test rules of `wl.recommend`.
 
-Sizes are spread evenly in their logarithm. The seed chooses shares, conditions, bounds and the
-accuracy, too.
+Sizes are log-uniform. The seed also chooses shares, condition numbers, bounds and the accuracy.
 """
 
 from __future__ import annotations
@@ -24,29 +23,33 @@ DEVICE = "cpu"
 
 
 def choices(seed: int) -> np.random.Generator:
-    """Return random numbers that choose a problem, independent of those that fill it."""
+    """Return a generator for the choices, independent of the problem's data."""
     return np.random.default_rng([seed, 331])
 
 
 def accuracy_of(seed: int) -> float:
-    """Return the relative residual that a problem is solved to."""
+    """Return the relative residual of a problem's solves."""
     return float(np.random.default_rng([seed, 332]).choice(ACCURACIES))
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> int:
-    """Return an integer in [low, high], evenly spread in its logarithm."""
+    """Return a log-uniform integer in [low, high]."""
     return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
 
 def plant(rng: np.random.Generator) -> Plant:
-    """Return a way to plant: a share of active unknowns, sometimes boxes, weak unknowns, equations."""
+    """Return options for a planted solution.
+
+    They choose a share of active unknowns and, sometimes, boxes, weakly active unknowns and
+    equations.
+    """
     boxed = bool(rng.random() < 0.3)
     weak, mixed = (float(rng.random() < 0.2) * float(rng.uniform(0, 0.5)) for _ in range(2))
     return Plant(active=float(rng.uniform(0.1, 0.7)), boxed=boxed, weak=weak, mixed=mixed)
 
 
 def grid(rng: np.random.Generator, seed: int, shape: tuple[int, ...]) -> Problem:
-    """Return a planted Poisson problem, sometimes with holes, solids and random coefficients."""
+    """Return a planted Poisson problem, sometimes with holes, solids and coefficients."""
     holes = float(rng.random() < 0.5)
     coefficients = "random" if rng.random() < 0.4 else "uniform"
     return gallery.poisson(
@@ -68,7 +71,10 @@ def liquid(rng: np.random.Generator, most: int) -> Problem:
 
 
 def convection(m: int, wind: float, *, upwind: bool) -> scipy.sparse.csr_array:
-    """Return diffusion and convection along both axes on m^2 cells: upwind differences make it an M-matrix, centered ones need not."""
+    """Return convection-diffusion on m^2 cells.
+
+    Upwind differences make the matrix an M-matrix; centered ones need not.
+    """
     L = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
     C = scipy.sparse.diags_array(
         [-2.0, 2.0, 0.0] if upwind else [-1.0, 0.0, 1.0], offsets=[-1, 0, 1], shape=(m, m)
@@ -95,7 +101,10 @@ def flow(rng: np.random.Generator, seed: int) -> Problem:
 
 
 def sparse_squares(rng: np.random.Generator, seed: int) -> Problem:
-    """Return J J' with sparse J of fewer columns than rows, or as many, plus a small multiple of I: semi-definite or badly conditioned."""
+    """Return J J' plus a small multiple of I, J sparse with at most n columns.
+
+    The matrix is semi-definite or ill-conditioned.
+    """
     n, filler = between(rng, 30, 2000), np.random.default_rng(seed)
     J = scipy.sparse.random_array(
         (n, max(2, int(n * rng.uniform(0.5, 1.2)))), density=min(1.0, 4 / n), rng=filler
@@ -112,7 +121,10 @@ def sparse_squares(rng: np.random.Generator, seed: int) -> Problem:
 
 
 def sparse_unsymmetric(rng: np.random.Generator, seed: int) -> Problem:
-    """Return a random sparse matrix with signs and a dominant diagonal: a P-matrix, no M-matrix."""
+    """Return a random sparse P-matrix that is no M-matrix.
+
+    Its entries have random signs and its diagonal is dominant.
+    """
     n, filler = between(rng, 30, 10000), np.random.default_rng(seed)
     R = scipy.sparse.random_array((n, n), density=min(0.5, 5 / n), rng=filler)
     R.data -= 0.5
@@ -132,13 +144,13 @@ def sparse_unsymmetric(rng: np.random.Generator, seed: int) -> Problem:
 def scene(rng: np.random.Generator, seed: int, model: object) -> Problem:
     """Return a contact problem of a scene with bodies that rest or begin to move."""
     name = str(rng.choice([n for n in SCENES if n not in ("driven-gears",)]))
-    # odd: an arch has a link on top
+    # Odd: an arch needs a keystone.
     size = None if rng.random() < 0.4 else between(rng, 1, 3) * 2 + 1
     return contact_scene(name, size, model=model, seed=seed)  # type: ignore[arg-type]
 
 
 def frozen(rng: np.random.Generator, seed: int) -> Problem:
-    """Return a scene's contacts with constant boxes for friction: symmetric, semi-definite, sparse."""
+    """Return contacts with constant friction boxes: symmetric, semi-definite, sparse."""
     p = scene(rng, seed, None)
     normal = np.abs(rng.standard_normal(len(p.b)))
     low, high = p.lower.at(normal), p.upper.at(normal)
@@ -148,7 +160,7 @@ def frozen(rng: np.random.Generator, seed: int) -> Problem:
 
 
 def bodies_in_liquid(rng: np.random.Generator) -> wl.LCP:
-    """Return a splash with rigid columns of low rank added: products only."""
+    """Return a splash with a low-rank term of rigid bodies: matrix products only."""
     splash = gallery.splash(between(rng, 8, 20), phase=float(rng.random()))
     A = wl.GridPoisson(splash.cells, device=DEVICE, dtype=wp.float64)
     columns = np.zeros((*splash.cells.shape, 3))
@@ -225,7 +237,7 @@ FAMILIES: dict[str, Make] = {
 
 
 def make(family: str, seed: int) -> tuple[str, wl.LCP, float]:
-    """Return a problem's name, the problem and the accuracy asked for."""
+    """Return a problem's name, the problem and its required accuracy."""
     number = 1000 * list(FAMILIES).index(family) + seed
     made = FAMILIES[family](choices(number), number)
     if isinstance(made, wl.LCP):
@@ -254,7 +266,7 @@ def support_vectors(rng: np.random.Generator) -> wl.LCP:
 
 
 def portfolio(rng: np.random.Generator) -> wl.LCP:
-    """Return Markowitz's problem, the multiplier of sum x = 1 as last unknown."""
+    """Return Markowitz's problem; the last unknown is the multiplier of sum x = 1."""
     n, d = between(rng, 20, 200), between(rng, 2, 10)
     F = rng.standard_normal((n, d))
     A = np.zeros((n + 1, n + 1))
@@ -275,7 +287,7 @@ def game(rng: np.random.Generator) -> wl.LCP:
 
 
 def linear_program(rng: np.random.Generator) -> wl.LCP:
-    """Return min c'z, G z >= h, z >= 0 with its dual, a skew LCP; both are feasible."""
+    """Return min c'z, G z >= h, z >= 0 with its dual, a skew LCP; both feasible."""
     n, m = between(rng, 5, 80), between(rng, 3, 60)
     G = rng.standard_normal((m, n))
     z, multipliers = (np.maximum(rng.standard_normal(size), 0.0) for size in (n, m))
@@ -300,7 +312,7 @@ def p_matrix(rng: np.random.Generator, seed: int) -> wl.LCP:
 
 
 def laplacian(rng: np.random.Generator) -> wl.LCP:
-    """Return the Laplacian of a random graph, singular, under loads that bounds carry."""
+    """Return the singular Laplacian of a random graph; bounds carry the loads."""
     n = between(rng, 50, 3000)
     ends = rng.integers(0, n, (2, 2 * n))
     ends = ends[:, ends[0] != ends[1]]
@@ -324,22 +336,22 @@ def stack(rng: np.random.Generator, seed: int) -> wl.LCP:
 
 
 def products(rng: np.random.Generator, seed: int) -> wl.LCP:
-    """Return a problem whose matrix shows its products only."""
+    """Return a problem whose operator offers matrix products only."""
     n = between(rng, 20, 400)
-    made = gallery.definite(
+    problem = gallery.definite(
         n, condition=10.0 ** float(rng.uniform(0, 3)), plant=plant(rng), seed=seed
     )
-    A = np.asarray(made.A)
+    A = np.asarray(problem.A)
     return wl.LCP(
         wl.LinearOperator(lambda x: A @ x, shape=(n,), symmetric=True),
-        made.b,
-        made.lower,
-        made.upper,
+        problem.b,
+        problem.lower,
+        problem.upper,
     )
 
 
 def membrane(rng: np.random.Generator) -> wl.LCP:
-    """Return a membrane under a load: a sparse Laplacian, shifted unevenly."""
+    """Return a membrane under a load: a sparse Laplacian with an uneven shift."""
     m = between(rng, 8, 90)
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
     weights = scipy.sparse.diags_array(rng.uniform(0.5, 2, m * m))
@@ -371,14 +383,14 @@ KINDS: dict[str, Make] = {  # problems of many fields; all have solutions
 
 
 def sign_error(rng: np.random.Generator, low: int, high: int) -> wl.LCP:
-    """Return -A of a definite A without upper bounds: no descent method can solve it."""
+    """Return -A of a definite A without upper bounds, unsolvable by descent methods."""
     n = between(rng, low, high)
     A = scipy.sparse.diags_array([1.0, -4.0, 1.0], offsets=[-1, 0, 1], shape=(n, n))
     return wl.LCP(scipy.sparse.csr_array(A), rng.standard_normal(n))
 
 
 def negative_diagonal(rng: np.random.Generator, seed: int, *, boxed: bool) -> Problem:
-    """Return a dense random matrix with some negative diagonal entries, and a planted solution."""
+    """Return a dense random matrix with negative diagonal entries, planted solution."""
     n = between(rng, 5, 40)
     A = rng.standard_normal((n, n)) + np.diag(np.where(rng.random(n) < 0.2, -1.0, 3.0) * n**0.5)
     A[0, 0] = -1.0
@@ -392,7 +404,10 @@ def negative_diagonal(rng: np.random.Generator, seed: int, *, boxed: bool) -> Pr
 
 
 def sparse_negative_diagonal(rng: np.random.Generator) -> wl.LCP:
-    """Return a random symmetric sparse matrix with a negative diagonal entry in one row of twenty, in a box."""
+    """Return a boxed random symmetric sparse matrix with negative diagonal entries.
+
+    One row of twenty has a negative diagonal entry.
+    """
     n = between(rng, 300, 4000)
     R = scipy.sparse.random_array((n, n), density=4 / n, rng=rng, data_sampler=rng.standard_normal)
     d = rng.uniform(0.5, 3.0, n)
@@ -406,7 +421,7 @@ def sparse_negative_diagonal(rng: np.random.Generator) -> wl.LCP:
 
 
 def wind(rng: np.random.Generator) -> wl.LCP:
-    """Return upwind convection and diffusion on a grid above an obstacle: an unsymmetric stencil."""
+    """Return upwind convection-diffusion above an obstacle: an unsymmetric stencil."""
     m, peclet = between(rng, 16, 128), 10.0 ** float(rng.uniform(-1, 2))
     stencil = np.array(
         [[0.0, -1.0, 0.0], [-1.0 - peclet, 4.0 + 2 * peclet, -1.0], [0.0, -1.0 - peclet, 0.0]]
@@ -418,7 +433,10 @@ def wind(rng: np.random.Generator) -> wl.LCP:
 
 
 def dominant(rng: np.random.Generator, seed: int) -> Problem:
-    """Return a random sparse matrix whose diagonal is two to four times the rest of its row: sweeps converge fast."""
+    """Return a random sparse matrix with a dominant diagonal.
+
+    The diagonal is two to four times the rest of its row, so that sweeps converge fast.
+    """
     n, filler = between(rng, 300, 20000), np.random.default_rng(seed)
     R = scipy.sparse.random_array((n, n), density=5 / n, rng=filler)
     R.data -= 0.5
@@ -435,14 +453,15 @@ def dominant(rng: np.random.Generator, seed: int) -> Problem:
 
 
 def large_game(rng: np.random.Generator) -> wl.LCP:
-    """Return a matrix game and its dual, a skew LCP, dense, with 410 to 500 unknowns."""
+    """Return a matrix game and its dual: a dense skew LCP of 410 to 500 unknowns."""
     n = int(rng.integers(205, 250))
     payoff = rng.uniform(1, 2, (n, n))
     A = np.block([[np.zeros((n, n)), payoff], [-payoff.T, np.zeros((n, n))]])
     return wl.LCP(A, np.concatenate([-np.ones(n), np.ones(n)]))
 
 
-RARE: dict[str, Make] = {  # for rules that no kind above meets; sign errors may have no solution
+# For rules that no kind above meets; problems of sign errors may have no solution.
+RARE: dict[str, Make] = {
     "sign error": lambda r, s: sign_error(r, 10, 500),
     "large sign error": lambda r, s: sign_error(r, 1001, 3000),
     "negative diagonal": lambda r, s: negative_diagonal(r, s, boxed=False),

@@ -1,4 +1,8 @@
-"""Steps of many spheres in a box, by methods in turns from the same state: seconds of a step and of its solve, residual, overlap."""
+"""Steps of many spheres in a box: methods compared from the same state.
+
+The methods take turns. Measured are the seconds of a step and of its solve, the residual and the
+overlap of the spheres.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +21,21 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.scene.scene_file import load_scene
 
-SPHERES, SIDE = 1000, 10  # and how many lie along a side of the box
-# steps until they have fallen onto each other, steps measured, and their length [s]
+SPHERES, SIDE = 1000, 10  # number of spheres, and spheres along a side of the box
+# Steps until the spheres have fallen onto each other, measured steps, and their length [s].
 SETTLING, STEPS, DT = 40, 5, 0.005
-RADIUS, APART = 0.05, 0.115  # [m]: the largest, and from center to center at first
-# of the solves; boxes of friction may take as many iterations as they need
+RADIUS, APART = 0.05, 0.115  # [m] largest radius, and initial distance of centers
+# Tolerance and most iterations of a solve; friction boxes may take as many as they need.
 TOLERANCE, MOST = 1e-5, 3000
 METHODS = ("psor", "nncg", "proximal-gauss-seidel")
-SHARE = 0.15  # of the time of PSOR's steps
+SHARE = 0.15  # largest share of the time of PSOR's steps
 
 
 def spheres(method: str) -> dict[str, Any]:
-    """Return the scene: spheres of 9 to 10 cm on a lattice, a bit off their places, that fall onto each other."""
+    """Return the scene: spheres of 9 to 10 cm that fall onto each other.
+
+    They start on a lattice, slightly displaced.
+    """
     rng, solids = np.random.default_rng(0), []
     for number in range(SPHERES):
         layer, place = divmod(number, SIDE * SIDE)
@@ -54,7 +61,7 @@ def spheres(method: str) -> dict[str, Any]:
 
 
 class _Timed:
-    """A method of contacts whose solves are timed."""
+    """Contact method whose solves are timed."""
 
     def __init__(self, solver: Any) -> None:
         self.solver, self.seconds = solver, 0.0
@@ -75,23 +82,26 @@ def overlap(bodies: RigidBodies) -> float:
 
 
 def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
-    """Return what steps take by each method: all take the same step from the same state, in turns; the last method's is kept."""
-    made, timed = {}, {}
+    """Return the cost of steps by each method, by interleaved timing.
+
+    All methods take the same step from the same state. The result of the last method is kept.
+    """
+    simulations, timed = {}, {}
     for method in METHODS:
         options.say(f"{SPHERES} spheres in a box: {method}")
-        made[method] = SIMULATOR.create(
+        simulations[method] = SIMULATOR.create(
             load_scene(spheres(method)), device=options.device, folder=Path()
         )
-        solve = made[method].bodies._solve
+        solve = simulations[method].bodies._solve
         solve._solver = timed[method] = _Timed(solve._solver)
-    last = made[METHODS[-1]]
+    last = simulations[METHODS[-1]]
     for _ in range(SETTLING):
         last.step(DT)
-    found: dict[str, dict[str, list[float]]] = {method: defaultdict(list) for method in METHODS}
-    for number in range(-1, STEPS):  # the first one loads kernels
+    samples: dict[str, dict[str, list[float]]] = {method: defaultdict(list) for method in METHODS}
+    for number in range(-1, STEPS):  # the first step loads kernels
         state = last.state()
         for method in METHODS:
-            simulation, timed[method].seconds = made[method], 0.0
+            simulation, timed[method].seconds = simulations[method], 0.0
             simulation.restore(state)
             begun = time.perf_counter()
             row = simulation.step(DT)
@@ -107,8 +117,8 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
             }
             figures |= {"contacts": float(row["contacts"] or 0)}
             for name, value in figures.items() if number >= 0 else ():
-                found[method][name].append(value)
-    return _reported(found)
+                samples[method][name].append(value)
+    return _reported(samples)
 
 
 def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], Table]:

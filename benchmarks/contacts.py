@@ -1,4 +1,7 @@
-"""Rigid contacts: methods on the scenes of figures 2.9 and 2.11, residual against sweeps and seconds as figures 2.10 and 2.12 have it."""
+"""Rigid contacts: residuals of methods on the scenes of [Book] figures 2.9, 2.11.
+
+The residual is recorded against sweeps and seconds, as in figures 2.10 and 2.12.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +26,15 @@ from warp_lcp.gallery.rigid_world import Assembly, World
 
 TITLE = "Rigid contacts: the scenes of figures 2.9 and 2.11"
 DT = 0.01  # [s]
-# of PGS and NNCG, as in figure 2.12; other sweeping methods get as many, or what costs as much
+# Sweeps of PGS and NNCG, as in figure 2.12; other sweeping methods get as many, or an equal cost.
 SWEEPS = 5000
-TOLERANCE = 1e-13  # of the residual at x = 0: curves end there
+TOLERANCE = 1e-13  # share of the residual at x = 0; curves end there
 RATIOS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
-EQUAL = (200, 1000, 5000)  # sweeps at which NNCG and PGS are compared
-TARGET = 10.0  # how many times smaller the residual of NNCG should be than that of PGS
+EQUAL = (200, 1000, 5000)  # sweeps after which NNCG and PGS are compared
+TARGET = 10.0  # required ratio of PGS's residual to NNCG's
 DRAWN = ("box-stack", "wall", "heavy-on-light", "hanging-snake")  # scenes whose residuals are drawn
 STACKS = ("box-stack", "sphere-stack", "wall", "leaning-wall", "heavy-on-light")
-# unknowns of a Stewart-Trinkle problem up to which Lemke's method and Newton's are waited for
+# Most unknowns of a Stewart-Trinkle problem that Lemke's method and Newton's method solve.
 LARGEST_LCP = 1500
 
 BOXED: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
@@ -54,7 +57,10 @@ LCP: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Solve every scene's problem by every method; then the heavy box at growing mass ratios by PGS and NNCG."""
+    """Solve the problem of every scene by every method.
+
+    Then solve the heavy box at growing mass ratios by PGS and NNCG.
+    """
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
     solves: list[Record] = []
     charts: list[Chart] = []
@@ -77,7 +83,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def next_step(name: str, device: str) -> Assembly:
-    """Return the velocity problem of a scene's next step, after it has settled where it needs to."""
+    """Return the velocity problem of a scene's next step, settled first where needed."""
     world: World = SCENES[name]()
     stepper = ContactStepper(world, wl.NNCG(), dt=DT, device=device)
     for _ in range(SETTLING.get(name, 0)):
@@ -86,7 +92,10 @@ def next_step(name: str, device: str) -> Assembly:
 
 
 def unhindered(most: int, tolerance: float = TOLERANCE) -> wl.StoppingCriteria:
-    """Return criteria that let a method go on whatever its residual does: spikes are part of the picture."""
+    """Return criteria that never stop a method early.
+
+    Spikes of the residual are part of the plots.
+    """
     return wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most, divergence=1e30)
 
 
@@ -96,22 +105,25 @@ Curve = tuple[list[float], list[float]]
 def _scene(
     name: str, system: ContactSystem, options: Options, solves: list[Record]
 ) -> dict[str, Curve]:
-    """Solve a scene by all methods; return linear iterations, relative residuals and seconds of each."""
+    """Solve a scene by all methods.
+
+    Return linear iterations, relative residuals and seconds of each.
+    """
     curves: dict[str, Curve] = {}
     models: list[tuple[ContactModel, str, dict[str, Any]]] = [
         (BoxedModel(), "boxed", BOXED),
         (StewartTrinkleModel(4), "LCP", LCP),
     ]
     for model, kind, methods in models:
-        given = model.problem(system)
-        if kind == "LCP" and len(given.b) > LARGEST_LCP:
+        formulation = model.problem(system)
+        if kind == "LCP" and len(formulation.b) > LARGEST_LCP:
             continue
-        problem = (given.dense() if kind == "LCP" else given).lcp(device=options.device)
+        problem = (formulation.dense() if kind == "LCP" else formulation).lcp(device=options.device)
         for label, make in methods.items():
             method, most = make(system)
             facts = {"model": kind, "scene": name, "method": label}
             try:
-                wl.solve(problem, method, stopping=unhindered(1))  # loads kernels
+                wl.solve(problem, method, stopping=unhindered(1))  # loads the kernels
                 result = wl.solve(problem, method, stopping=unhindered(most))
             except ValueError as error:
                 solves.append(
@@ -129,7 +141,7 @@ def _scene(
                 "linear_iterations": Figure(result.linear_iterations),
                 "seconds": Figure(result.history[-1].seconds, "s"),
                 "cone_residual": Figure(cone, "m/s"),
-                "unknowns": Figure(len(given.b)),
+                "unknowns": Figure(len(formulation.b)),
             }
             for level in (1e-3, 1e-6, 1e-10):
                 reached = next(((n, t) for n, r, t in history if r <= level), None)
@@ -145,7 +157,10 @@ def _scene(
 
 
 def _equal(options: Options) -> list[Record]:
-    """Return PGS and NNCG after equal sweeps, on the stacks and the heavy box at all mass ratios."""
+    """Compare PGS and NNCG after equal sweeps.
+
+    They run on the stacks, and on the heavy box at all mass ratios.
+    """
     systems = {
         name: next_step(name, options.device).system for name in STACKS if name != "heavy-on-light"
     }
@@ -179,7 +194,7 @@ def _equal(options: Options) -> list[Record]:
 
 
 def _finding(records: list[Record]) -> Table:
-    """Return how often NNCG keeps what the book says of it, PGS not having converged itself."""
+    """Count the scenes where NNCG behaves as the book says and PGS has not converged."""
     rows = []
     for n in EQUAL:
         open_ones = [r for r in records if (r.value(f"PGS_{n}") or 0.0) > 10 * TOLERANCE]
@@ -209,7 +224,7 @@ def _equal_table(records: list[Record]) -> Table:
 
 
 def _tables(solves: list[Record]) -> list[Table]:
-    """Return a table of each scene."""
+    """Return a table for each scene."""
     columns = [
         "method",
         "model",

@@ -1,8 +1,9 @@
-"""Seepage through a dam against PETSc's SNESVI, in turns on one core: `python -m benchmarks.dam`, in the source tree.
+"""Seepage through a dam: interleaved comparison with PETSc's SNESVI, one core.
 
-Both are cold: problem, operator and multigrid are made on the way. PETSc iterates from grid to
-grid, each with doubled spaces between nodes, takes Newton's steps on the free set (`vinewtonrsls`)
-and solves them by conjugate gradients and its geometric multigrid.
+Run `python -m benchmarks.dam` in the source tree. Both solvers start cold: the time includes
+problem, operator and multigrid. PETSc uses grid sequencing, each grid with half the spacing of the
+last. On each it takes Newton steps on the free set (`vinewtonrsls`), solved by conjugate gradients
+with its geometric multigrid.
 """
 
 import argparse
@@ -35,7 +36,7 @@ def ours(nx: int, ny: int) -> tuple[float, str, int, float]:
 
 
 def theirs(python: str, levels: int) -> dict[str, object]:
-    """Return PETSc's answer on its finest grid; the norm is that of the inner nodes."""
+    """Return PETSc's answer on its finest grid, with the norm of the inner nodes."""
     request = {"coarsest": COARSEST, "levels": levels, "rtol": RTOL, "sizes": SIZES}
     command = [
         python,
@@ -53,7 +54,7 @@ def theirs(python: str, levels: int) -> dict[str, object]:
 
 
 def main() -> None:
-    """Print a line a turn."""
+    """Print a line for each turn."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--levels",
@@ -62,10 +63,10 @@ def main() -> None:
         help="grids of PETSc, 5 x 7 nodes the coarsest: 11 are 4097 x 6145",
     )
     parser.add_argument("--repeat", type=int, default=REPEAT)
-    given, python = parser.parse_args(), interpreter()
-    nx, ny = ((n - 1) * 2 ** (given.levels - 1) + 1 for n in COARSEST)
-    ours(65, 97)  # loads kernels
-    for _ in range(given.repeat):
+    arguments, python = parser.parse_args(), interpreter()
+    nx, ny = ((n - 1) * 2 ** (arguments.levels - 1) + 1 for n in COARSEST)
+    ours(65, 97)  # loads the kernels
+    for _ in range(arguments.repeat):
         seconds, status, steps, norm = ours(nx, ny)
         line = (
             f"{nx} x {ny} nodes to {RTOL:g}: ours {seconds:.2f} s, {status}, {steps} steps, |w| "
@@ -73,7 +74,7 @@ def main() -> None:
         )
         if python is None:
             sys.exit(f"{line}; {missing()}")
-        peer = theirs(python, given.levels)
+        peer = theirs(python, arguments.levels)
         last = peer["steps"][-1][2:4]  # type: ignore[index]
         line += f"; PETSc {peer['version']} {peer['seconds']:.2f} s, {last}, |w| {peer['norm']:.9g}"
         sys.stdout.write(f"{line}; ratio {peer['seconds'] / seconds:.1f}\n")  # type: ignore[operator]

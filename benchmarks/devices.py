@@ -1,4 +1,7 @@
-"""CPU beside GPU: the same work on each machine, one file of figures for each, which `--compare` puts side by side."""
+"""CPU and GPU: the same work on each machine, and a comparison of the results.
+
+A run writes one file of figures; `--compare` puts two files side by side.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from warp_lcp.scene.simulator import simulators
 TITLE = "One machine: solvers, contacts, steps, kernels"
 SIZES = (64, 128)
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
-SWEEPS = 20  # of PGS: its time is given for one; to 1e-6 it needs thousands on these grids
+SWEEPS = 20  # sweeps of PGS; the time of one is reported, since 1e-6 needs thousands on these grids
 METHODS: dict[str, Callable[[], Any]] = {
     "ProjectedMultigrid": wl.ProjectedMultigrid,
     "MinimumMapNewton": wl.MinimumMapNewton,
@@ -32,10 +35,11 @@ METHODS: dict[str, Callable[[], Any]] = {
     "FischerNewton": wl.FischerNewton,
     "InteriorPoint": wl.InteriorPoint,
 }
-CONTACTS, CONTACT_SWEEPS = "wall", 200  # scene of the gallery, and sweeps in a sample
+CONTACTS, CONTACT_SWEEPS = "wall", 200  # scene of the gallery, and sweeps of a sample
 STEPS = ("dam-break", "column-collapse")  # built-in scenes whose steps are timed: a liquid, sand
-LARGEST_STEP = 128  # cells along the longest side: of sand in 256 a step takes minutes on two cores
-BEFORE, TIMED = 10, 20  # steps until the material moves, and those that are timed
+# Cells along the longest side: a step of sand with 256 takes minutes on two cores.
+LARGEST_STEP = 128
+BEFORE, TIMED = 10, 20  # steps until the material moves, and timed steps
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -70,10 +74,10 @@ def _solves(n: int, options: Options) -> list[Record]:
     """Time solves of a splash with separating walls, and sweeps of PGS."""
     problem, device = splash(n).lcp("walls", device=options.device), options.device
     work: dict[str, Callable[[], object]] = {}
-    found: dict[str, wl.SolveResult] = {}
+    results: dict[str, wl.SolveResult] = {}
 
     def solve(name: str, method: Any, workspace: Any, stopping: wl.StoppingCriteria) -> None:
-        found[name] = wl.solve(problem, method, stopping=stopping, workspace=workspace)
+        results[name] = wl.solve(problem, method, stopping=stopping, workspace=workspace)
         wp.synchronize_device(device)
 
     for name, kind in METHODS.items():
@@ -82,20 +86,20 @@ def _solves(n: int, options: Options) -> list[Record]:
     pgs = wl.ProjectedSOR(omega=1.0)
     work["PGS"] = partial(solve, "PGS", pgs, pgs.init(problem), unhindered(SWEEPS))
     records = []
-    for name, taken in in_turns(work, options.repeat).items():
+    for name, seconds in in_turns(work, options.repeat).items():
         if name == "PGS":
             records.append(
                 Record(
                     f"{n}^3: a sweep of PGS",
-                    {"seconds": Figure.least([t / SWEEPS for t in taken], "s")},
+                    {"seconds": Figure.least([t / SWEEPS for t in seconds], "s")},
                 )
             )
             continue
         figures = {
-            "seconds": Figure.least(taken, "s"),
-            "iterations": Figure(found[name].iterations),
+            "seconds": Figure.least(seconds, "s"),
+            "iterations": Figure(results[name].iterations),
         }
-        records.append(Record(f"{n}^3: {name}", figures, {"status": found[name].status.name}))
+        records.append(Record(f"{n}^3: {name}", figures, {"status": results[name].status.name}))
     return records
 
 
@@ -104,15 +108,15 @@ def _kernels(n: int, options: Options) -> list[Record]:
     box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device=options.device)
     x, y = (wp.ones(box.layout.size, dtype=wp.float32, device=options.device) for _ in range(2))
     problem = splash(n).lcp("linear", device=options.device)
-    kept: Any = wl.ProjectedMultigrid().init(problem)
-    wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept)
+    workspace: Any = wl.ProjectedMultigrid().init(problem)
+    wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
 
     def product() -> None:
         box.stencil.product(x, y)
         wp.synchronize_device(options.device)
 
     def cycle() -> None:
-        kept.hierarchy.cycle.run()
+        workspace.hierarchy.cycle.run()
         wp.synchronize_device(options.device)
 
     taken = in_turns({"product": product, "multigrid cycle": cycle}, options.repeat)
@@ -128,13 +132,13 @@ def _step(name: str, cells: int, options: Options) -> Record:
     simulation = simulators()[scene.scene.simulator].create(
         scene, device=options.device, folder=Path.cwd()
     )
-    taken = []
+    seconds = []
     for step in range(BEFORE + TIMED):
         begun = time.perf_counter()
         simulation.step(simulation.stable_dt())
         wp.synchronize_device(options.device)
-        taken += [time.perf_counter() - begun] if step >= BEFORE else []
-    return Record(f"a step of {name}, {cells} cells", {"seconds": Figure.of(taken, "s")})
+        seconds += [time.perf_counter() - begun] if step >= BEFORE else []
+    return Record(f"a step of {name}, {cells} cells", {"seconds": Figure.of(seconds, "s")})
 
 
 def _contacts(options: Options) -> Record:

@@ -1,4 +1,4 @@
-"""The same liquid in larger domains: what a step and its memory cost, and what laying grids around the liquid takes of a run."""
+"""The same liquid in larger domains: cost of steps, memory and grid rebuilds."""
 
 from __future__ import annotations
 
@@ -20,16 +20,19 @@ from warp_lcp.fluids import SIMULATOR, LiquidScene
 from warp_lcp.simulation import NoStopwatch
 
 TITLE = "The same liquid in larger domains"
-SIDE = 48  # cells of the cube of liquid, and of the smallest domain
+SIDE = 48  # cells along a side of the cube of liquid, and of the smallest domain
 LARGER = (48, 96, 192, 384, 768)
-STEPS, LONGEST = 4, 0.005  # before a step is measured; the longest one [s]
-FLIGHT = 0.8  # [s] that a ball flies through a domain without far ends, and falls onto a floor
-# MB; % of a step
+STEPS, LONGEST = 4, 0.005  # steps before the measured one; the longest step [s]
+FLIGHT = 0.8  # [s] time of flight of a ball through an unbounded domain, onto a floor
+# Time ratios by domain size, growth of the state, memory [MB], grid rebuilds [% of a step].
 TIME_LIMITS, GROWTH_LIMIT, MEMORY_LIMIT, LAYING_LIMIT = {192: 1.2, 768: 1.5}, 1.15, 200.0, 8.0
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Step the liquid in each domain, in turns; then memory, a process each; then the flight."""
+    """Step the liquid in each domain, interleaved; then measure memory and the flight.
+
+    Memory is measured in one process per domain.
+    """
     if wp.get_device(options.device).is_cuda:
         raise ValueError(f"--device {options.device}: the suite domains measures the CPU")
     sizes = options.sizes or LARGER
@@ -91,7 +94,7 @@ def _stepping(n: int) -> Any:
     start = simulation.state()
 
     def step() -> None:
-        if simulation.step_count > STEPS + 40:  # it must not reach the floor
+        if simulation.step_count > STEPS + 40:  # the liquid must not reach the floor
             simulation.restore(start)
         simulation.step(min(simulation.stable_dt(), LONGEST))
 
@@ -101,9 +104,10 @@ def _stepping(n: int) -> Any:
 
 
 def memory_of(n: int) -> tuple[int, float, float]:
-    """Return the cells that the grid covers, what the process grew by in some steps, and the size of a state [MB].
+    """Return the cells of the grid, the growth of the process and the size of a state.
 
-    The same steps in the smallest domain come before: what they load and keep is not the domain's.
+    Sizes are in MB. The same steps in the smallest domain come first, so that what they load and
+    keep is not counted.
     """
     _stepping(SIDE)()
     forget_peak()
@@ -120,21 +124,24 @@ def memory_of(n: int) -> tuple[int, float, float]:
 
 
 class Shares(NoStopwatch):
-    """Seconds of each stage."""
+    """Stopwatch that adds up the seconds of each stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def stage(self, name: str, *arrays: Any) -> Iterator[None]:
-        """Add the seconds of what happens to a stage."""
+        """Add the seconds of the enclosed code to a stage."""
         begun = time.perf_counter()
         yield
         self.seconds[name] += time.perf_counter() - begun
 
 
 def _flight() -> Record:
-    """Return what laying grids takes of a ball's flight over a solid, in a domain without far ends."""
+    """Return the cost of grid rebuilds during a ball's flight.
+
+    The ball flies over a solid in an unbounded domain.
+    """
     scene = LiquidScene.model_validate(
         {
             "scene": {"simulator": "fluids"},
@@ -189,7 +196,7 @@ def _flight_table(record: Record) -> Table:
 def _targets(records: list[Record]) -> Table:
     by_name = {record.name: record for record in records}
     times = {n: by_name[f"{n}^3"].figures["ratio"] for n in TIME_LIMITS if f"{n}^3" in by_name}
-    found = [
+    targets = [
         Target(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x")
         for n, ratio in times.items()
     ]
@@ -197,12 +204,12 @@ def _targets(records: list[Record]) -> Table:
         growth = (
             by_name["192^3"].figures["memory"].value / by_name[f"{SIDE}^3"].figures["memory"].value
         )
-        found.append(Target(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x"))
+        targets.append(Target(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x"))
     if "768^3" in by_name:
-        found.append(
+        targets.append(
             Target("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB")
         )
-    found.append(
+    targets.append(
         Target("laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %")
     )
-    return table_of_targets("of large domains", found)
+    return table_of_targets("of large domains", targets)

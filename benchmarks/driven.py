@@ -1,10 +1,11 @@
-"""What a run costs that Python drives: `python -m benchmarks.driven [SCENE ...]`, in the source tree; in turns, by threes.
+"""Cost of driving a run from Python.
 
-The same run by `run_scene`, as the command line calls it, by `for frame in wl.Run(...)` with a
-callback in each step and a look at the particles in each frame, and by `run_scene` again, which
-says what the clock cannot tell apart. All write log, frames and checkpoints. Seconds of the
-processor, so that neighbors on the machine count less; ratios to the first of the three, their
-medians and quartiles.
+Run `python -m benchmarks.driven [SCENE ...]` in the source tree. Three runs of the same scene take
+turns: by `run_scene`, as on the command line; by `for frame in wl.Run(...)`, with a callback in
+each step and access to the particles in each frame; and by `run_scene` again, which shows the noise
+of the clock. All write log, frames and checkpoints. Times are CPU seconds, so that other programs
+on the machine count less. The output is ratios to the first of the three, with medians and
+quartiles.
 """
 
 import sys
@@ -34,7 +35,7 @@ def by_command(scene: str, folder: Path, duration: float) -> None:
 
 
 def by_program(scene: str, folder: Path, duration: float) -> None:
-    """Run it from Python, and look at every frame."""
+    """Run a scene from Python, with access to every frame."""
     steps: list[float] = []
     run = wl.Run(
         scene,
@@ -52,13 +53,13 @@ def measure(scene: str, duration: float) -> None:
     """Print the ratios of a scene's runs."""
     work, seconds = (by_command, by_program, by_command), []
     for _ in range(TURNS + 1):
-        taken = []
+        turn_seconds = []
         for run in work:
             with tempfile.TemporaryDirectory() as folder:
                 begun = time.process_time()
                 run(scene, Path(folder) / "run", duration)
-                taken.append(time.process_time() - begun)
-        seconds.append(taken)
+                turn_seconds.append(time.process_time() - begun)
+        seconds.append(turn_seconds)
     first, driven, again = np.transpose(seconds[1:])  # the first turn loads kernels
     sys.stdout.write(
         f"{scene}, {duration:g} s, {first.mean():.2f} s of the processor, {TURNS} turns:\n"

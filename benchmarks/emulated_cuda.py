@@ -1,20 +1,21 @@
 # mypy: ignore-errors
-"""What is done on CUDA, on the CPU: to be imported before the package. The plugin `tests/emulated_cuda.py` has tests run so.
+"""Emulation of CUDA on the CPU; import it before the package.
 
-The package decides as on CUDA (`device.is_cuda`, `__CUDA_ARCH__`), blocks of threads run as
-cooperative fibers that meet at barriers, threads and blocks run in an order that is not the usual
-one (ORDER = forward, reversed, permuted), `.numpy()` gives a copy, so that what is written to it is
-lost, as it is there, and recorded programs launch what a graph would hold.
+The plugin `tests/emulated_cuda.py` runs tests with it. The package decides as on CUDA
+(`device.is_cuda`, `__CUDA_ARCH__`). Blocks of threads run as cooperative fibers that meet at
+barriers. Threads and blocks run in an unusual order (ORDER = forward, reversed, permuted).
+`.numpy()` returns a copy, so that writes to it are lost, as on CUDA. Recorded programs launch what
+a graph would hold.
 
-With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels
-whose results depend on it and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of
-cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory: `launched_by_cells`
-counts such launches, `otherwise` those whose fields differ in a bit, or whose sums differ by more
-than rounding. `meter` counts launches, readbacks and allocations, and calls: of Python, to launch,
-copy or clear, one for a whole graph.
+With COMPARE=1 every launch runs in all three orders from equal memory. `differs` counts the kernels
+whose results depend on the order and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by
+quads of cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory.
+`launched_by_cells` counts such launches; `otherwise` counts those whose fields differ in a bit, or
+whose sums differ by more than rounding. `meter` counts launches, readbacks, allocations and calls.
+A call is one of Python to launch, copy or clear; a whole graph is one call.
 
-What it cannot show: torn interleavings and the memory model (threads run one after another),
-graphs' own rules, the order of streams.
+Not emulated: torn interleavings and the memory model (threads run one after another), rules of
+graphs, the order of streams.
 """
 
 import collections
@@ -38,9 +39,9 @@ ORDERS = ("forward", "reversed", "permuted")
 ORDER = ORDERS.index(os.environ.get("ORDER", "permuted"))
 COMPARE, CELLS = os.environ.get("COMPARE") == "1", os.environ.get("CELLS") == "1"
 PACKAGE = "warp_lcp"
-# these ask CUDA itself, or another process
+# These modules query CUDA itself, or another process.
 REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")
-ADDRESS = 0x6F0000000000  # of the order, where compiled kernels look it up
+ADDRESS = 0x6F0000000000  # address at which compiled kernels read the order of threads
 # Kernels (module:name) whose results depend on the order of threads, and why they may.
 ORDER_MATTERS = {
     "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
@@ -88,15 +89,20 @@ struct emulated_order {
     size_t n, a; int order;
     emulated_order(size_t size) : n(size), a(1), order(*(volatile int*)ADDRESSull) {
         if (order != 2 || n < 3) return;
-        const auto divisor = [](size_t x, size_t y) { while (y) { const size_t t = x % y; x = y; y = t; } return x; };
+        const auto divisor = [](size_t x, size_t y) {
+            while (y) { const size_t t = x % y; x = y; y = t; }
+            return x;
+        };
         for (a = (size_t)(0.6180339887*(double)n) | 1; divisor(a, n) != 1;) ++a; }
-    size_t operator()(size_t t) const { return order == 0 ? t : order == 1 ? n - 1 - t : (t*a + n/3) % n; }
+    size_t operator()(size_t t) const {
+        return order == 0 ? t : order == 1 ? n - 1 - t : (t*a + n/3) % n;
+    }
 };
 """
 
 
 def swap(template, *pairs):
-    """Replace pieces of one of Warp's templates of kernels."""
+    """Replace parts of one of Warp's kernel templates."""
     text = getattr(codegen, template)
     for old, new in pairs:
         if old not in text:
@@ -106,7 +112,7 @@ def swap(template, *pairs):
 
 
 def emulate_kernels():
-    """Have kernels compiled as on CUDA, with threads and blocks in another order."""
+    """Compile kernels as on CUDA, with threads and blocks in another order."""
     rounded = ""
     for kind, type_ in (("f", "float"), ("d", "double")):
         for name, sign in (("add", "+"), ("sub", "-"), ("mul", "*")):
@@ -146,29 +152,29 @@ def emulate_kernels():
         ("        block_first += (size_t)active_count;\n", ""),
     )
     wp.config.enable_cpu_blocks = True
-    # of its own: Warp does not hash templates
+    # A cache folder of its own, since Warp does not hash templates.
     wp.config.kernel_cache_dir = str(Path(__file__).parents[1] / "build" / "emulated-cuda")
 
 
 class Loader(importlib.machinery.SourceFileLoader):
-    """Modules that take the CPU for CUDA."""
+    """Module loader whose modules treat the CPU as CUDA."""
 
     def get_code(self, fullname):
-        """Compile the source, never what is cached."""
+        """Compile the source; ignore cached bytecode."""
         path = self.get_filename(fullname)
         source = self.get_data(path).decode()
         if not fullname.startswith(REAL):
             source = re.sub(r"\.(is_cuda|is_cpu)\b", r".\1_like", source)
-        # fibers only where threads meet
+        # Fibers are needed only where threads meet at barriers.
         source = source.replace("block_dim: int = 256", "block_dim: int = 1")
         return compile(source, path, "exec", dont_inherit=True)
 
 
 class Finder(importlib.abc.MetaPathFinder):
-    """Finds modules of the package for `Loader`."""
+    """Finder that loads modules of the package by `Loader`."""
 
     def find_spec(self, name, path, target=None):
-        """Find a module of the package."""
+        """Return the spec of a module of the package."""
         spec = (
             importlib.machinery.PathFinder.find_spec(name, path, target)
             if name.partition(".")[0] == PACKAGE
@@ -179,12 +185,12 @@ class Finder(importlib.abc.MetaPathFinder):
         return spec
 
 
-# of launches, readbacks and allocations, to be cleared by whoever looks
+# Counts of launches, readbacks, allocations and calls; the reader clears it.
 meter = collections.Counter[str]()
 
 
 def counted(what, result):
-    """Count a call; return its result."""
+    """Count a call and return its result."""
     meter[what] += 1
     return result
 
@@ -195,7 +201,7 @@ def counting(what, plain):
 
 
 def emulate_decisions():
-    """Have the package decide as on CUDA, and Warp launch as there."""
+    """Make the package decide and Warp launch as on CUDA."""
     if any(name.partition(".")[0] == PACKAGE for name in sys.modules):
         raise RuntimeError(f"{PACKAGE} is imported already: give the plugin to pytest with -p")
     context.Device.is_cuda_like = property(lambda self: True)
@@ -232,7 +238,11 @@ def emulate_decisions():
 
 
 def arrays_of(value, kind, found):
-    """Collect the addresses of arrays in a parameter, in structs and in tables of structs, with their bytes and element types."""
+    """Collect addresses, sizes and element types of the arrays in a kernel argument.
+
+    Arrays in structs and in tables of structs are included. `found` maps an address to bytes and
+    type.
+    """
     if isinstance(value, array_t):
         dtype, shape = getattr(kind, "dtype", None), [value.shape[i] for i in range(value.ndim)]
         item = (
@@ -256,22 +266,25 @@ def arrays_of(value, kind, found):
 
 
 def compared(invoke):
-    """Return what launches a kernel in all orders from equal memory, and notes what differs."""
+    """Return a launcher that runs kernels in all orders and records differences.
+
+    Every order starts from equal memory.
+    """
 
     def launch(kernel, hooks, params, adjoint):
-        found = {}
+        arrays = {}
         for argument, value in zip(kernel.adj.args, params[1:], strict=False):
-            arrays_of(value, argument.type, found)
-        before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+            arrays_of(value, argument.type, arrays)
+        before = {address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()}
         after = []
         for order.value in (*({0, 1, 2} - {ORDER}), ORDER):
             for address, data in before.items():
                 ctypes.memmove(address, data, len(data))
             invoke(kernel, hooks, params, adjoint)
             after.append(
-                {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+                {address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()}
             )
-        # arguments from memory change nothing
+        # The hash of a module with arguments in memory is no part of the name.
         name = f"{kernel.module.name.partition('.memory.')[0]}:{kernel.key}"
         if after[0] != after[2] or after[1] != after[2]:
             if not any(fnmatch.fnmatchcase(name, known) for known in ORDER_MATTERS):
@@ -280,15 +293,18 @@ def compared(invoke):
     return launch
 
 
-PIECES = ("moved",)  # sums that count pieces of rows: that they are 0 is what counts
+PIECES = ("moved",)  # sums that count pieces of rows; only zero or nonzero is compared
 
 
 def checked_by_cells(invoke):
-    """Return what launches passes by quads also by cells, from equal memory, and notes what differs."""
+    """Return a launcher that also runs quad passes by cells and records differences.
+
+    Both start from equal memory.
+    """
     from warp_lcp.rows import layout
     from warp_lcp.rows.pass_form import Form
 
-    forms = {}  # of kernels; None of those that are no pass by quads
+    forms = {}  # form of each kernel; None if it is no pass by quads
 
     def form_of(kernel):
         if kernel not in forms:
@@ -306,12 +322,17 @@ def checked_by_cells(invoke):
             invoke(kernel, hooks, params, adjoint)
             return
         counts = meter.copy()
-        found, (_, rows, given), columns, twin = {}, params, form.declared.found, form.by_cells
-        arrays_of(given, kernel.adj.args[1].type, found)
-        for address in {given.out.data} if columns else ():
-            found.pop(address, None)  # places of sums are others
+        arrays, (_, rows, kernel_args), columns, twin = (
+            {},
+            params,
+            form.declared.found,
+            form.by_cells,
+        )
+        arrays_of(kernel_args, kernel.adj.args[1].type, arrays)
+        for address in {kernel_args.out.data} if columns else ():
+            arrays.pop(address, None)  # the two forms have different places of sums
         native, cells = (
-            twin.native.from_buffer_copy(bytes(given)),
+            twin.native.from_buffer_copy(bytes(kernel_args)),
             type(rows).from_buffer_copy(rows),
         )
         cells.grain, cells.chunks = 1, cells.nx
@@ -321,10 +342,10 @@ def checked_by_cells(invoke):
             native.out = out.__ctype__()
         by_cells, arguments = layout.copy_of(layout.BLANK), object.__new__(twin._struct)
         vars(by_cells)["_ctype"], vars(arguments)["_ctype"] = cells, native
-        before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+        before = {address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()}
         wp.launch(twin.kernel, dims, [by_cells, arguments], device="cpu", block_dim=1)
         expected = {
-            address: ctypes.string_at(address, size) for address, (size, _) in found.items()
+            address: ctypes.string_at(address, size) for address, (size, _) in arrays.items()
         }
         for address, data in before.items():
             ctypes.memmove(address, data, len(data))
@@ -335,12 +356,12 @@ def checked_by_cells(invoke):
         name = " ".join([form.declared.name, *form.words])
         launched_by_cells[name] += 1
         otherwise[name] += not all(
-            equal_bits(ctypes.string_at(a, len(data)), data, found[a][1])
+            equal_bits(ctypes.string_at(a, len(data)), data, arrays[a][1])
             for a, data in expected.items()
         )
         if columns:
             count = len(columns) * math.prod(layout.threads(rows))
-            sums = np.frombuffer(ctypes.string_at(given.out.data, 8 * count)).reshape(
+            sums = np.frombuffer(ctypes.string_at(kernel_args.out.data, 8 * count)).reshape(
                 len(columns), -1
             )
             for column, one, other in zip(
@@ -356,7 +377,7 @@ def checked_by_cells(invoke):
 
 
 def equal_bits(one, other, kind):
-    """Return whether two arrays of a type have the same bits; every NaN counts as the same."""
+    """Return whether two arrays of a type have equal bits; all NaN are equal."""
     if one == other or kind not in (wp.float32, wp.float64):
         return one == other
     a, b = (
@@ -367,7 +388,7 @@ def equal_bits(one, other, kind):
 
 
 def equal_sums(one, other, column, *, largest):
-    """Return whether two sets of partial results come to the same, sums but for rounding."""
+    """Return whether two sets of partial results agree, sums up to rounding."""
     if largest:
         return np.array_equal(one.max(), other.max(), equal_nan=True)
     a, b, size = one.sum(), other.sum(), np.abs(other).sum()
@@ -387,7 +408,10 @@ if COMPARE:
 
 
 def replayed():
-    """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
+    """Keep recorded commands and launch them in place of a graph.
+
+    Call this once the package can be imported. Loops of graphs read their conditions in place.
+    """
     from warp_lcp.rows import device_graph, host_kernel, joined
     from warp_lcp.rows.program import LaunchGraph, Loop, Program
 
@@ -395,10 +419,13 @@ def replayed():
         context.invoke = checked_by_cells(context.invoke)
 
     class HostGraph(LaunchGraph):
-        """Kernels on the host's memory, which run at once on every machine: what waits for the device waits on."""
+        """Launch graph in host memory.
+
+        Its kernels run at once; waits for the device are deferred.
+        """
 
         def run(self, *arguments, **options):
-            """Launch everything, so that the host can read it."""
+            """Launch all commands and leave their results to the host."""
             waiting, state, counts = joined.WAITING, vars(joined.WAITING).copy(), meter.copy()
             waiting.depth, waiting.programs = 0, []
             try:

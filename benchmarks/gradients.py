@@ -1,8 +1,11 @@
-"""What gradients through a solution cost: `python -m benchmarks.gradients`, in the source tree; seconds of the processor, in turns.
+"""Cost of gradients through a solution.
 
-`wl.vjp` beside the solve itself and the linear solve that it consists of, on a membrane over a
-ball: held unknowns are AIR, the tolerance is the same, its operator is made each time. Peaks of
-memory beyond what there was, after solves of few and of many steps.
+Run `python -m benchmarks.gradients` in the source tree. Its CPU times are interleaved.
+
+`wl.vjp` is compared with the solve itself and with the linear solve that it contains, on a membrane
+over a ball. In that linear solve the active unknowns are AIR, the tolerance is the same, and the
+operator is rebuilt each time. Memory is the peak above that before, after solves of few and of many
+steps.
 """
 
 import sys
@@ -21,30 +24,30 @@ TOLERANCES = (1e-6, 1e-10)
 def membrane(
     shape: tuple[int, ...], faces: bool
 ) -> tuple[wl.GridPoisson, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Return operator, cells, load, obstacle and coefficients of a membrane between fixed edges."""
+    """Return operator, cells, load, obstacle and coefficients of a clamped membrane."""
     cells, rng = np.full(shape, wl.AIR), np.random.default_rng(SEED)
     cells[(slice(1, -1),) * len(shape)] = wl.FLUID
     square = sum(
         ((q - n / 2) / (0.3 * n)) ** 2 for q, n in zip(np.indices(shape), shape, strict=True)
     )
-    given: dict[str, Any] = {}
+    coefficients: dict[str, Any] = {}
     for axis in range(len(shape) if faces else 0):
         face = list(shape)
         face[-1 - axis] += 1
-        given[f"face_{'xyz'[axis]}"] = rng.uniform(0.5, 2.0, face)
+        coefficients[f"face_{'xyz'[axis]}"] = rng.uniform(0.5, 2.0, face)
     obstacle = np.where(square < 1, 0.5 * np.sqrt(np.maximum(1 - square, 0.0)), -1.0)
     return (
-        wl.GridPoisson(cells, device="cpu", **given),
+        wl.GridPoisson(cells, device="cpu", **coefficients),
         cells,
         np.full(shape, 20.0 / shape[0] ** 2),
         obstacle,
-        given,
+        coefficients,
     )
 
 
 def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
-    """Print medians of a linear solve and of a vector-Jacobian product, and the median of their ratios."""
-    A, cells, load, obstacle, given = membrane(shape, faces)
+    """Print median times of a linear solve and of `wl.vjp`, and their median ratio."""
+    A, cells, load, obstacle, coefficients = membrane(shape, faces)
     problem, tight, stopping = (
         wl.LCP(A, load, lower=obstacle),
         wl.StoppingCriteria(rtol=1e-10),
@@ -59,7 +62,7 @@ def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
     right = np.where(open_cells == wl.FLUID, g, 0.0)
 
     def linear() -> np.ndarray:
-        block = wl.GridPoisson(open_cells, device="cpu", **given)
+        block = wl.GridPoisson(open_cells, device="cpu", **coefficients)
         return wl.solve(wl.LCP(block, right, -np.inf), stopping=stopping).x.numpy()
 
     work = {
@@ -87,7 +90,10 @@ def measure(shape: tuple[int, ...], faces: bool, rtol: float) -> None:
 
 
 def remember(shape: tuple[int, ...]) -> None:
-    """Print what `wl.vjp` takes beyond what there was, after solves of few and of many steps, and what a linear solve does."""
+    """Print the additional memory of `wl.vjp` and of a linear solve.
+
+    They are measured after solves of few and of many steps.
+    """
     A, _, load, obstacle, _ = membrane(shape, False)
     problem = wl.LCP(A, load, lower=obstacle)
     for method in (wl.ProjectedMultigrid(), wl.ProjectedSOR(omega=1.95)):

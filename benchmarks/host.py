@@ -1,8 +1,9 @@
-"""Host time of a simulation step by stage, beside the native work in it: `python -m warp_lcp.benchmarks.host`.
+"""Host time of a simulation step by stage, and of the native work in it.
 
-A step is Python that prepares operations, and native calls that execute tables of them
-(`warp_lcp.rows.team.Team.run`). The *floor* of a stage is the time of its native calls alone: each
-is repeated from the same memory, without Python in between, and the fastest one counts.
+Run `python -m warp_lcp.benchmarks.host`. A step consists of Python, which prepares operations, and
+of native calls, which execute tables of them (`warp_lcp.rows.team.Team.run`). The *floor* of a
+stage is the time of its native calls alone: each call is repeated from the same memory, without
+Python in between, and the fastest one counts.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ from warp_lcp.scene.simulator import simulators
 
 TITLE = "Host time of a step by stage"
 SCENES = ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "dam-break")
-RESOLUTION = 32  # cells along the longest side: so few that a step is mostly host time
-# steps before the measured ones, in which the material begins to move; steps of a round
+RESOLUTION = 32  # cells along the longest side; so few that a step is mostly host time
+# Steps before the measured ones, in which the material begins to move; steps of a round.
 SKIPPED, STEPS = 30, 20
-REPLAYS = 5  # of a native call
+REPLAYS = 5  # replays of a native call
 OUTSIDE = "outside stages"
 CALLS, OPERATIONS = "native calls", "operations"
 LAUNCHES, COPIES, READS, ALLOCATIONS = (
@@ -70,10 +71,12 @@ COUNTS = (CALLS, OPERATIONS, *COUNTED)
 
 
 class StageTimer:
-    """Stopwatch of a simulation that adds up the processor's seconds of each stage, those of stages within it excluded.
+    """Stopwatch of a simulation: CPU seconds of each stage.
+
+    Nested stages are excluded from the enclosing one.
 
     Attributes:
-        seconds: by stage, in the order of their first begin; `OUTSIDE` between `begin` and `end`.
+        seconds: CPU seconds by stage, in order of first begin; `OUTSIDE` for the rest of a step.
     """
 
     def __init__(self) -> None:
@@ -83,7 +86,7 @@ class StageTimer:
 
     @property
     def current(self) -> str:
-        """The innermost stage that runs now."""
+        """Innermost stage that is running."""
         return self._running[-1] if self._running else OUTSIDE
 
     @contextmanager
@@ -112,15 +115,17 @@ class StageTimer:
 
 
 class StepRecorder:
-    """Counts the calls of steps by stage and replays their native calls, while it is entered.
+    """Counter of calls by stage, which also replays native calls.
+
+    It counts as long as its `with` block runs.
 
     Args:
-        timer: says which stage is running.
-        replays: of each native call; 0: only count.
+        timer: stopwatch with the running stage.
+        replays: number of replays of each native call; 0 to count only.
 
     Attributes:
-        counts: by stage, of `COUNTS`.
-        native: seconds of the native calls by stage, the fastest replay of each.
+        counts: numbers of calls by stage and kind, see `COUNTS`.
+        native: seconds of the native calls by stage, with the fastest replay of each.
     """
 
     def __init__(self, timer: StageTimer, replays: int = REPLAYS) -> None:
@@ -128,7 +133,7 @@ class StepRecorder:
         self.native: dict[str, float] = defaultdict(float)
         self._timer, self._replays, self._within = timer, replays, False
         self._arrays: list[wp.array] = []
-        self._table: Any = None  # that the team executes
+        self._table: Any = None  # the table that the thread pool executes
         self._patches = ExitStack()
 
     def __enter__(self) -> StepRecorder:
@@ -138,14 +143,14 @@ class StepRecorder:
                 self._replace(owner, name, self._counted(kind, getattr(owner, name)))
         self._replace(Team, "run", self._run(Team.run))
         if self._replays:
-            # All arrays are kept from here on, so that none is freed that a replay writes to.
+            # All arrays are kept alive from here on, so that a replay never writes to freed memory.
             self._arrays = [a for a in gc.get_objects() if type(a) is wp.array]
             self._replace(Team, "_do", self._replayed(Team._do))
             self._replace(wp.array, "__init__", self._kept(wp.array.__init__))
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End to count."""
+        """End the counting."""
         self._patches.close()
         self._arrays = []
 
@@ -153,7 +158,10 @@ class StepRecorder:
         self._patches.enter_context(patch.object(owner, name, function))
 
     def _counted(self, kind: str, plain: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that counts its calls, but not those that another counted function makes."""
+        """Return a function that counts its calls.
+
+        Calls by another counted function are not counted.
+        """
 
         def call(*args: Any, **options: Any) -> Any:
             if self._within:
@@ -183,7 +191,10 @@ class StepRecorder:
         return init
 
     def _replayed(self, plain: Callable[..., None]) -> Callable[..., None]:
-        """Return the native call, which is then repeated from the memory that it began with: the last one leaves what the first did."""
+        """Return a native call that is repeated from the same initial memory.
+
+        The last repetition leaves the same memory as the first call.
+        """
 
         def do(team: Team, asked: Any) -> None:
             if asked.mode != RUN:
@@ -208,7 +219,7 @@ class StepRecorder:
         return time.process_time() - begun
 
     def _memory(self) -> list[tuple[int, int]]:
-        """Return where the memory of all arrays begins and ends; views own none."""
+        """Return begin and end of the memory of all arrays, views excluded."""
         owners = [
             a
             for a in self._arrays
@@ -223,25 +234,25 @@ class StepRecorder:
 def measure(options: Options, out: Path) -> Results:
     """Measure steps of each scene."""
     scenes = [options.scene] if options.scene else SCENES
-    found: dict[str, list[Record]] = {}
+    by_scene: dict[str, list[Record]] = {}
     for name in scenes:
         for size in options.sizes or (RESOLUTION,):
             options.say(f"{name}, {size} cells")
-            found[f"{name}, {size} cells"] = scene_records(
+            by_scene[f"{name}, {size} cells"] = scene_records(
                 name, size, options.device, STEPS, options.repeat
             )
-    return results(found, machine(options.device, elements=1 << 22, repeat=options.repeat))
+    return results(by_scene, machine(options.device, elements=1 << 22, repeat=options.repeat))
 
 
 def scene_records(name: str, resolution: int, device: str, steps: int, rounds: int) -> list[Record]:
-    """Return records of a scene: of its whole step, and of each stage.
+    """Return the records of a scene: of its whole step, and of each stage.
 
     Args:
-        name: of a scene, or its file.
+        name: name or file of a scene.
         resolution: cells along the longest side.
-        device: of the CPU.
-        steps: of a round, whose mean is a sample.
-        rounds: samples.
+        device: the CPU.
+        steps: steps of a round; their mean is a sample.
+        rounds: number of samples.
 
     Raises:
         ValueError: the device is not the CPU, a number is not positive, or the simulation has no
@@ -256,7 +267,7 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     simulation: Any = simulators()[scene.scene.simulator].create(
         scene, device=device, folder=Path.cwd()
     )
-    if not hasattr(simulation, "watch"):  # a `warp_lcp.simulation.Profiled`
+    if not hasattr(simulation, "watch"):  # see `warp_lcp.simulation.Profiled`
         raise ValueError(f"{name}: its simulation has no stages")
 
     def step() -> None:
@@ -267,7 +278,7 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     samples: dict[str, list[float]] = defaultdict(lambda: [0.0] * rounds)
     whole, unwatched = list[float](), simulation.watch
     for turn in range(rounds):
-        # a stopwatch reads a clock at both ends of each stage
+        # A stopwatch reads a clock at both ends of each stage.
         simulation.watch, since = unwatched, time.process_time()
         for _ in range(steps):
             step()
@@ -300,7 +311,7 @@ def _records(
 ) -> list[Record]:
     """Return a record of the step and one of each stage, the longest first."""
     for stage in counts.keys() | native.keys():
-        samples[stage]  # a stage that the rounds had not
+        samples[stage]  # creates the stage if the rounds did not have it
     records = [(label, whole, sum(counts.values(), Counter()), sum(native.values()), "step")]
     for stage in sorted(samples, key=lambda stage: -min(samples[stage])):
         records.append((f"{label}: {stage}", samples[stage], counts[stage], native[stage], stage))
@@ -350,7 +361,7 @@ def _rows(records: Sequence[Record]) -> list[list[str]]:
 
 
 def main() -> None:
-    """Print a table of each scene, and write files if asked."""
+    """Print a table of each scene; write files on request."""
     parser = argparse.ArgumentParser(
         prog="python -m warp_lcp.benchmarks.host", description=(__doc__ or "").splitlines()[0]
     )
@@ -366,28 +377,30 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder of host.json, host.md and host-stages.png")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
-    found = {}
+    by_scene = {}
     try:
-        wl.set_threads(given.threads)
-        for name in given.scene or SCENES:
-            label = f"{name}, {given.resolution} cells"
-            found[label] = scene_records(name, given.resolution, "cpu", given.steps, given.rounds)
+        wl.set_threads(arguments.threads)
+        for name in arguments.scene or SCENES:
+            label = f"{name}, {arguments.resolution} cells"
+            by_scene[label] = scene_records(
+                name, arguments.resolution, "cpu", arguments.steps, arguments.rounds
+            )
             for line in [
                 f"## {label}",
                 "",
-                *markdown(results({label: found[label]}).tables[0]),
+                *markdown(results({label: by_scene[label]}).tables[0]),
                 "",
             ]:
                 sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
     except ValueError as error:
         parser.error(str(error))
-    if given.out:
-        given.out.mkdir(parents=True, exist_ok=True)
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
         for line in write(
-            "host", TITLE, results(found, machine("cpu", elements=1 << 22)), given.out
+            "host", TITLE, results(by_scene, machine("cpu", elements=1 << 22)), arguments.out
         ):
             sys.stdout.write(f"{line}\n")
 

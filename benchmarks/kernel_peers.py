@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Peers of the 7-point product: a plain Warp kernel with one thread a cell, and Numba."""
+"""Peers of the 7-point product: a plain Warp kernel and Numba."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,10 @@ f32_3d, u8_3d = wp.array3d(dtype=wp.float32), wp.array3d(dtype=wp.uint8)
 
 @wp.kernel(enable_backward=False, module="warp_lcp.benchmarks.plain")
 def plain_kernel(d: u8_3d, x: f32_3d, y: f32_3d):
-    """Y = A x with d open faces a cell, 0 where there is no unknown; one thread a cell."""
+    """Evaluate y = A x with d open faces of a cell, one thread per cell.
+
+    Cells without an unknown have d = 0 and get y = 0.
+    """
     i, j, k = wp.tid()
     i += 1
     j += 1
@@ -45,7 +48,10 @@ def plain_product(d: wp.array, x: wp.array, y: wp.array, device: str) -> Callabl
 
 
 def numba_products(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> dict[str, Callable[[], None]]:
-    """Return Numba's products on padded fields: of the same stencil, and with a constant diagonal of 6; {} where Numba is missing."""
+    """Return Numba's products on padded fields; {} where Numba is missing.
+
+    One has the same stencil, one a constant diagonal of 6.
+    """
     if not present("numba"):
         return {}
     import numba

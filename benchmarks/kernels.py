@@ -1,7 +1,8 @@
-"""Every pass that a solve makes over the finest grid, by itself: cells and bytes a second against what copying memory reaches.
+"""Rates of all passes over the finest grid, against the copy bandwidth.
 
-The passes are those that solves of a full basin bind, so that the list follows the code. The bytes
-are those of the fields that a pass declares to read and to write, each counted once.
+Rates are in cells and bytes per second. The passes are those that solves of a full basin bind, so
+that the list follows the code. The bytes are those of the fields that a pass declares to read and
+to write, each counted once.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from warp_lcp.rows.row_pass import Bound
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)
 PRODUCT = "stencil.product, float32"
-# kernels that run once in a while: for a new operator, problem or set of cells
+# Kernels that run rarely: for a new operator, problem or set of cells.
 SET_UP = (
     "grid_poisson.copy_cells",
     "grid_poisson.count_faces",
@@ -47,14 +48,14 @@ PEER_ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """A pass with its fields, by name."""
+    """Pass with its fields by name, recorded when it was bound."""
 
     bound: Bound
     fields: dict[str, wp.array[Any]]
 
     @property
     def name(self) -> str:
-        """Area, name, types and what is absent: `cycle.sweep uniform float32 uint8 -b`."""
+        """Area, name, types and absent fields: `cycle.sweep uniform float32 uint8 -b`."""
         absent = [
             f"-{name}" for name in self.bound.form.declared.optional if name not in self.fields
         ]
@@ -62,7 +63,7 @@ class Heard:
 
     @property
     def writes(self) -> dict[str, int]:
-        """Bytes that are written."""
+        """Sizes of the written fields [bytes]."""
         return {
             name: size
             for name, size in self._sizes().items()
@@ -71,7 +72,7 @@ class Heard:
 
     @property
     def reads(self) -> dict[str, int]:
-        """Bytes that are read."""
+        """Sizes of the read fields [bytes]."""
         return {
             name: size
             for name, size in self._sizes().items()
@@ -80,12 +81,15 @@ class Heard:
 
     @property
     def bytes(self) -> float:
-        """Bytes that must be moved, those of ghost cells apart."""
+        """Bytes that must be moved, without ghost cells."""
         n = round(self.bound.rows.size ** (1 / 3)) - 2
         return sum(self._sizes().values()) * n**3 / (n + 2) ** 3
 
     def _sizes(self) -> dict[str, int]:
-        """Return the bytes of the fields of this grid and of the next coarser one; other arrays are small."""
+        """Return the bytes of the fields of this grid and of the next coarser one.
+
+        Other arrays are small and left out.
+        """
         declared = self.bound.form.declared
         small = {*declared.by_row, *declared.whole, "out"}
         return {
@@ -96,7 +100,7 @@ class Heard:
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Measure all kernels at the sizes asked for."""
+    """Measure all kernels at the requested sizes."""
     sizes = options.sizes or SIZES
     if not present("numba"):
         options.say("Numba is missing: pip install 'warp-lcp[peers]'")
@@ -128,18 +132,22 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_form(n: int, form: str, options: Options) -> list[Record]:
-    """Hear the passes of one form of coefficients, then measure them in turns with copies and the peers."""
+    """Record the passes of one form of coefficients and time them, interleaved.
+
+    Copies and the peers take part in the rounds.
+    """
     device = options.device
-    heard, product = _hear(_basin(n, form), device)
+    passes, product = _hear(_basin(n, form), device)
     a, b = (wp.full(min(COPIED, 64 * n**3), 1.0, dtype=wp.float32, device=device) for _ in range(2))
-    kernels = [(name, _synchronized(one.bound.launch, device)) for name, one in heard.items()]
+    kernels = [(name, _synchronized(one.bound.launch, device)) for name, one in passes.items()]
     peers = _peers(product, n, device) if form == "unit" else {}
     work: dict[str, Callable[[], None]] = {}
     for third in range(COPIES):  # spread over a round, which takes seconds at 256^3
         work[f"copy {third}"] = _synchronized(lambda: wp.copy(b, a), device)
         work |= dict(kernels[third::COPIES])
     times = in_turns(work, options.repeat)
-    # apart, for then all are done within milliseconds: other users of the machine slow them alike
+    # Peers have rounds of their own, all within milliseconds, so that other users of the machine
+    # slow them alike.
     if peers:
         apart = in_turns(
             {
@@ -155,7 +163,7 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
         for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)
     ]
     records = []
-    for key, one in heard.items():
+    for key, one in passes.items():
         role = "set-up" if key.startswith(SET_UP) else "serial" if key.startswith(SERIAL) else "hot"
         with_peers = one is product and bool(peers)
         taken, copied = (apart["product"], own) if with_peers else (times[key], copying)
@@ -192,7 +200,7 @@ def _basin(n: int, form: str) -> Splash:
 
 
 def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
-    """Return `run` with a wait for the device behind it; as it is on the CPU."""
+    """Return `run` followed by a wait for the device; on the CPU `run` itself."""
     if not wp.get_device(device).is_cuda:
         return run
 
@@ -204,8 +212,11 @@ def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
 
 
 def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
-    """Return the passes over the finest grid that solves of the scene bind, by a unique label, and the float32 product among them."""
-    heard: list[Heard] = []
+    """Return the passes over the finest grid that solves of the scene bind.
+
+    Each pass has a unique label. The float32 product among them is returned as well.
+    """
+    recorded: list[Heard] = []
     bind = RowPass.bind
 
     def listening(
@@ -228,7 +239,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        heard.append(Heard(bound, fields))
+        recorded.append(Heard(bound, fields))
         return bound
 
     with mock.patch.object(RowPass, "bind", listening):
@@ -249,12 +260,12 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
         A.stencil.product(x, wp.zeros_like(x))
     kinds: dict[str, Heard] = {}
-    for one in heard:
+    for one in recorded:
         declared = one.bound.form.declared
         alone = not declared.name.startswith(
             "components."
         )  # those follow each other's trees in borrowed memory: `search` times them together
-        # bounds of the host are coded there: a byte of a cell is sent then, not eight
+        # Bounds on the host are coded there; only one byte per cell is sent then, not eight.
         there = one.bound.rows.device is A.device
         if (
             alone
@@ -264,11 +275,14 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
             and not declared.listed
         ):
             kinds.setdefault(one.name, one)
-    return kinds, kinds[heard[-1].name]
+    return kinds, kinds[recorded[-1].name]
 
 
 def _peers(product: Heard, n: int, device: str) -> dict[str, Callable[[], None]]:
-    """Return the peers of the product on the same memory: where a field lies in the caches' sets is worth 30 % at 128^3."""
+    """Return the peers of the product on the same memory.
+
+    The place of a field in the sets of the caches changes the time by 30 % at 128^3.
+    """
     d, x, y = (product.fields[name].reshape((n + 2,) * 3) for name in ("d", "x", "y"))
     return {
         "Warp, one thread a cell": plain_product(d, x, y, device),
@@ -279,7 +293,10 @@ def _peers(product: Heard, n: int, device: str) -> dict[str, Callable[[], None]]
 def _figures(
     times: list[float], n: int, per_cell: float, copying: list[float]
 ) -> dict[str, Figure]:
-    """Return rates of a kernel that moves `per_cell` bytes, and their share of what copying moved a second in the same rounds."""
+    """Return rates of a kernel that moves `per_cell` bytes.
+
+    The share of the copy bandwidth in the same rounds is included.
+    """
     figures = {
         "cells": Figure(n**3),
         "seconds": Figure.of(times, "s"),

@@ -1,6 +1,7 @@
-"""What each model that a scene can turn on adds to a step and to memory: the list of prices that `warp-lcp check` tells runs by.
+"""Cost of each model of a scene, in time per step and memory.
 
-python -m warp_lcp.benchmarks.models          # also writes warp_lcp/scene/models.toml and docs/models.md, in a checkout
+`warp-lcp check` estimates runs from this price list. Run `python -m warp_lcp.benchmarks.models`. In
+a checkout it also writes warp_lcp/scene/models.toml and docs/models.md.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ from warp_lcp.scene.table import validate
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
-FRAMES = 15  # that are timed, half a second: columns collapse, and reach the other wall
-# [m]: a column of less material, of the same height, tells what goes with the material from what
-# goes with the domain
+FRAMES = 15  # timed frames, half a second: columns collapse and reach the other wall
+# [m] width of a column of less material and the same height. It separates the cost of the material
+# from that of the domain.
 THIN = 0.12
 QUIET = {"diagnostics": False}
 REFERENCE = "{}"  # the tables of the reference scene, as text
@@ -48,13 +49,16 @@ Tables = dict[str, Any]
 
 @dataclass(frozen=True)
 class Offer:
-    """A model: tables of the reference scene with it, and of the nearest scene without; those left out are the reference's."""
+    """Model: tables of the reference scene with it, and of the nearest scene without.
 
-    on: Tables  # with it
-    off: Tables = field(default_factory=dict)  # without it
-    unit: str = "cell"  # what its bytes are counted by, `cell` or `particle`
-    count: int = 1  # how many of it are there, each of which has the price
-    frames: bool = False  # it works when a frame is made, not in a step
+    Tables that are not named are those of the reference.
+    """
+
+    on: Tables  # tables with the model
+    off: Tables = field(default_factory=dict)  # tables without it
+    unit: str = "cell"  # unit of its bytes, `cell` or `particle`
+    count: int = 1  # number of its instances, each of which has the price
+    frames: bool = False  # whether it works for a frame, not in a step
 
 
 def offers(simulator: str, dimension: int) -> dict[str, Offer]:
@@ -70,7 +74,7 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     both = {
         "cut cells": Offer({"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}),
         "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
-        # which move too
+        # Both scenes have moving solids.
         "rigid bodies": Offer({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),
         "density correction": Offer({"density_correction": {}}),
         "automatic density correction": Offer({"density_correction": None}),
@@ -112,7 +116,10 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
 def reference(
     simulator: str, dimension: int, tables: Tables, size: int, *, width: float = 0.55
 ) -> Scene:
-    """Return the reference scene, a column in a box twice as long as high, with some tables changed, or taken out by None."""
+    """Return the reference scene: a column in a box twice as long as high.
+
+    Tables may be changed, or removed by None.
+    """
     scene: Tables = {
         "scene": {"simulator": simulator, "name": "reference"},
         "time": {"duration": 10.0},
@@ -140,7 +147,10 @@ def create(scene: Scene, device: str) -> Any:
 
 
 def run_seconds(simulation: Any, time: Time) -> np.ndarray:
-    """Return the seconds of each step of a run's beginning, as long as a run takes them: how many iterations a solve needs follows that."""
+    """Return the seconds of each step of the first frames of a run.
+
+    Time steps are those of a run, since the number of iterations of a solve depends on them.
+    """
     spent = []
     for frame in range(1, FRAMES + 1):
         while time.frame_time(frame) - simulation.time > 1e-9:
@@ -154,7 +164,10 @@ def run_seconds(simulation: Any, time: Time) -> np.ndarray:
 
 
 def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
-    """Return the seconds of a step and its row: the processor's own seconds on a CPU, which other programs take no part of."""
+    """Return the seconds of a step and its row.
+
+    On a CPU they are CPU seconds, which other programs do not affect.
+    """
     device = simulation.grid.device
     read = clock(str(device))
     wp.synchronize_device(device)
@@ -166,7 +179,10 @@ def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
 
 @dataclass
 class Sample:
-    """A scene that is measured: the scene, its bytes and the least seconds of each of its steps, which are the same in each run."""
+    """Measured scene: its bytes, and the least seconds of each of its steps.
+
+    The steps are the same in each run.
+    """
 
     scene: Scene
     bytes: int
@@ -174,17 +190,23 @@ class Sample:
 
     @property
     def seconds(self) -> float:
-        """Return the mean of a step."""
+        """Mean seconds of a step."""
         return float(self.steps.mean())
 
     def again(self, steps: np.ndarray) -> None:
-        """Take the shorter times of another run; where its steps are others, which only GPUs' rounding makes them, of those of both."""
+        """Keep the shorter times of this and another run.
+
+        Rounding on GPUs may change the number of steps; then only the steps of both count.
+        """
         count = min(len(self.steps), len(steps))
         self.steps = np.minimum(self.steps[:count], steps[:count])
 
 
 def first_run(scene: Scene, device: str) -> Sample:
-    """Return a scene's bytes and seconds; what other simulations held is gone before it starts."""
+    """Return a scene's bytes and seconds of one run.
+
+    Memory of other simulations is freed first.
+    """
     gc.collect()
     before = array_bytes()
     simulation = create(scene, device)
@@ -195,14 +217,18 @@ def first_run(scene: Scene, device: str) -> Sample:
 
 
 def measure_all(simulator: str, dimension: int, size: int, options: Options) -> dict[str, Sample]:
-    """Return the scenes of all offers by their tables' text, the reference among them; runs are taken in turns."""
+    """Return samples of the reference and all models' scenes, by their tables' text.
+
+    The runs take turns.
+    """
     wanted: dict[str, Tables] = {REFERENCE: {}}
     for offer in offers(simulator, dimension).values():
         wanted |= {str(tables): tables for tables in (offer.on, offer.off)}
     samples: dict[str, Sample] = {}
     for text, tables in wanted.items():
         scene = reference(simulator, dimension, tables, size)
-        create(scene, options.device).step(1e-3)  # what is loaded once is no scene's
+        # Loads kernels and data that are no part of a scene's cost.
+        create(scene, options.device).step(1e-3)
         samples[text] = first_run(scene, options.device)
     for _ in range(options.repeat - 1):
         for sample in samples.values():
@@ -211,14 +237,21 @@ def measure_all(simulator: str, dimension: int, size: int, options: Options) -> 
 
 
 def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
-    """Return which part of the seconds does not depend on the size, given those of half the resolution, and which grows with it."""
+    """Split the seconds of a step into a fixed part and one that grows with the size.
+
+    `half` is the time at half the resolution.
+    """
     ratio = 2**dimension
     fixed = min(max((ratio * half - seconds) / (ratio - 1), 0.0), max(seconds, 0.0))
     return fixed, max(seconds - fixed, 0.0)
 
 
 def split_base(base: Sample, half: Sample, thin: Sample) -> tuple[float, float, float]:
-    """Return the seconds of a step that are fixed, and those a cell and a particle, of three scenes of other sizes and amounts."""
+    """Return the seconds of a step: fixed, per cell and per particle.
+
+    They are fitted by nonnegative least squares to three scenes of other sizes and amounts of
+    material.
+    """
     scenes = [(base, counts(base.scene)), (half, counts(half.scene)), (thin, counts(thin.scene))]
     rows = np.array([[1.0, *count] for _, count in scenes]) / np.array(
         [[sample.seconds] for sample, _ in scenes]
@@ -229,7 +262,7 @@ def split_base(base: Sample, half: Sample, thin: Sample) -> tuple[float, float, 
 
 
 def counts(scene: Scene) -> tuple[int, int]:
-    """Return how many cells and particles a reference scene has."""
+    """Return the numbers of cells and particles of a reference scene."""
     simulation = create(scene, "cpu")
     return math.prod(simulation.grid.counts), simulation.particles.count
 
@@ -252,7 +285,7 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
         "cell_bytes": Figure(base.bytes / cells, "B"),
     }
     facts = {"cells": cells, "particles": particles}
-    found = [Record(f"{simulator} {dimension}d: base", figures, facts)]
+    records = [Record(f"{simulator} {dimension}d: base", figures, facts)]
     for name, offer in offers(simulator, dimension).items():
         on, off, many = str(offer.on), str(offer.off), {"cell": cells, "particle": particles}
         added, added_half = (
@@ -268,10 +301,10 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
                 (samples[on].bytes - samples[off].bytes) / many[offer.unit] / offer.count, "B"
             ),
         }
-        found.append(
+        records.append(
             Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames})
         )
-    return found
+    return records
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -287,7 +320,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
-    """Return the prices of a simulator's models, as a reader wants them."""
+    """Return the table of a simulator's prices."""
     base = records[0]
     whole = base.figures["step"].value
     rows = []
@@ -314,7 +347,10 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
 
 
 def price_list(records: list[Record]) -> Mapping[str, Any]:
-    """Return what `warp_lcp/scene/models.toml` holds: by simulator, dimension and model what a `warp_lcp.scene.models.Price` has."""
+    """Return the contents of `warp_lcp/scene/models.toml`.
+
+    It holds the fields of `warp_lcp.scene.models.Price` by simulator, dimension and model.
+    """
     listed: dict[str, Any] = {}
     for record in records:
         where, separator, name = record.name.partition(": ")
@@ -331,7 +367,10 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
 
 
 def overview(records: Sequence[Record]) -> Table:
-    """Return the prices of all models in 3-D: what each adds to a step, as a share of `base`, and to memory."""
+    """Return the prices of all models in 3-D.
+
+    The columns are time per step as a share of `base`, and memory.
+    """
     columns = {"fluids 3d": "liquid", "granular 3d": "sand"}
     priced = {record.name: record for record in records if ": " in record.name}
     names = list(dict.fromkeys(name.split(": ")[1] for name in priced))
@@ -346,7 +385,7 @@ def overview(records: Sequence[Record]) -> Table:
 
 
 def _price(record: Record, base: Record) -> str:
-    """Return what a model adds to a step and to memory, or what `base` takes."""
+    """Return the added time per step and memory of a model, or those of `base`."""
     step, unit = (
         record.figures["step"].value,
         "particle" if "particle_bytes" in record.figures else "cell",
@@ -365,7 +404,7 @@ def _price(record: Record, base: Record) -> str:
 
 
 def write_page(page: Path, results: Results) -> None:
-    """Put the table into the page of the documentation, between its two marks."""
+    """Write the table into the page of the documentation, between its two marks."""
     head, _, rest = page.read_text("utf-8").partition(BEGIN)
     table = "\n".join(markdown(overview(results.records)))
     told = f"One core of {results.records[0].facts['hardware']['cpu']}."
@@ -378,8 +417,10 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--page", type=Path, default=Path("docs/models.md"))
-    given = parser.parse_args()
-    options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
+    arguments = parser.parse_args()
+    options = Options(
+        arguments.device, (), arguments.repeat, lambda text: sys.stderr.write(f"{text}\n")
+    )
     results = measure(options, Path())
     head = (
         "# What models add to a step and to memory, by simulator and dimension; written by "
@@ -388,7 +429,7 @@ def main() -> None:
     Path(str(files("warp_lcp.scene") / TABLE)).write_text(
         head + tomli_w.dumps(price_list(results.records)), "utf-8"
     )
-    write_page(given.page, results)
+    write_page(arguments.page, results)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The problems that are measured: a splash in a closed box, and what makes it harder."""
+"""Problems of the benchmarks: a splash in a closed box, and harder variants."""
 
 from __future__ import annotations
 
@@ -32,14 +32,17 @@ __all__ = [
 
 
 def plane(n: int) -> Splash:
-    """Return the cells of a splash's plane y = 1/2, with their b, as a problem in 2-D on n^2 cells."""
+    """Return a splash's plane y = 1/2 as a 2-D problem of n^2 cells."""
     whole = splash_part(n, (slice(0, n), slice(n // 2, n // 2 + 1), slice(0, n)))
     cells = np.ascontiguousarray(whole.cells[1:-1, 1, 1:-1])
     return Splash(n, cells, whole.b[:, 0].copy(), whole.wall[:, 0].copy())
 
 
 def cut_cells(scene: Splash) -> Splash:
-    """Return the scene with open fractions of the faces near the solid sphere, between 0.1 and 1, as arrays."""
+    """Return the scene with cut faces near the solid sphere.
+
+    Their open fractions are arrays between 0.1 and 1.
+    """
     n = scene.n
     c, f = (np.arange(n) + 0.5) / n, np.arange(n + 1) / n
     faces = {}
@@ -54,12 +57,18 @@ def cut_cells(scene: Splash) -> Splash:
 
 
 def anisotropic(scene: Splash, ratio: float = 100.0) -> Splash:
-    """Return the scene with `ratio` times as large coefficients along z, the axis of gravity there: cells flatter than wide."""
+    """Return the scene with `ratio` times as large coefficients along z.
+
+    Gravity acts along z; the cells are flatter than wide.
+    """
     return Splash(scene.n, scene.cells, scene.b, scene.wall, {"face_x": ratio})
 
 
 def warm_changes(scene: Splash, size: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """Return b and a right-hand side that differs from it by `size` of its norm, by another velocity field."""
+    """Return b and a right-hand side that differs from it by `size` of its norm.
+
+    The difference comes from another velocity field.
+    """
     other = splash(scene.n, phase=0.23).b
     return scene.b, scene.b + size * np.linalg.norm(scene.b) / np.linalg.norm(other) * other
 
@@ -67,14 +76,17 @@ def warm_changes(scene: Splash, size: float = 0.01) -> tuple[np.ndarray, np.ndar
 def natural(
     cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.ndarray
 ) -> np.ndarray:
-    """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere, with coefficients of 1, by no code of the solvers; all of one shape."""
+    """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere.
+
+    Coefficients are 1 and all arrays have one shape. No code of the solvers is used.
+    """
     fluid, air = cells == wl.FLUID, cells == wl.AIR
     p, y = np.where(fluid, x, 0.0), b.copy()
     for axis in range(3):
         below, above = ([slice(None)] * 3 for _ in range(2))
         below[axis], above[axis] = slice(None, -1), slice(1, None)
         i, j = tuple(below), tuple(above)
-        # SOLID cells, and the box around all, let nothing through
+        # SOLID cells, and the box around all, are closed.
         open_ = (fluid[i] & (fluid[j] | air[j])) | (fluid[j] & air[i])
         flux = np.where(open_, p[i] - p[j], 0.0)
         y[i] += flux

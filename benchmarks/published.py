@@ -1,7 +1,8 @@
-"""Methods published for the pressure LCP from 2011 to 2023 on the splash: iterations and seconds to the same residual.
+"""Published methods for the pressure LCP on the splash: iterations and seconds.
 
-Each runs as published as far as that is known (`docs/published-methods.md` says what was read and
-what is reconstructed), cold from p = 0, and then with what this library adds. All share kernels,
+The methods are of 2011 to 2023 and solve to the same residual. Each runs as published, as far as
+that is known: `docs/published-methods.md` says what was read and what is reconstructed. Each starts
+cold from p = 0, and then runs again with the additions of this library. All share kernels,
 precision, multigrid cycles and stopping criteria, so that methods are compared and not
 implementations. `docs/generate/published_figures.py` puts the figures into that page.
 """
@@ -28,15 +29,17 @@ from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 TITLE = "Published methods for the pressure LCP"
 SIZES = (64, 128)
 FLAT = 4  # cells along a side in 2-D, in units of those in 3-D
-REPEATED = 3.0  # [s] of one solve, above which one sample is taken
+REPEATED = 3.0  # [s] of one solve, above which only one sample is taken
 PATIENCE = 20.0  # [s] of one solve, above which a method is not run at larger sizes
 ENGINE = "multigrid, default"
-# that are kept of a case
+# Figures of a case that are recorded.
 FIGURES = ("total", "iterations", "linear_iterations", "residual", "converged")
 
 
 class ProductsOnly(wl.Operator):
-    """The matrix of a grid without its stencil: what a method knows that needs matrix-vector products only.
+    """Matrix of a grid without its stencil.
+
+    Methods that need matrix-vector products only see no more of it.
 
     Args:
         cells: types of the cells.
@@ -62,11 +65,12 @@ class ProductsOnly(wl.Operator):
 
 @dataclass(frozen=True, kw_only=True)
 class TruncatedMultigrid(wl.ProjectedMultigrid):
-    """Multigrid iterations whose coarse levels leave out the active set: neither conjugate directions nor projected cycles.
+    """Multigrid iterations whose coarse levels leave out the active set.
 
-    From x, unknowns at a bound with y = A x + b of the right sign are held; a linear cycle on the
-    others, whose Galerkin coarse levels and interpolation leave the held ones out, gives a
-    correction z; x + t z is projected onto the bounds, t the minimizer of the energy along z.
+    The method has neither conjugate directions nor projected cycles. From x, unknowns at a bound
+    with y = A x + b of the right sign are active. A linear cycle on the other unknowns gives a
+    correction z; its Galerkin coarse levels and its interpolation leave the active ones out. Then x
+    + t z is projected onto the bounds, where t minimizes the energy along z.
     """
 
     def init(self, problem: wl.LCP) -> TruncatedWorkspace:
@@ -76,10 +80,13 @@ class TruncatedMultigrid(wl.ProjectedMultigrid):
 
 
 class TruncatedWorkspace(MultigridWorkspace):
-    """Memory of the method for one problem."""
+    """Workspace of the method for one problem."""
 
     def wants_monotone_cycle(self) -> bool:
-        """Return False, and forget the direction, so that the next one is the cycle's correction."""
+        """Return False, and reset the direction.
+
+        The next direction is then the cycle's correction.
+        """
         self.forget_direction()
         return False
 
@@ -90,9 +97,9 @@ class TruncatedWorkspace(MultigridWorkspace):
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of the tables."""
+    """Row of the tables."""
 
-    source: str  # authors and year; "here" for what this library makes of the method
+    source: str  # authors and year; "here" for variants of this library
     label: str
     solver: Any
     operator: Callable[..., Any] = wl.GridPoisson
@@ -131,7 +138,10 @@ ENTRIES = (
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Measure every method at every size in 3-D and 2-D, with bounds at walls and everywhere."""
+    """Measure every method at every size in 3-D and 2-D.
+
+    The bounds are at walls and everywhere.
+    """
     sizes = options.sizes or SIZES
     where = machine(
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
@@ -155,9 +165,9 @@ def _measure_scene(
     """Measure one sample of every method in each round.
 
     Args:
-        scene: what to solve.
+        scene: the scene to solve.
         options: device and number of rounds.
-        slow: methods with their bounds that are left out; those above PATIENCE are added.
+        slow: pairs of method and bounds that are left out; those above PATIENCE are added.
         load: whether a first round without samples loads the kernels.
     """
     linear = Case(
@@ -201,7 +211,10 @@ def _measure_scene(
 
 
 def _record(case: Case, source: str, linear: Case | None = None) -> Record:
-    """Return the figures of a case, with ratios to the linear solves of the same rounds."""
+    """Return the figures of a case.
+
+    They include ratios to the linear solves of the same rounds.
+    """
     figures = {name: figure for name, figure in case.figures().items() if name in FIGURES}
     if linear is not None:
         of_linear = linear.samples["total"][: len(case.samples["total"])]

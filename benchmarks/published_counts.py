@@ -1,7 +1,7 @@
-"""Published iteration counts of named methods on problems that can be rebuilt exactly, and the counts of the methods here.
+"""Published iteration counts, and the counts of the methods here.
 
-Each runs with the settings, the start and the stopping rule of its source, in double precision; see
-`docs/published-methods.md`.
+The problems can be rebuilt exactly. Each method runs with the settings, the start and the stopping
+rule of its source, in double precision; see `docs/published-methods.md`.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ P4PDES, DEALII, PERMON, TAO, BOOK = (
     "[Book] table C.2",
 )
 MURTY, YOUNG = "Murty 1988", "theory"
-LEVELS = (17, 33, 65, 129, 257)  # nodes a side
-# PETSc's tolerance of linear systems
+LEVELS = (17, 33, 65, 129, 257)  # nodes along a side
+# PETSc's tolerance of linear systems.
 NEWTON: dict[str, Any] = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}
 REDUCED = wl.MinimumMapNewton(safeguard=False, **NEWTON)
 SEMISMOOTH = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0, **NEWTON)
 SOLVED = 1e-8  # PETSc's relative tolerance
-AT_BOUND = 1e-8  # from the bound, where PETSc's active set ends
-KINK = 1e-12  # of x - l and y, below which TAO moves the point
-# as TAO's bqpip: 0.95 of the way to a bound, a start whose products w s have its mean, 2000
+AT_BOUND = 1e-8  # distance from the bound below which PETSc's active set ends
+KINK = 1e-12  # size of x - l and y below which TAO moves the point
+# As TAO's bqpip: 0.95 of the way to a bound, a start with all products w s at their mean, 2000
 PREDICTOR_CORRECTOR = wl.InteriorPoint(
     precision="double", monotone_cycles=0, backoff=0.95, start=120.0, predictor_eta=1e-8, eta=1e-8
 )
@@ -48,16 +48,16 @@ PREDICTOR_CORRECTOR = wl.InteriorPoint(
 
 @dataclass(frozen=True)
 class Count:
-    """Published numbers of iterations and the function that counts them here.
+    """Published iteration counts, and the function that counts here.
 
     Attributes:
         method: name in `wl.METHODS`.
         problem: problem, grids and start.
         printed: the published numbers.
-        source: where they were read.
-        measure: counts iterations here, a number for each printed one.
-        reason: why a number here differs by more than WITHIN; empty: none does.
-        slow: whether that takes seconds.
+        source: source of the numbers.
+        measure: function that counts iterations here, a number for each printed one.
+        reason: why a number here differs by more than WITHIN; empty if none does.
+        slow: whether the count takes seconds.
     """
 
     method: str
@@ -69,14 +69,14 @@ class Count:
     slow: bool = False
 
     def row(self, here: Sequence[float]) -> str:
-        """Return the row of docs/published-methods.md with the counts found here."""
+        """Return the row of docs/published-methods.md with the counts measured here."""
         printed, found = (
             ", ".join(f"{n:.4g}" for n in numbers) for numbers in (self.printed, here)
         )
         return f"| `{self.method}` | {self.problem} | {printed} | {found} | {self.source} |"
 
 
-# a norm of x and y, fields of the problem's shape
+# A norm of x and y, fields of the problem's shape.
 Small = Callable[[np.ndarray, np.ndarray], float]
 
 
@@ -89,10 +89,12 @@ def steps_until(
     relative: bool = True,
     x0: np.ndarray | None = None,
 ) -> wl.SolveResult:
-    """Solve until a norm of (x, y) is at most `tolerance`, or that times its first value.
+    """Solve until a norm of (x, y) is at most a tolerance.
+
+    The tolerance is absolute, or relative to the first value.
 
     Raises:
-        RuntimeError: the method ends before.
+        RuntimeError: the method ends earlier.
     """
     work, norms = method.init(problem), list[float]()
     unknown, b = (problem.layout.unload(stored).numpy() for stored in (problem.unknown, problem.b))
@@ -117,7 +119,10 @@ def reduced_norm(lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
 
 
 def fischer_norm(lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
-    """Return the norm of the Fischer-Burmeister map of x - l and y (PETSc's SNESVINEWTONSSLS)."""
+    """Return the norm of the Fischer-Burmeister map (PETSc's SNESVINEWTONSSLS).
+
+    The map is that of x - l and y.
+    """
     a = np.where(np.isfinite(lower), x - lower, 0.0)
     return float(np.linalg.norm(a + y - np.hypot(a, y)))
 
@@ -129,7 +134,10 @@ def projected_gradient_norm(lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> 
 
 @cache
 def hemisphere(n: int) -> Problem:
-    """Return PETSc's ex9.c: a ball obstacle whose height beyond r^2 = 0.9 is linear in r^2."""
+    """Return PETSc's ex9.c: a membrane over a ball.
+
+    Beyond r^2 = 0.9 the obstacle's height is linear in r^2.
+    """
     s = np.linspace(-2, 2, n)
     square = s[:, None] ** 2 + s**2
     edge, height = 0.9, (1 - 0.9**2) ** 0.5
@@ -149,12 +157,15 @@ def _membrane(n: int, method: Any, norm: Any, x0: np.ndarray | None = None) -> w
 
 
 def cold_membrane(method: Any, norm: Any, levels: Sequence[int] = LEVELS) -> tuple[float, ...]:
-    """Return the iterations by grid from x = max(0, psi)."""
+    """Return the iterations on each grid from x = max(0, psi)."""
     return tuple(_membrane(n, method, norm).iterations for n in levels)
 
 
 def sequenced_membrane(method: Any, norm: Any) -> tuple[float, ...]:
-    """Return the iterations by grid, each started from the bilinear interpolant of the coarser solution, 5^2 nodes first."""
+    """Return the iterations on each grid with grid sequencing.
+
+    Each starts from the bilinear interpolant of the coarser solution; the first has 5^2 nodes.
+    """
     counts, x, n = dict[int, float](), None, 5
     while n <= LEVELS[-1]:
         result = _membrane(n, method, norm, x)
@@ -177,7 +188,11 @@ def _refined(u: np.ndarray) -> np.ndarray:
 
 
 def stairs_problem() -> tuple[wl.LCP, np.ndarray]:
-    """Return deal.II's step-41 and its obstacle: bilinear elements on 128^2 cells of [-1, 1]^2, load -10, u >= a stair of four steps."""
+    """Return the problem of deal.II's step-41 and its obstacle.
+
+    It has bilinear elements on 128^2 cells of [-1, 1]^2, the load -10, and u >= a stair of four
+    steps.
+    """
     n = 129
     x = np.linspace(-1, 1, n)
     stair = np.broadcast_to(
@@ -197,9 +212,10 @@ ACTIVE_SET = wl.PrimalDualActiveSet(monotone_cycles=0, eta=1e-3, precision="doub
 
 
 def stairs() -> tuple[float, ...]:
-    """Return the linear solves of the active set method on the stairs until the set stays the same.
+    """Return the linear solves of the active-set method on the stairs.
 
-    An unknown is active where y > c h^2 (u - g), c = 100. The first solve has no active unknown.
+    The method ends when the set stays the same. An unknown is active where y > c h^2 (u - g), c =
+    100. The first solve has no active unknown.
     """
     problem, stair = stairs_problem()
     weight = 100 * (2 / (len(stair) - 1)) ** 2
@@ -207,14 +223,17 @@ def stairs() -> tuple[float, ...]:
 
     def change(u: np.ndarray, y: np.ndarray) -> float:
         sets.append(np.pad((y > weight * (u - stair))[1:-1, 1:-1], 1))
-        # the start is no iterate
+        # The start is no iterate.
         return 1.0 if len(sets) == 2 else float(np.count_nonzero(sets[-1] ^ sets[-2]))
 
     return (steps_until(problem, ACTIVE_SET, change, 0.0, relative=False).iterations,)
 
 
 def string_problem() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return A, b, the obstacle and the tolerance of PERMON's ex1.c: a string above a sine, 100 nodes."""
+    """Return A, b, obstacle and tolerance of PERMON's ex1.c.
+
+    The problem is a string above a sine with 100 nodes.
+    """
     n = 100
     h, i = 1 / (n - 1), np.arange(1, n - 1)
     A = 2 * np.eye(n - 2) - np.eye(n - 2, k=1) - np.eye(n - 2, k=-1)
@@ -222,13 +241,19 @@ def string_problem() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 
 
 def bearing_problem(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return A, b, the bound and the tolerance of PERMON's jbearing2.c: a journal bearing of eccentricity 0.1."""
+    """Return A, b, bound and tolerance of PERMON's jbearing2.c.
+
+    The problem is a journal bearing of eccentricity 0.1.
+    """
     problem = journal_bearing(nx, ny, device="cpu").dense()
     return problem.A, problem.b, np.asarray(problem.lower), 1e-6
 
 
 def gradient_steps(A: Any, b: np.ndarray, lower: np.ndarray, tolerance: float) -> float:
-    """Return MPRGP's steps to a projected gradient of `tolerance` times b; proportioning steps count apart, as in PERMON."""
+    """Return MPRGP's steps to a projected gradient of `tolerance` times b.
+
+    Proportioning steps count separately, as in PERMON.
+    """
     norm = partial(projected_gradient_norm, lower)
     method = wl.MPRGP(precision="double", monotone_cycles=0)
     return steps_until(
@@ -247,10 +272,12 @@ def bearings(*sizes: tuple[int, int]) -> tuple[float, ...]:
 
 
 def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Return A, the payoff and b(V) of PETSc's blackscholes.c: a time step of an American put by Crank and Nicolson's scheme.
+    """Return A, the payoff and b(V) of PETSc's blackscholes.c.
 
-    Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has 151 values,
-    those of the step before.
+    The problem is a time step of an American put by Crank and Nicolson's scheme, for V_t = (rate -
+    dividend) S V_S + volatility^2 S^2 / 2 V_SS - rate V, t the time to expiry. The term rate V is
+    treated implicitly. Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has
+    the 151 values of the step before.
     """
     strike, rate, dividend, volatility, step = 10.0, 0.04, 0.01, 0.4, 0.1
     S = np.linspace(0, 100, 151)
@@ -271,10 +298,10 @@ def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.nda
 
 
 def fischer_gradient(A: np.ndarray, lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
-    """Return the norm of the gradient J'f of the Fischer-Burmeister map's merit (TAO's semismooth methods).
+    """Return the gradient norm of the Fischer-Burmeister merit function.
 
-    J = diag(p) + diag(q) A; at kinks p and q are those of a point moved along z, 1 at kinks and 0
-    elsewhere.
+    As in TAO's semismooth methods, it is the norm of J'f, J = diag(p) + diag(q) A. At kinks, p and
+    q are those of a point moved along z, which is 1 at kinks and 0 elsewhere.
     """
     a = x - lower
     rho = np.hypot(a, y)
@@ -287,7 +314,10 @@ def fischer_gradient(A: np.ndarray, lower: np.ndarray, x: np.ndarray, y: np.ndar
 
 
 def put() -> tuple[float, ...]:
-    """Return the Newton steps of the nine time steps of the put, each from the values of the step before."""
+    """Return the Newton steps of the put's nine time steps.
+
+    Each starts from the values of the step before.
+    """
     A, payoff, right_side = put_problem()
     lower, V, counts = payoff[1:-1], payoff, list[float]()
     method = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0, precision="double")
@@ -300,14 +330,17 @@ def put() -> tuple[float, ...]:
 
 
 def gap_norm(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the root of the complementarity gap plus the dual infeasibility (TAO's bqpip), for x >= 0."""
+    """Return the optimality measure of TAO's bqpip, for x >= 0.
+
+    It is the root of the complementarity gap plus the dual infeasibility.
+    """
     return float(
         np.sqrt(np.maximum(x, 0.0) @ np.maximum(y, 0.0) + np.abs(np.minimum(y, 0.0)).sum())
     )
 
 
 def interior_bearing() -> tuple[float, ...]:
-    """Return the interior-point steps on the journal bearing of eccentricity 0.9."""
+    """Return the interior-point steps on the bearing of eccentricity 0.9."""
     problem = journal_bearing(10, 16, 0.9, device="cpu").dense()
     return (
         steps_until(
@@ -317,7 +350,10 @@ def interior_bearing() -> tuple[float, ...]:
 
 
 def murty_problem(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return A and b of Murty's problem: 1 on the diagonal, 2 below, b_i = -(2^(n+1) - 2^(n-i)), i = 0, ... n - 1."""
+    """Return A and b of Murty's problem.
+
+    A has 1 on the diagonal and 2 below; b_i = -(2^(n+1) - 2^(n-i)), i = 0, ... n - 1.
+    """
     return np.eye(n) + 2 * np.tril(np.ones((n, n)), -1), 2.0 ** (n - np.arange(n)) - 2.0 ** (n + 1)
 
 
@@ -329,10 +365,10 @@ def pivots(*sizes: int) -> tuple[float, ...]:
 
 
 def slowest_mode(n: int, *, by_rows: bool) -> tuple[np.ndarray, float]:
-    """Return the error that sweeps on the 5-point operator of n^2 nodes reduce least, shape (n, n), and the factor.
+    """Return the error that sweeps reduce least, shape (n, n), and its factor.
 
-    Jacobi's is cos(pi h) with h = 1 / (n + 1); Gauss and Seidel's, row by row, its square (Young
-    1971).
+    The operator is the 5-point one on n^2 nodes. The factor of Jacobi is cos(pi h) with h = 1 / (n
+    + 1); that of Gauss-Seidel, row by row, is its square (Young 1971).
     """
     k, factor = np.arange(1, n + 1), float(np.cos(np.pi / (n + 1)))
     wave = np.sin(np.pi * k / (n + 1)) * (factor**k if by_rows else 1.0)
@@ -340,7 +376,10 @@ def slowest_mode(n: int, *, by_rows: bool) -> tuple[np.ndarray, float]:
 
 
 def sweeps(n: int, method: Any, *, by_rows: bool) -> float:
-    """Return the sweeps that divide the slowest error by 1e6 where no bound is met: A x = A 1, x >= 0 from 1 plus that error."""
+    """Return the sweeps that divide the slowest error by 1e6.
+
+    No bound is active: A x = A 1, x >= 0, from 1 plus that error.
+    """
     line = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     A = np.kron(line, np.eye(n)) + np.kron(np.eye(n), line)
     error = slowest_mode(n, by_rows=by_rows)[0].ravel()
@@ -354,7 +393,7 @@ def sweeps(n: int, method: Any, *, by_rows: bool) -> float:
 
 
 def theory(n: int, *, by_rows: bool) -> float:
-    """Return the sweeps that the factor of the slowest error says."""
+    """Return the sweeps predicted by the factor of the slowest error."""
     return float(np.ceil(np.log(1e-6) / np.log(slowest_mode(n, by_rows=by_rows)[1])))
 
 
@@ -365,13 +404,16 @@ def recipe(kind: str, method: str, problems: int) -> tuple[float, ...]:
 
 
 def contact_problem(k: int, tangents: int = 3) -> Problem:
-    """Return a problem of 30 contacts by the recipe of Num4LCP, whose Python code fills three of four tangents."""
+    """Return a problem of 30 contacts by the recipe of Num4LCP.
+
+    Its Python code fills three of four tangents.
+    """
     rng = np.random.default_rng([book.SEED + 1, k])
     return book.recipe(book.contact_matrix(30, rng, tangents), rng, f"contact {k}")
 
 
 def contacts(problems: int) -> tuple[float, ...]:
-    """Return Fischer-Newton's mean iterations by the book's tests on random contacts."""
+    """Return Fischer-Newton's mean iterations on random contacts, by the book's tests."""
     return _mean("Fischer-Newton", [contact_problem(k) for k in range(problems)])
 
 
@@ -479,6 +521,6 @@ COUNTS: tuple[Count, ...] = (
 )
 
 
-if __name__ == "__main__":  # the table of docs/published-methods.md
+if __name__ == "__main__":  # prints the table of docs/published-methods.md
     for count in COUNTS:
         sys.stdout.write(f"{count.row(count.measure())}\n")

@@ -1,9 +1,12 @@
-"""What a liquid costs a rank: `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
+"""Cost of a liquid on each rank: seconds, memory and received bytes.
 
-Prints the figures of the rank that has most of each. Seconds are the processor's, so that neighbors
-on the machine count less; a rank that waits for others in MPI takes them, too. Memory is the most
-that the process held, less what it held with Python, libraries and kernels. Bytes are those that a
-rank receives, by who sends them and why.
+Run `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for
+docs/planning.md.
+
+Each printed figure is that of the rank with the largest value. Seconds are CPU seconds, so that
+other programs on the machine count less; waiting in MPI uses CPU time too. Memory is the peak of
+the process, less its memory after Python, libraries and kernels were loaded. Bytes are those that a
+rank receives, by sender and reason.
 """
 
 from __future__ import annotations
@@ -28,18 +31,22 @@ from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp.rows.program import LaunchGraph, Program
 from warp_lcp.scene.scene_file import load_scene
 
-SKIPPED, STEPS = 10, 10  # liquid moves when it is measured
+SKIPPED, STEPS = 10, 10  # the liquid moves when it is measured
 SMALL = "domain.resolution=32"  # loads the kernels
 MEGA = 1 << 20
 
 
 class Traffic:
-    """What a rank receives: bytes and occasions, by their kind; those of a recorded program at each of its runs."""
+    """Counter of the bytes and messages that a rank receives, by kind.
+
+    Exchanges of a recorded program count at each of its runs.
+    """
 
     def __init__(self) -> None:
-        """Count from here on, in this process."""
+        """Start to count, in this process."""
         self.bytes, self.times = Counter[str](), Counter[str]()
-        self._recorded: list[tuple[str, int]] | None = None  # by the program that is being recorded
+        # Calls of the program that is being recorded.
+        self._recorded: list[tuple[str, int]] | None = None
         self._listen(
             Subdomain,
             "fill",
@@ -59,7 +66,7 @@ class Traffic:
         self._listen(
             Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes
         )
-        # sent; as much comes
+        # Sent bytes; as many are received.
         self._listen(
             MpiMailbox,
             "swap",
@@ -77,7 +84,7 @@ class Traffic:
         setattr(kind, name, counted)
 
     def _listen_to_programs(self) -> None:
-        """Count what is recorded when it runs, not when it is recorded."""
+        """Count recorded exchanges when they run, not when they are recorded."""
         record, run, recorded = (
             LaunchGraph._recorded,
             Program.run,
@@ -108,7 +115,7 @@ class Traffic:
 
 @cache
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
-    """Return how many ghost cells are filled."""
+    """Return the number of ghost cells that are filled."""
     forest = (
         owner._forest
         if isinstance(owner, Halo)
@@ -124,7 +131,7 @@ def _item(field: wp.array | np.ndarray) -> int:
 
 
 def main() -> None:
-    """Measure on the ranks there are."""
+    """Measure on all ranks."""
     wp.config.log_level = wp.LOG_ERROR
     ranks, (name, *overrides) = Ranks.world(), sys.argv[1:]
     traffic, make = (
@@ -142,7 +149,7 @@ def main() -> None:
         simulation.step(simulation.stable_dt())
     traffic.bytes.clear()
     traffic.times.clear()
-    begun = time.process_time()
+    start_time = time.process_time()
     rows = [simulation.step(simulation.stable_dt()) for _ in range(STEPS)]
     part: Any = simulation.grid.part
     box = part.box.counts
@@ -152,8 +159,8 @@ def main() -> None:
         for side in range(2)
         if part.cuts >> 2 * axis + side & 1
     )
-    seconds = (time.process_time() - begun) / STEPS
-    found = {
+    seconds = (time.process_time() - start_time) / STEPS
+    figures = {
         "cells of the box": part.box.cells,
         "cells stored": part.grid.size,
         "particles": simulation.particles.count,
@@ -164,7 +171,7 @@ def main() -> None:
         **{f"{kind}: bytes a step": size / STEPS for kind, size in sorted(traffic.bytes.items())},
         **{f"{kind}: times a step": count / STEPS for kind, count in sorted(traffic.times.items())},
     }
-    most = ranks.max(np.array([*found.values()], dtype=float))
+    most = ranks.max(np.array([*figures.values()], dtype=float))
     if ranks.is_root:
         counts = [key for key in ("solve_iterations", "density_iterations") if key in rows[0]]
         solves = [f"{np.mean([row[key] or 0 for row in rows]):.1f} {key}" for key in counts]
@@ -172,7 +179,7 @@ def main() -> None:
             f"{name} {' '.join(overrides)}, {ranks.size} ranks, {cpu_model()}; a step: "
             f"{', '.join(solves)}"
         )
-        for key, value in zip(found, most, strict=True):
+        for key, value in zip(figures, most, strict=True):
             print(f"{value:14,.1f}  {key}")
 
 

@@ -1,7 +1,8 @@
-"""The solves of the suite `scaling` on several ranks of PETSc: strong scaling, memory of a rank, and the price of being shared.
+"""Suite `ranks`: solves of the suite `scaling` on several ranks of PETSc.
 
-Started by `mpiexec`, it measures on the ranks there are, each of which makes its own box of the
-grid only. Otherwise it starts 1, 2 and 4 ranks itself, one after the other.
+It measures strong scaling, the memory of a rank, and the overhead of the distribution. Started by
+`mpiexec`, it measures on the running ranks; each rank makes only its own box of the grid. Otherwise
+it starts 1, 2 and 4 ranks itself, one after the other.
 """
 
 from __future__ import annotations
@@ -49,16 +50,15 @@ from warp_lcp.run.devices import devices, free_memory
 TITLE = "Solves on several ranks"
 SIZES = (64, 128)
 RANKS = (1, 2, 4)
-# relative difference that is left between the residual that a solve tells and the one that is
-# computed here
+# Largest relative difference of the residual that a solve reports and the recomputed one.
 ROUNDED = 1e-3
 TOLD = "to_1e-06"
-# [s] between two looks of a rank that waits: it leaves its core to the one that computes
+# [s] between two tests of a waiting rank; it leaves its core to the rank that computes.
 PAUSE = 0.002
-PLANNED = (ValueError, MemoryError, OSError)  # whose messages say enough
+PLANNED = (ValueError, MemoryError, OSError)  # errors whose messages say enough
 FAILED, WRONG_INPUT = 1, 2  # exit codes
 MEGA = 1 << 20
-WALLS = BOUNDS.index("walls")  # whose memory is counted: the others need as much or less
+WALLS = BOUNDS.index("walls")  # bounds whose memory is counted; the others need at most as much
 MEMORY = ("bytes_per_cell", "resident", "resident_more")
 
 Found = Mapping[tuple[int, str, int], Record]  # by cells a side, bounds, ranks
@@ -68,7 +68,7 @@ Found = Mapping[tuple[int, str, int], Record]  # by cells a side, bounds, ranks
 class Shared:
     """One kind of bounds at one size, on all ranks."""
 
-    decomposition: Decomposition  # of the n^3 cells
+    decomposition: Decomposition  # decomposition of the n^3 cells
     part: SplashPart  # this rank's cells
     bounds: str  # `linear`, `walls`, `everywhere`
     device: str  # Warp device of this rank
@@ -77,7 +77,7 @@ class Shared:
 
     @property
     def ranks(self) -> Ranks:
-        """Who share it."""
+        """Ranks of the decomposition."""
         return self.decomposition.ranks
 
     @cached_property
@@ -101,7 +101,10 @@ class Shared:
         return problem, solver, solver.init(problem)
 
     def sample(self, *, keep: bool) -> None:
-        """Solve from the arrays of cells and b to the tightest tolerance; seconds are those of the slowest rank."""
+        """Solve from the arrays of cells and b to the tightest tolerance.
+
+        Seconds are those of the slowest rank.
+        """
         self.ranks.comm.Barrier()
         begun = time.perf_counter()
         problem, solver, work = self.build()
@@ -126,7 +129,10 @@ class Shared:
                 self.samples[name].append(setup + self.ranks.max(met.seconds))
 
     def residual(self, x: np.ndarray) -> float:
-        """Return the relative natural residual of x, this rank's part of the solution; by NumPy in float64, not as the solve does it."""
+        """Return the relative natural residual of x, this rank's part of the solution.
+
+        It is computed by NumPy in float64, independently of the solver.
+        """
         inner = (slice(1, -1),) * 3
         cells, b = self.part.cells, np.pad(self.part.b, 1)
         lower = np.pad(self.lower, 1) if isinstance(self.lower, np.ndarray) else self.lower
@@ -139,10 +145,12 @@ class Shared:
         return math.sqrt(self.ranks.sum(squares[0]) / self.ranks.sum(squares[1]))
 
     def memory(self, before: int) -> None:
-        """Count what the ranks hold in a solve: bytes of arrays a cell, the most that a process has, and that less `before`.
+        """Measure the memory of the ranks in a solve.
+
+        The figures are bytes of arrays per cell, the peak of a process, and the peak less `before`.
 
         Args:
-            before: bytes that this process held when it had loaded its kernels, and not this scene.
+            before: bytes of this process with its kernels, before the scene was made.
         """
         forget_peak()
         arrays, most = array_bytes(), list[int]()
@@ -168,7 +176,10 @@ class Shared:
         self.counts["resident_more"] = self.ranks.max(peak - before) / MEGA
 
     def record(self, plain: Growing | None, team: Growing | None) -> Record:
-        """Return the figures; `plain` is the same solve by one process, `team` by one with a thread for each rank."""
+        """Return the figures.
+
+        `plain` is the same solve by one process, `team` by one with a thread for each rank.
+        """
         figures = {name: Figure.of(taken, "s") for name, taken in self.samples.items() if taken}
         units = {"bytes_per_cell": "B", "resident": "MiB", "resident_more": "MiB"}
         figures |= {name: Figure(value, units.get(name, "")) for name, value in self.counts.items()}
@@ -192,10 +203,10 @@ class Shared:
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Measure on the ranks there are, or on each number of ranks in a run of its own.
+    """Measure on the running ranks, or on each number of ranks in a run of its own.
 
     Raises:
-        SystemExit: on all ranks but the first, and on all with an exit code that is not 0 where one
+        SystemExit: on all ranks except the first; on all ranks, with a nonzero exit code, if one
             has failed.
     """
     sizes = sorted(options.sizes or SIZES)
@@ -206,7 +217,7 @@ def measure(options: Options, out: Path) -> Results:
         raise SystemExit(WRONG_INPUT)
     else:
         records = [record for count in RANKS for record in _started(count, sizes, options)]
-    found = {
+    by_case = {
         (r.facts["n"], r.facts["bounds"], r.facts["ranks"]): r
         for r in records
         if "boxes" in r.facts
@@ -216,16 +227,19 @@ def measure(options: Options, out: Path) -> Results:
         elements=1 << 22,
         repeat=options.repeat,
     )
-    charts = [] if launch.rank_here() is not None else [_chart(found, sizes)]
+    charts = [] if launch.rank_here() is not None else [_chart(by_case, sizes)]
     return Results(
-        [where, *records], [targets(found, sizes), _table(found)], list(charts), _failures(records)
+        [where, *records],
+        [targets(by_case, sizes), _table(by_case)],
+        list(charts),
+        _failures(records),
     )
 
 
 def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
-    """Measure on so many ranks, started here."""
+    """Start so many ranks and measure on them."""
     with tempfile.TemporaryDirectory() as folder:
-        asked = [
+        suite_options = [
             *(part for n in sizes for part in ("--size", str(n))),
             "--repeat",
             str(options.repeat),
@@ -236,7 +250,7 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
             "-m",
             "warp_lcp.benchmarks",
             "ranks",
-            *asked,
+            *suite_options,
             "--repeat",
             str(options.repeat),
             "--device",
@@ -244,7 +258,7 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
             "--out",
             folder,
         ]
-        idle = str(int(count > (os.cpu_count() or 1)))  # to give cores away costs microseconds
+        idle = str(int(count > (os.cpu_count() or 1)))  # yielding a core costs microseconds
         waiting = {VARIABLE: "1", "OMPI_MCA_mpi_yield_when_idle": idle}
         process = subprocess.run(
             launch.command(count, *arguments), env=launch.environment() | waiting, check=False
@@ -256,7 +270,10 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
 
 
 def _together(sizes: Sequence[int], options: Options) -> list[Record]:
-    """Measure on the ranks that mpiexec has started; every rank calls it, and only the first one returns."""
+    """Measure on the ranks that mpiexec has started.
+
+    Every rank calls it; only the first one returns.
+    """
     wp.config.log_level = wp.LOG_ERROR
     ranks = Ranks.world()
     try:
@@ -276,10 +293,10 @@ def _together(sizes: Sequence[int], options: Options) -> list[Record]:
 def on_ranks(
     ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[str], object]
 ) -> list[Record]:
-    """Measure the sizes that fit on all ranks, one sample of each in every round; collective.
+    """Measure the sizes that fit on all ranks, one sample of each in every round.
 
-    The first rank also solves each problem alone, on one thread and on as many as there are ranks,
-    in the same rounds, as far as it fits on its machine.
+    This call is collective. The first rank also solves each problem alone, on one thread and on as
+    many as there are ranks, in the same rounds, as far as it fits on its machine.
 
     Raises:
         MemoryError: no size fits.
@@ -290,7 +307,7 @@ def on_ranks(
     devices()  # starts Warp without its native messages
     here = device_of_rank(ranks, device)
     for case in shared_cases(min(sizes), ranks, here):
-        case.sample(keep=False)  # loads kernels
+        case.sample(keep=False)  # loads the kernels
     records, cases, threads = (
         list[Record](),
         list[tuple[Shared, Growing | None, Growing | None]](),
@@ -304,7 +321,7 @@ def on_ranks(
             )
             continue
         forget_peak()
-        before = resident_bytes()  # with the arrays of smaller grids
+        before = resident_bytes()  # includes the arrays of smaller grids
         shared = shared_cases(n, ranks, here)
         shared[WALLS].memory(before)
         for case in shared:
@@ -335,7 +352,7 @@ def on_ranks(
                     wl.set_threads(count)
                     plain.sample(keep=turn > 0)
             wl.set_threads(threads)
-            request = ranks.comm.Ibarrier()  # for the first rank
+            request = ranks.comm.Ibarrier()  # waits for the first rank
             while not request.Test():
                 time.sleep(PAUSE)
     return [*records, *(case.record(*others) for case, *others in cases)]
@@ -349,7 +366,7 @@ def shared_cases(n: int, ranks: Ranks, device: str) -> list[Shared]:
 
 
 def _fits(cells: int, device: str) -> bool:
-    """Return whether a scene and its solve fit on this rank's machine."""
+    """Return whether a scene and its solve fit into this rank's memory."""
     free, host = free_memory(device), free_memory("cpu")
     need = {
         device: SOLVE_BYTES * cells,
@@ -361,13 +378,13 @@ def _fits(cells: int, device: str) -> bool:
 
 
 def _ratio(a: Record | None, b: Record | None, figure: str) -> Figure | None:
-    """Return a figure of one record over that of another."""
+    """Return the ratio of a figure in two records."""
     first, second = (None if r is None else r.value(figure) for r in (a, b))
     return None if first is None or not second else Figure(first / second)
 
 
 def targets(found: Found, sizes: Sequence[int]) -> Table:
-    """Return the figures to reach, at the sizes from 128^3 on."""
+    """Return the targets at the sizes from 128^3 on."""
     rows = []
     for n in (size for size in sizes if size >= 128):
         counts = [
@@ -380,7 +397,7 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
         spread_ = Figure(max(counts) - min(counts)) if len(counts) == len(RANKS) else None
         single = one.figures.get(f"{TOLD}_over_single") if one else None
         team = two.figures.get(f"{TOLD}_over_team") if two else None
-        # without a core for each rank it tells nothing
+        # Meaningless without a core for each rank.
         gain = _ratio(one, two, TOLD) if (os.cpu_count() or 1) >= 2 else None
         rows += [
             Target(
@@ -462,7 +479,7 @@ def _table(found: Found) -> Table:
 
 
 def _failures(records: Sequence[Record]) -> list[str]:
-    """Return solves that do not converge, or whose x has not the residual that they tell."""
+    """Return solves that do not converge or report a wrong residual."""
     lines = []
     for record in (r for r in records if "boxes" in r.facts):
         told, computed = record.figures["told"].value, record.figures["residual"].value
@@ -474,7 +491,7 @@ def _failures(records: Sequence[Record]) -> list[str]:
 
 
 def _chart(found: Found, sizes: Sequence[int]) -> Lines:
-    """Return what ranks gain on a grid."""
+    """Return the chart of the speedup by ranks."""
     gains: dict[str, tuple[list[float], list[float]]] = {
         "as many times as ranks": (list(RANKS), list(RANKS))
     }

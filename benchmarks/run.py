@@ -1,4 +1,4 @@
-"""Steps per second of built-in scenes, where the time goes, and what particles and walls cost there."""
+"""Steps per second of built-in scenes, by stage, and the cost of particles, walls."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
 PARTICLES = 128  # cells along the longest side of the scene whose particles are timed
 PARTICLE_STEPS = 12
-# [s] simulated of the scene in which solves with and without walls are compared: the splash lies in
-# it
+# [s] simulated in the scene that compares solves with and without walls: the splash is within this
+# time.
 WALL_TIME = 0.6
-# solids fill whole cells, as they do by themselves at the suite's own resolutions
+# Solids fill whole cells, the default at the suite's own resolutions.
 WHOLE = "domain.solids=voxel"
 STAGES: dict[str, tuple[ModuleType | type, str]] = {
     "to grid": (ParticleSimulation, "particles_to_grid"),
@@ -42,31 +42,31 @@ STAGES: dict[str, tuple[ModuleType | type, str]] = {
 
 
 class Watch:
-    """Takes the rows of a run's log."""
+    """Observer that collects the rows of a run's log."""
 
     def __init__(self) -> None:
         self.rows: list[Mapping[str, Any]] = []
 
     def note(self, text: str) -> None:
-        """Take a remark."""
+        """Ignore a remark."""
 
     def start(self, time: float, end: float) -> None:
-        """Learn the time [s] that the run begins and ends at."""
+        """Ignore the time [s] of the begin and of the end."""
 
     def step(self, row: Mapping[str, Any]) -> None:
-        """Take a step's row."""
+        """Store a step's row."""
         self.rows.append(row)
 
     def frame(self, index: int, last: int) -> None:
-        """Learn that a frame was written."""
+        """Ignore a written frame."""
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Run the scenes in turns, then compare walls and time the particles."""
+    """Run the scenes, interleaved; then compare walls and time the particles."""
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
     size = max(options.sizes, default=0)
     samples: dict[str, list[dict[str, float]]] = {name: [] for name in SCENES}
-    for turn in range(options.repeat + 1):  # the first one loads kernels
+    for turn in range(options.repeat + 1):  # the first turn loads kernels
         options.say(f"scenes, round {turn} of {options.repeat}")
         for name, duration in SCENES.items():
             sample = _run(name, duration, size, options.device)
@@ -96,7 +96,7 @@ def _overrides(duration: float, size: int) -> list[str]:
 
 
 def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]:
-    """Run a scene into a temporary folder; return its steps and seconds by stage."""
+    """Run a scene in a temporary folder; return its steps and seconds by stage."""
     scene, watch = load_scene(name, _overrides(duration, size)), Watch()
     with tempfile.TemporaryDirectory() as folder, timed(device, STAGES) as seconds:
         begun = time.perf_counter()
@@ -130,7 +130,10 @@ def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> Record:
 
 
 class BothSolves:
-    """In the place of `wl.solve`: solves as asked, and the same problem without bounds, each warm from its own last solution."""
+    """Replacement of `wl.solve` that also solves without bounds.
+
+    Each of the two solves starts from its own last solution.
+    """
 
     def __init__(self, plain: Any, device: str) -> None:
         self.plain, self.device = plain, device
@@ -142,7 +145,7 @@ class BothSolves:
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     def __call__(self, problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
-        """Solve both and keep the seconds."""
+        """Solve both problems and record the seconds."""
         if self._problem is None:
             self._problem = wl.LCP(
                 problem.A, problem.b.reshape(problem.layout.stored_shape), -np.inf, np.inf
@@ -170,7 +173,10 @@ class BothSolves:
         return result
 
     def _start(self, x0: wp.array[Any]) -> wp.array[Any]:
-        """Scale the last linear solution as the scene scaled its own: by the ratio of time steps."""
+        """Scale the last linear solution by the ratio of time steps.
+
+        The scene scales its own solution in the same way.
+        """
         if self._last is None:
             return wp.clone(x0)
         guess, (bounded, free) = x0.numpy(), self._last
@@ -186,7 +192,7 @@ class BothSolves:
 
 
 def _walls(size: int, options: Options) -> Record:
-    """Solve every step of the running dam break with separating walls and without bounds."""
+    """Solve each step of a dam break with separating walls and without bounds."""
     scene = load_scene(
         "dam-break",
         [
@@ -220,7 +226,7 @@ def _walls(size: int, options: Options) -> Record:
 
 
 def _particles(size: int, options: Options) -> Record:
-    """Step a dam break and time what its particles cost."""
+    """Step a dam break and time its particle stages."""
     scene = load_scene("dam-break", [WHOLE, f"domain.resolution={size}"])
     simulation: Any = simulators()[scene.scene.simulator].create(
         scene, device=options.device, folder=Path.cwd()
@@ -229,14 +235,14 @@ def _particles(size: int, options: Options) -> Record:
     with timed(options.device, STAGES) as seconds:
         for _ in range(PARTICLE_STEPS + 1):
             simulation.step(min(simulation.stable_dt(), scene.time.dt_max))
-    there, back = seconds["to grid"][1:], seconds["to particles"][1:]
+    to_grid, back = seconds["to grid"][1:], seconds["to particles"][1:]
     figures = {"particles": Figure(count)}
     figures |= {
         label: Figure.of([1e9 * t / count for t in times], "ns")
-        for label, times in (("to_grid", there), ("to_particles", back))
+        for label, times in (("to_grid", to_grid), ("to_particles", back))
     }
     figures["round_trip"] = Figure.of(
-        [1e9 * (a + b) / count for a, b in zip(there, back, strict=True)], "ns"
+        [1e9 * (a + b) / count for a, b in zip(to_grid, back, strict=True)], "ns"
     )
     figures["advection"] = Figure.of([1e9 * t / count for t in seconds["advection"][1:]], "ns")
     return Record("particles, 3-D", figures)

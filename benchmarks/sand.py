@@ -1,4 +1,7 @@
-"""Sand: the coupled methods at equal residual from the same states, the yield sets, and what a step costs."""
+"""Sand: coupled methods at equal residual, the yield sets, and cost of a step.
+
+The methods start from the same states.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +22,12 @@ from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
 TITLE = "Sand: pressure and friction together"
-# [s] into the collapse
+# [s] into the collapse.
 STATES = {"falling": 0.1, "mid-flow": 0.25, "spreading": 0.4, "coming to rest": 0.8}
-TOLERANCE = 1e-3  # of the stresses, in units of rho g dx
-MOST = 4000  # iterations that a method may take here
+TOLERANCE = 1e-3  # tolerance of the stresses, in units of rho g dx
+MOST = 4000  # limit of the iterations of a method
 COLLAPSE_END = 1.2  # [s]
-STEPS = 20  # of the large scenes that are timed
+STEPS = 20  # timed steps of the large scenes
 COLLAPSE = {
     "a step": "seconds_per_step",
     "iterations": "iterations",
@@ -33,7 +36,7 @@ COLLAPSE = {
     "last top speed": "max_speed",
     "last energy, of the most": "kinetic_energy",
 }
-ROUNDS = (10, 20, 40, 80, 160, 320, 640, 1280)  # iterations at which the curves are taken
+ROUNDS = (10, 20, 40, 80, 160, 320, 640, 1280)  # iterations at which the curves are sampled
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -64,7 +67,10 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def collapse(size: int, **tables: Any) -> SandScene:
-    """Return the collapse of a column twice as high as wide, `size` cells across the domain."""
+    """Return the collapse of a column twice as high as wide.
+
+    The domain has `size` cells across.
+    """
     scene: dict[str, Any] = {
         "scene": {"simulator": "granular"},
         "time": {"duration": COLLAPSE_END},
@@ -80,7 +86,10 @@ def collapse(size: int, **tables: Any) -> SandScene:
 
 
 def _large() -> dict[str, SandScene]:
-    """Return scenes whose steps are timed: 65,000 particles on 128^2 cells, 500,000 on 64^3."""
+    """Return scenes whose steps are timed.
+
+    They have 65,000 particles on 128^2 cells, and 500,000 on 64^3.
+    """
     flat = {"size": [1.28, 1.28], "resolution": 128, "friction": 0.577}
     deep = {"size": [0.64, 0.64, 0.64], "resolution": 64, "friction": 0.577}
     column = [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.82]}]
@@ -103,7 +112,10 @@ def _step(simulation: SandSimulation) -> dict[str, Any]:
 
 
 class _Taken:
-    """In the place of a simulation's solve: one by another method, its residual [rho g dx] and its seconds kept."""
+    """Replacement of a simulation's solve by another method.
+
+    It records the residual [rho g dx] and the seconds.
+    """
 
     def __init__(self, stress: Any, name: str, tolerance: float, most: int) -> None:
         self.stress, self.method, self.tolerance, self.most = (
@@ -116,7 +128,7 @@ class _Taken:
         self.outcome: wl.SolveResult | None = None
 
     def __call__(self, scale: float) -> wl.SolveResult:
-        """Solve, and look at the clock."""
+        """Solve and record the seconds."""
         begun = time.perf_counter()
         stopping = wl.StoppingCriteria(
             rtol=0.0, atol=self.tolerance * scale, max_iterations=self.most
@@ -141,7 +153,10 @@ def _solve(
 def _methods(
     size: int, options: Options
 ) -> tuple[list[Record], dict[str, tuple[list[float], list[float]]]]:
-    """Return each method's iterations and seconds from each state, and their curves from the one mid-flow."""
+    """Return each method's iterations and seconds from each state.
+
+    The curves of the methods from the state in mid-flow are returned too.
+    """
     records, curves = [], dict[str, tuple[list[float], list[float]]]()
     simulation = _simulation(collapse(size), options.device)
     for label, moment in STATES.items():
@@ -150,25 +165,25 @@ def _methods(
             _step(simulation)
         state = simulation.state()
         seconds: dict[str, list[float]] = {name: [] for name in METHODS}
-        found: dict[str, _Taken] = {}
-        for turn in range(options.repeat + 1):  # the first loads kernels
+        solves: dict[str, _Taken] = {}
+        for turn in range(options.repeat + 1):  # the first turn loads kernels
             for name in METHODS:
-                taken = _solve(simulation, state, name, TOLERANCE, MOST)
-                found[name] = taken
+                solve = _solve(simulation, state, name, TOLERANCE, MOST)
+                solves[name] = solve
                 if turn > 0:
-                    seconds[name].append(taken.seconds)
+                    seconds[name].append(solve.seconds)
         base = seconds["interleaved-sweeps"]
-        for name, taken in found.items():
-            assert taken.outcome is not None
+        for name, solve in solves.items():
+            assert solve.outcome is not None
             ratios = [a / b for a, b in zip(seconds[name], base, strict=True)]
             figures = {
                 "seconds": Figure.of(seconds[name], "s"),
                 "ratio": Figure.of(ratios),
-                "iterations": Figure(taken.outcome.iterations),
-                "residual": Figure(taken.residual),
+                "iterations": Figure(solve.outcome.iterations),
+                "residual": Figure(solve.residual),
             }
             records.append(
-                Record(f"{label}: {name}", figures, {"status": taken.outcome.status.name})
+                Record(f"{label}: {name}", figures, {"status": solve.outcome.status.name})
             )
             if label == "mid-flow":
                 curves[name] = _curve(simulation, state, name)
@@ -179,7 +194,7 @@ def _methods(
 def _curve(
     simulation: SandSimulation, state: dict[str, np.ndarray], name: str
 ) -> tuple[list[float], list[float]]:
-    """Return seconds and residuals of solves that stop after some iterations."""
+    """Return seconds and residuals of solves with limited iterations."""
     taken = [_solve(simulation, state, name, 1e-12, most) for most in ROUNDS]
     return [t.seconds for t in taken], [t.residual for t in taken]
 

@@ -1,7 +1,7 @@
-"""What a solve costs as the grid grows: set-up, iterations, seconds to three tolerances, bytes a cell, and the exponent of the growth.
+"""Cost of a solve against grid size, with its growth exponent.
 
-And how far it can get: solves in each precision that are asked for a residual of 0 end at their
-floor.
+The figures are set-up, iterations, seconds to three tolerances, and bytes per cell. A second part
+measures the attainable accuracy: solves in each precision with a tolerance of 0 end at their floor.
 """
 
 from __future__ import annotations
@@ -37,19 +37,18 @@ from warp_lcp.run.devices import free_memory
 
 TITLE = "Cost of a solve against the size of the grid"
 CPU_SIZES, CUDA_SIZES = (32, 64, 128, 256), (32, 64, 128, 256, 512, 1024)
-# a cell: operator, problem, workspace, b, bounds, the result and what making them takes; 59 at
-# 128^3
+# Bytes of a cell: operator, problem, workspace, b, bounds, result and temporaries; 59 at 128^3.
 SOLVE_BYTES = 60
-# a cell, in the memory of the host: the scene, the fields that it is made with (41 at 128^3) and
-# the bounds
+# Bytes of a cell in host memory: the scene, the fields that it is made from (41 at 128^3), the
+# bounds.
 SCENE_BYTES = 60
-# cells a side from which on the growth is fitted: below, launches cost more than cells
+# Cells along a side from which on the growth is fitted: below, launches cost more than cells.
 ASYMPTOTIC = 64
 FIGURES = tuple(f"to_{t:.0e}" for t in TOLERANCES)
 PRECISIONS = ("single", "mixed", "double")
 REACHED = 1e-8  # relative residual that mixed precision must reach on every grid
 ENDLESS = wl.StoppingCriteria(rtol=0.0, max_iterations=60, patience=6)
-FIELD_BYTES = 8  # of copying a float32 field: a read and a write
+FIELD_BYTES = 8  # bytes per cell of a copy of a float32 field: a read and a write
 
 
 @dataclass
@@ -64,14 +63,14 @@ class Growing:
 
     @property
     def unknowns(self) -> int:
-        """FLUID cells."""
+        """Number of FLUID cells."""
         return int((self.scene.cells == wl.FLUID).sum())
 
     def sample(self, *, keep: bool) -> None:
-        """Solve from the arrays of cells and b to the tightest tolerance; the history tells when the others were met.
+        """Solve from the arrays of cells and b to the tightest tolerance.
 
-        The method has no tolerance within, so that a solve that is asked for less takes the same
-        steps.
+        The history shows when the looser tolerances were met. The method has no inner tolerance, so
+        that a solve with a looser one takes the same steps.
         """
         lower, solver = self.scene.lower(self.bounds), wl.ProjectedMultigrid()
         begun = time.perf_counter()
@@ -98,17 +97,19 @@ class Growing:
         n = self.scene.n
         case = Case("unit", self.scene, self.bounds, wl.ProjectedMultigrid(), self.device)
         case.memory()
-        figures = {name: Figure.of(taken, "s") for name, taken in self.samples.items() if taken}
+        figures = {
+            name: Figure.of(samples, "s") for name, samples in self.samples.items() if samples
+        }
         figures |= {name: Figure(value) for name, value in self.counts.items()}
         figures |= {
             "unknowns": Figure(self.unknowns),
             "bytes_per_cell": Figure(case.counts["bytes_per_cell"], "B"),
         }
-        taken = self.samples["to_1e-06"]
-        if taken:
-            figures["per_cell"] = Figure.of([1e9 * t / n**3 for t in taken], "ns")
+        samples = self.samples["to_1e-06"]
+        if samples:
+            figures["per_cell"] = Figure.of([1e9 * t / n**3 for t in samples], "ns")
             figures["in_copies"] = Figure.of(
-                [t * copying * 1e9 / (FIELD_BYTES * n**3) for t in taken]
+                [t * copying * 1e9 / (FIELD_BYTES * n**3) for t in samples]
             )
         return Record(f"{n}^3 {self.bounds}", figures, {"n": n, "bounds": self.bounds})
 
@@ -127,7 +128,7 @@ def measure(options: Options, out: Path) -> Results:
     cases = [
         Growing(scene, bounds, options.device) for scene in map(splash, sizes) for bounds in BOUNDS
     ]
-    for turn in range(options.repeat + 1):  # the first one loads kernels
+    for turn in range(options.repeat + 1):  # the first turn loads kernels
         options.say(f"scaling to {max(sizes)}^3, round {turn} of {options.repeat}")
         for case in cases:
             case.sample(keep=turn > 0)
@@ -159,7 +160,10 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def floor(scene: Splash, bounds: str, precision: str, device: str) -> Record:
-    """Solve until no step makes the residual smaller; return that over the residual at 0, computed here and as the solve tells it."""
+    """Solve until no step reduces the residual further.
+
+    Return that residual over the residual at 0, recomputed and as the solve reports it.
+    """
     result = wl.solve(
         scene.lcp(bounds, device=device),
         wl.ProjectedMultigrid(precision=precision),
@@ -212,12 +216,15 @@ def fitting(asked: Sequence[int], device: str) -> tuple[list[int], dict[int, str
 
 
 def exponent(unknowns: Sequence[float], seconds: Sequence[float]) -> float:
-    """Return the exponent of unknowns that seconds grow with, by least squares of the logarithms."""
+    """Return the growth exponent of seconds over unknowns.
+
+    The fit is by least squares of the logarithms.
+    """
     return float(np.polyfit(np.log(unknowns), np.log(seconds), 1)[0])
 
 
 def _growth(bounds: str, cases: Sequence[Growing]) -> Record:
-    """Return the exponents of each round."""
+    """Return the growth exponents of each round."""
     large = (
         [c for c in cases if c.scene.n >= ASYMPTOTIC]
         if sum(c.scene.n >= ASYMPTOTIC for c in cases) > 1
@@ -323,23 +330,23 @@ def _floor_table(floors: Sequence[Record]) -> Table:
 
 
 def _failures(floors: Sequence[Record]) -> list[str]:
-    """Return where mixed precision does not get there, or a solve tells another residual than x has."""
+    """Return failures of mixed precision, and solves with a wrong reported residual."""
     lines = []
     for r in floors:
-        own, told = r.figures["floor"].value, r.figures["told"].value
+        own, reported = r.figures["floor"].value, r.figures["told"].value
         if r.facts["precision"] == "mixed" and own > REACHED:
             lines.append(f"{r.name}: ends at {own:.2e}")
-        # at the floor x has few digits that count: rounding in two orders of summation differs by a
-        # share of the floor itself
-        if not math.isclose(own, told, rel_tol=0.5):
-            lines.append(f"{r.name}: the solve tells {told:.2e}, x has {own:.2e}")
+        # At the floor x has few significant digits: rounding errors of two orders of summation
+        # differ by a share of the floor itself.
+        if not math.isclose(own, reported, rel_tol=0.5):
+            lines.append(f"{r.name}: the solve tells {reported:.2e}, x has {own:.2e}")
     return lines
 
 
 def _charts(
     records: Sequence[Record], growth: Sequence[Record], floors: Sequence[Record]
 ) -> list[Chart]:
-    """Return the seconds to 1e-6 over the unknowns, and the floors over the cells a side."""
+    """Return the charts of seconds to 1e-6 over the unknowns, and of the floors."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
     for g in growth:
         here = [
@@ -356,7 +363,7 @@ def _charts(
         x, y = ends.setdefault(r.facts["floor of"], ([], []))
         x.append(r.facts["n"])
         y.append(r.figures["floor"].value)
-    # it would hide the others
+    # It would hide the other curves.
     double = frozenset(label for label in ends if label.startswith("double"))
     return [
         Lines("seconds", "Cold solves to 1e-6, set-up included", "unknowns", "s", curves),

@@ -1,7 +1,7 @@
-"""Linear and LCP solves of the splash: set-up, iterations, seconds, memory; against PyAMG and SciPy in the same process, in turns.
+"""Linear and LCP solves of the splash: time, iterations and memory.
 
-Every method of the library then solves a problem of each kind that [Book] appendix C compares
-methods on, made small.
+The solves take turns with those of PyAMG and SciPy in the same process. Then every method of the
+library solves a small problem of each kind on which [Book] appendix C compares methods.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from warp_lcp.solvers.fallback import Progress
 
 TITLE = "Linear and LCP pressure solves"
 SIZES = (64, 128)
-# [s] after which a peer is not asked again: at 256^3 PyAMG needs that for one solve
+# [s] after which a peer gets no more rounds: PyAMG needs that for one solve at 256^3.
 PEER_SECONDS = 60.0
-# cells a side beyond which only the engine on unit coefficients is measured: the rest takes minutes
-# a round
+# Cells along a side beyond which only ProjectedMultigrid on unit coefficients is measured; the
+# other cases take minutes per round.
 LARGE = 192
-SCIPY_CELLS = 64  # cells a side up to which plain CG is waited for
+SCIPY_CELLS = 64  # cells along a side up to which plain CG is measured
 ENGINE = "ProjectedMultigrid"
 
 
 def is_near(progress: Progress) -> bool:
-    """Return whether the residual has fallen to a hundredth, so that the active set is known."""
+    """Return whether the residual is a hundredth, where the active set is known."""
     return progress.norms[-1] <= 1e-2 * progress.norms[0]
 
 
@@ -45,7 +45,7 @@ OTHERS = {
     "InteriorPoint": wl.InteriorPoint(),
     "InteriorPoint, crossover": wl.Fallback(wl.InteriorPoint(), (wl.MinimumMapNewton(), is_near)),
 }
-# of [Book] appendix C: fluids, contacts, and matrices made at random
+# [Book] appendix C: fluids, contacts, and random matrices.
 BOOK: dict[str, Callable[[], gallery.Problem]] = {
     "fluid 12^3": lambda: gallery.splash(12).named("walls", device="cpu"),
     "contacts of 12 bodies": lambda: gallery.contact(12, seed=2015),
@@ -55,7 +55,7 @@ BOOK_STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=1000, patience=100
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Measure all cases at the sizes asked for, then every method on small problems."""
+    """Measure all cases at the requested sizes, then all methods on small problems."""
     sizes = options.sizes or SIZES
     where = machine(
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
@@ -93,7 +93,7 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
     )
     solves |= {"SciPy CG": scipy_cg} if n <= SCIPY_CELLS else {}
     answers: dict[str, list[Answer]] = {name: [] for name in solves}
-    for turn in range(options.repeat + 1):  # the first one loads kernels
+    for turn in range(options.repeat + 1):  # the first turn loads kernels
         options.say(f"solvers at {n}^3, round {turn} of {options.repeat}")
         for case in cases:
             case.cold(keep=turn > 0)
@@ -110,7 +110,11 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
 
 
 def _cases(n: int, device: str) -> list[Case]:
-    """Return the cases of a size: the engine and other methods on unit coefficients, the engine on what is harder."""
+    """Return the cases of a size.
+
+    ProjectedMultigrid and other methods run on unit coefficients. Only ProjectedMultigrid runs on
+    harder scenes.
+    """
     scene, engine = splash(n), wl.ProjectedMultigrid()
     if n > LARGE:
         return [Case("unit", scene, bounds, engine, device) for bounds in BOUNDS]
@@ -144,7 +148,7 @@ def _cases(n: int, device: str) -> list[Case]:
 def _records(
     n: int, cases: list[Case], answers: dict[str, list[Answer]], question: Question
 ) -> list[Record]:
-    """Return the records of a size, with ratios of samples that were taken in the same round."""
+    """Return the records of a size, with ratios of samples of the same rounds."""
     by_name = {case.name: case for case in cases}
     pyamg = [a.total for a in answers.get("PyAMG SA-CG", [])]
     records = []
@@ -172,14 +176,14 @@ def _records(
                 {"form": case.form, "bounds": case.bounds, "method": method, "n": n},
             )
         )
-    for name, given in answers.items():
+    for name, solutions in answers.items():
         figures = {
-            part: Figure.of([getattr(a, part) for a in given], "s")
+            part: Figure.of([getattr(a, part) for a in solutions], "s")
             for part in ("setup", "solve", "total")
         }
         figures |= {
-            "iterations": Figure(given[-1].iterations),
-            "residual": Figure(question.residual(given[-1].x)),
+            "iterations": Figure(solutions[-1].iterations),
+            "residual": Figure(question.residual(solutions[-1].x)),
         }
         records.append(
             Record(
@@ -192,7 +196,7 @@ def _records(
 
 
 def _curves(cases: list[Case]) -> dict[str, tuple[list[float], list[float]]]:
-    """Return relative residual over seconds of the histories."""
+    """Return the curves of relative residual over seconds."""
     curves = {}
     for case in cases:
         if case.history and case.form == "unit":
@@ -209,7 +213,7 @@ def _curves(cases: list[Case]) -> dict[str, tuple[list[float], list[float]]]:
 
 
 def _times(n: int, records: Sequence[Record]) -> Table:
-    """Seconds, as medians with the range of the cold total."""
+    """Return the table of seconds: medians, and the range of the cold total."""
     parts = ("setup", "solve", "total", "reuse", "warm", "to_1e-04", "to_1e-06", "to_1e-08")
     columns = [
         "case",
@@ -263,18 +267,21 @@ def _quality(n: int, records: Sequence[Record]) -> Table:
 def _book(
     options: Options,
 ) -> tuple[list[Record], dict[str, dict[str, tuple[list[float], list[float]]]]]:
-    """Solve each small problem by every method that takes it; return records, and residuals over iterations by problem and method."""
+    """Solve each small problem by every applicable method.
+
+    The result is records, and residuals over iterations by problem and method.
+    """
     records, curves = list[Record](), dict[str, dict[str, tuple[list[float], list[float]]]]()
     for what, make in BOOK.items():
         curves[what] = {}
         for name, method in wl.METHODS.items():
             problem = make().lcp(device=options.device)
             try:
-                # loads kernels
+                # Loads the kernels.
                 wl.solve(problem, method(), stopping=wl.StoppingCriteria(max_iterations=1))
                 begun = time.perf_counter()
                 result = wl.solve(problem, method(), stopping=BOOK_STOPPING)
-            except ValueError:  # the method says that the problem is none for it
+            except ValueError:  # the method refuses the problem
                 continue
             figures = {
                 "seconds": Figure(time.perf_counter() - begun, "s"),

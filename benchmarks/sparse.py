@@ -1,4 +1,7 @@
-"""Sparse matrices numbered at random: a cold solve with bounds against PyAMG's best linear solve of the same matrix, in turns."""
+"""Sparse matrices with random numbering: cold solves against PyAMG.
+
+A solve with bounds is compared with PyAMG's best linear solve of the same matrix, interleaved.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +24,24 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.sparse_family import FAMILY, SparseProblem, numbered_at_random
 
 TITLE = "Sparse matrices numbered at random: with bounds, against PyAMG without"
-# roots of the numbers of unknowns; problems of the first seed that nothing was tuned on are asked
-# for
+# Roots of the numbers of unknowns; first seed of problems on which nothing was tuned.
 SIZES, SEED = (316, 1000), 30001
-RTOL, TARGET = 1e-6, 1.5  # of the residual; of our seconds over PyAMG's
-ITERATIONS = 100  # after which PyAMG's solve counts as failed
+RTOL, TARGET = 1e-6, 1.5  # relative residual; target of our seconds over PyAMG's
+ITERATIONS = 100  # limit after which PyAMG's solve counts as failed
 BUILDS = ("smoothed_aggregation_solver", "ruge_stuben_solver", "rootnode_solver")
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Solve a problem of each kind and size, cold, `repeat` times; PyAMG's solvers that are not near its best are asked once."""
+    """Solve a problem of each kind and size, cold, `repeat` times.
+
+    PyAMG's solvers that are far from its best run once.
+    """
     records, seed = (
         [machine(options.device, repeat=options.repeat)],
         SEED if options.seed is None else options.seed,
     )
     for number, kind in enumerate(FAMILY):
-        ours(numbered_at_random(kind, 4000, seed), options.device)  # loads kernels
+        ours(numbered_at_random(kind, 4000, seed), options.device)  # loads the kernels
         for side in sorted(options.sizes or SIZES):
             record = _contest(kind, side * side, seed + number, options)
             options.say(
@@ -47,27 +52,30 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def ours(problem: SparseProblem, device: str) -> tuple[float, wl.SolveResult]:
-    """Return the seconds of a cold solve, operator and LCP made on the way, and its result."""
-    begun = time.perf_counter()
+    """Return the seconds of a cold solve, operator and LCP included, and its result."""
+    start_time = time.perf_counter()
     A = wl.SparseOperator(problem.A, device=device, near_null_space=problem.near_null_space)
     result = wl.solve(
         wl.LCP(A, problem.b, problem.lower),
         stopping=wl.StoppingCriteria(rtol=RTOL, max_iterations=300),
     )
-    return time.perf_counter() - begun, result
+    return time.perf_counter() - start_time, result
 
 
 def pyamg_solvers(problem: SparseProblem) -> dict[str, Callable[[], float]]:
-    """Return PyAMG's solves of A x = -b by name: each gives the seconds of set-up and solve, inf where it fails."""
-    found: dict[str, Callable[[], float]] = {}
+    """Return PyAMG's solves of A x = -b by name.
+
+    Each returns the seconds of set-up and solve, inf if it fails.
+    """
+    solvers: dict[str, Callable[[], float]] = {}
     for build in BUILDS:
         for accel in ("cg",) if problem.symmetric else ("gmres", "bicgstab"):
-            # which divides by zero on elastic blocks
+            # Ruge-Stuben divides by zero on elastic blocks.
             if problem.near_null_space is None or build != "ruge_stuben_solver":
-                found[f"{build.removesuffix('_solver')} {accel}"] = partial(
+                solvers[f"{build.removesuffix('_solver')} {accel}"] = partial(
                     _pyamg, problem, build, accel
                 )
-    return found
+    return solvers
 
 
 def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
@@ -79,13 +87,13 @@ def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
     )
     if problem.near_null_space is not None:
         A, settings = A.tobsr((2, 2)), {"B": problem.near_null_space}
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         solver = getattr(pyamg, build)(A, **settings)
-        # GMRES measures the preconditioned residual, which ends it early: to PyAMG's advantage
+        # GMRES tests the preconditioned residual and so ends early, to PyAMG's advantage.
         x = solver.solve(-problem.b, tol=RTOL, accel=accel, maxiter=ITERATIONS)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - start_time
     return (
         seconds
         if np.linalg.norm(A @ x + problem.b) <= 1e3 * RTOL * np.linalg.norm(problem.b)

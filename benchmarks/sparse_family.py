@@ -1,4 +1,4 @@
-"""Generated obstacle and contact problems as sparse matrices whose unknowns are numbered at random."""
+"""Random sparse obstacle and contact problems with random numbering."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import scipy.spatial
 
 @dataclass(frozen=True)
 class SparseProblem:
-    """y = A x + b, x >= lower."""
+    """Problem y = A x + b, x >= lower."""
 
     A: sp.csr_array  # shape (n, n)
     b: np.ndarray  # shape (n,)
@@ -33,19 +33,19 @@ def _nodes(m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _obstacle(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a wavy bump."""
+    """Return the heights of a wavy bump."""
     return rng.uniform(0.3, 0.7) ** 2 - x**2 - y**2 + 0.02 * np.sin(9 * x + rng.uniform(0, 6))
 
 
 def five_points(n: int, rng: np.random.Generator) -> SparseProblem:
-    """A membrane over a bump, finite differences."""
+    """Return a membrane over a bump by finite differences."""
     m = round(n**0.5)
     A = sp.kron(sp.eye_array(m), _second(m)) + sp.kron(_second(m), sp.eye_array(m))
     return SparseProblem(A.tocsr(), np.full(m * m, 8 / (m + 1) ** 2), _obstacle(*_nodes(m), rng))
 
 
 def nine_points(n: int, rng: np.random.Generator) -> SparseProblem:
-    """The same with bilinear elements."""
+    """Return the membrane by bilinear elements."""
     m = round(n**0.5)
     mass = sp.diags_array([1.0, 4.0, 1.0], offsets=[-1, 0, 1], shape=(m, m)) / 6
     A = sp.kron(_second(m), mass) + sp.kron(mass, _second(m))
@@ -53,13 +53,16 @@ def nine_points(n: int, rng: np.random.Generator) -> SparseProblem:
 
 
 def triangles(n: int, rng: np.random.Generator) -> SparseProblem:
-    """The same with linear elements on Delaunay's triangulation of random points."""
+    """Return the membrane by linear triangles on random points.
+
+    The mesh is Delaunay's triangulation.
+    """
     points = rng.random((n, 2))
     corners = scipy.spatial.Delaunay(points).simplices
     p = points[corners]
     side = np.stack([p[:, 2] - p[:, 1], p[:, 0] - p[:, 2], p[:, 1] - p[:, 0]], axis=1)
     area = 0.5 * np.abs(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
-    sound = area > 1e-4 / n  # slivers at the hull
+    sound = area > 1e-4 / n  # without slivers at the hull
     corners, side, area = corners[sound], side[sound], area[sound]
     entries = np.einsum("tik,tjk->tij", side, side) / (4 * area)[:, None, None]
     A = sp.coo_array(
@@ -73,7 +76,10 @@ def triangles(n: int, rng: np.random.Generator) -> SparseProblem:
 
 
 def convection(n: int, rng: np.random.Generator) -> SparseProblem:
-    """The five points with a wind that turns, upwind: an unsymmetric M-matrix."""
+    """Return convection-diffusion with rotating wind: an unsymmetric M-matrix.
+
+    The stencil has five points and upwind differences.
+    """
     plain = five_points(n, rng)
     m = round(n**0.5)
     x, y = _nodes(m)
@@ -88,7 +94,10 @@ def convection(n: int, rng: np.random.Generator) -> SparseProblem:
 
 
 def elastic(n: int, rng: np.random.Generator) -> SparseProblem:
-    """Plane strain, bilinear elements: a block held at one side sinks onto a wavy ground."""
+    """Return an elastic block, held at one side, that sinks onto a wavy ground.
+
+    The elements are bilinear, in plane strain.
+    """
     m = round((n / 2) ** 0.5)
     g = 3**-0.5
     C = np.array([[1.35, 0.58, 0], [0.58, 1.35, 0], [0, 0, 0.385]])  # E = 1, nu = .3
@@ -117,7 +126,7 @@ def elastic(n: int, rng: np.random.Generator) -> SparseProblem:
 
 
 def graph(n: int, rng: np.random.Generator) -> SparseProblem:
-    """The Laplacian of a random graph with short and long edges, shifted."""
+    """Return the shifted Laplacian of a random graph with short and long edges."""
     first, far = (
         rng.integers(0, n, 3 * n),
         np.minimum(20 * rng.pareto(1.0, 3 * n) + 1, n - 1).astype(np.int64),
@@ -142,13 +151,16 @@ FAMILY: dict[str, Callable[[int, np.random.Generator], SparseProblem]] = {
 
 
 def numbered_at_random(kind: str, n: int, seed: int) -> SparseProblem:
-    """Return a problem of a kind with about n unknowns; those of an elastic node stay together."""
+    """Return a problem of a kind with about n unknowns, randomly numbered.
+
+    The unknowns of an elastic node stay together.
+    """
     rng = np.random.default_rng(seed)
-    made, block = FAMILY[kind](n, rng), 2 if kind == "elastic" else 1
-    order = (block * rng.permutation(len(made.b) // block)[:, None] + np.arange(block)).ravel()
-    A = made.A[order][:, order].tocsr()
+    problem, block = FAMILY[kind](n, rng), 2 if kind == "elastic" else 1
+    order = (block * rng.permutation(len(problem.b) // block)[:, None] + np.arange(block)).ravel()
+    A = problem.A[order][:, order].tocsr()
     A.sort_indices()
-    # PyAMG does not take others with its own
+    # PyAMG does not combine other index types with its own.
     A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
-    B = None if made.near_null_space is None else made.near_null_space[order]
-    return SparseProblem(A, made.b[order], made.lower[order], B, made.symmetric)
+    B = None if problem.near_null_space is None else problem.near_null_space[order]
+    return SparseProblem(A, problem.b[order], problem.lower[order], B, problem.symmetric)

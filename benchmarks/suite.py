@@ -1,4 +1,7 @@
-"""The suites as the command line sees them. Each measures in a process of its own, whose libraries are told to use one thread first."""
+"""Benchmark suites for the command line.
+
+Each measures in a process of its own, whose libraries use one thread.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,10 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.compare import comparison
 from warp_lcp.distributed import launch
 
-WRONG_INPUT = 2  # exit code of a suite that says what is wrong with its input
+WRONG_INPUT = 2  # exit code of a suite with wrong input
 RANKS = "ranks"  # module and files of `scaling --engine petsc`
-# before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads fight over
-# two cores
+# Set before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads compete
+# for two cores.
 ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -26,15 +29,15 @@ ONE_THREAD = {
 
 @dataclass(frozen=True)
 class Suite:
-    """A set of measurements."""
+    """Set of measurements."""
 
-    name: str  # what the command line calls it; the files are NAME.json, NAME.md and NAME-*.png
-    summary: str  # what it measures
-    # about how many minutes on two cores, kernels compiled before, and which extras it can use
+    name: str  # name on the command line; the files are NAME.json, NAME.md and NAME-*.png
+    summary: str  # description for the help text
+    # Minutes on two cores with compiled kernels, and the optional extras.
     takes: str
-    resizable: bool = True  # whether it can be asked for other sizes
-    scenes: bool = False  # whether it can be asked for a scene
-    seeded: bool = False  # whether it can be asked for seeds of random problems
+    resizable: bool = True  # whether other sizes can be requested
+    scenes: bool = False  # whether a scene can be requested
+    seeded: bool = False  # whether seeds of random problems can be requested
 
     def run(
         self,
@@ -48,7 +51,10 @@ class Suite:
         shared: bool = False,
         threads: int | None = None,
     ) -> list[Path]:
-        """Measure in a process of its own, as `warp_lcp.cli.suites.Benchmark.run` says; a failed check leaves the files and is an error."""
+        """Measure in a process of its own.
+
+        See `warp_lcp.cli.suites.Benchmark.run`. A failed check raises an error; the files remain.
+        """
         if sizes and not self.resizable:
             raise ValueError(
                 f"size = {sizes[0]}: cannot be given for the suite {self.name}, which has its own "
@@ -80,7 +86,7 @@ class Suite:
         process = subprocess.run(
             [sys.executable, "-m", "warp_lcp.benchmarks", *arguments], env=environment, check=False
         )
-        if shared and launch.rank_here():  # the first of several ranks speaks for all
+        if shared and launch.rank_here():  # the first of several ranks prints for all
             raise SystemExit(process.returncode)
         if process.returncode == WRONG_INPUT:
             raise ValueError(f"the suite {name} rejected its input")
@@ -89,7 +95,7 @@ class Suite:
         return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".png"))
 
     def compare(self, old: Path, new: Path) -> str:
-        """Return a table of new figures over old ones with the bounds that their ranges give.
+        """Return a table of new figures over old ones, with bounds from their ranges.
 
         Raises:
             ValueError: a file is no result of a suite.

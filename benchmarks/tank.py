@@ -1,4 +1,7 @@
-"""A pressure problem is as large as its liquid, not as its box: a tank that is filled to 30 %, cold, as large as memory holds."""
+"""Suite `tank`: a tank filled to 30 %, solved cold, as large as memory holds.
+
+The cost of a pressure problem depends on its liquid, not on its box.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +35,13 @@ from warp_lcp.run.devices import free_memory
 
 TITLE = "A tank filled to 30 %: what a solve costs a cell of the box and of the liquid"
 SIZES = (128, 256, 384, 768)
-BYTES = 22  # a cell of the box, at the peak: the arrays that the problem is made of, or the solve
-ONCE = 512  # cells a side from which on one sample is taken
-FULL = 0.35  # of the height, above which there is AIR only
-PLANES = 4  # that NumPy checks at a time
+BYTES = 22  # bytes of a cell of the box at the peak: the arrays of the problem, or the solve
+ONCE = 512  # cells along a side from which on one sample is taken
+FULL = 0.35  # share of the height above which there is AIR only
+PLANES = 4  # planes that NumPy checks at a time
 PARTS = ("operator", "problem", "workspace", "solve")
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
-PEAK, STEPS = 18.0, 12  # what 768^3 may take [GB]; iterations
+PEAK, STEPS = 18.0, 12  # limits at 768^3: memory [GB]; iterations
 MCADAMS = (
     "Beside it: McAdams, Sifakis and Teran (2010), *A parallel multigrid Poisson solver for fluids "
     "simulation on large grids*: linear "
@@ -50,7 +53,9 @@ MCADAMS = (
 
 @dataclass(frozen=True)
 class Tank:
-    """Liquid with a wavy surface, a sphere and a pillar in it, in a closed box; axes z, y, x, and y is up.
+    """Closed tank of liquid with a wavy surface, a sphere and a pillar.
+
+    The axes are z, y, x, and y is up.
 
     Args:
         n: cells along a side.
@@ -60,11 +65,17 @@ class Tank:
 
     @cached_property
     def rows(self) -> int:
-        """Rows of a plane, from the floor on, above which there is AIR only."""
+        """Number of lowest rows of a plane that may hold liquid.
+
+        Above them there is AIR only.
+        """
         return math.ceil(FULL * self.n) + 1
 
     def solid(self, k: int) -> np.ndarray:
-        """Return which of those cells of plane k are SOLID, with one layer around: shape (rows + 2, n + 2)."""
+        """Return which cells of plane k are SOLID, shape (rows + 2, n + 2).
+
+        One layer around the rows is included.
+        """
         x, y = (
             (np.arange(-1, self.n + 1) + 0.5) / self.n,
             (np.arange(-1, self.rows + 1)[:, None] + 0.5) / self.n,
@@ -76,7 +87,10 @@ class Tank:
         return found | (x < 0) | (x > 1) | (y < 0) | (z < 0) | (z > 1)
 
     def plane(self, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return cell types, b and lower bounds of those cells of plane k, shape (rows, n): 0 on cells that touch a solid, else -inf."""
+        """Return cell types, b and lower bounds of plane k, shape (rows, n) each.
+
+        The bound is 0 on cells that touch a solid, else -inf.
+        """
         x, y, z = (
             (np.arange(self.n) + 0.5) / self.n,
             (np.arange(self.rows)[:, None] + 0.5) / self.n,
@@ -101,17 +115,23 @@ class Tank:
         return cells, np.where(fluid, b, 0.0), np.where(fluid & ~wall, -np.inf, 0.0)
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return cell types, b and lower bounds, shape (n, n, n), of which only the lowest rows are written."""
-        made = tuple(
+        """Return cell types, b and lower bounds, shape (n, n, n) each.
+
+        Only the lowest rows are written.
+        """
+        fields = tuple(
             np.zeros((self.n,) * 3, dtype=kind) for kind in (np.int8, np.float64, np.float64)
         )
         for k in range(self.n):
-            for whole, part in zip(made, self.plane(k), strict=True):
+            for whole, part in zip(fields, self.plane(k), strict=True):
                 whole[k, : self.rows] = part
-        return made[0], made[1], made[2]
+        return fields[0], fields[1], fields[2]
 
     def residuals(self, x: np.ndarray) -> tuple[float, float]:
-        """Return the norms of the natural residual at x and at 0, computed by NumPy and by no code of the solvers."""
+        """Return the norms of the natural residual at x and at 0.
+
+        They are computed by NumPy, without code of the solvers.
+        """
         squares = np.zeros(2)
         for first, last, parts in self._slabs():
             cells, b, lower = (np.stack(field) for field in zip(*parts, strict=True))
@@ -127,7 +147,7 @@ class Tank:
         return float(norm), float(reference)
 
     def _slabs(self) -> Iterator[tuple[int, int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]]:
-        """Yield planes to check, with one more on each side."""
+        """Yield slabs of planes to check, with one plane more on each side."""
         for first in range(0, self.n, PLANES):
             last = min(first + PLANES, self.n)
             yield (
@@ -146,7 +166,7 @@ def measure(options: Options, out: Path) -> Results:
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
     wl.set_threads(available_threads())
     try:
-        for n in [min(asked), *sizes]:  # the first one loads kernels
+        for n in [min(asked), *sizes]:  # the first size loads kernels
             options.say(f"tank {n}^3")
             records.append(record(Tank(n), options.repeat if n < ONCE else 1))
     finally:
@@ -158,7 +178,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def record(tank: Tank, repeat: int) -> Record:
-    """Solve cold from the arrays, and check what comes back."""
+    """Solve cold from the arrays and check the result."""
     samples, counts = defaultdict[str, list[float]](list), dict[str, float]()
     for _ in range(repeat):
         result = _solve(tank, samples, counts)
@@ -190,11 +210,14 @@ def record(tank: Tank, repeat: int) -> Record:
 
 
 def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]) -> wl.SolveResult:
-    """Take a sample: seconds, and GB that are resident; the arrays are let go when the problem is made."""
+    """Take a sample: seconds, and resident memory [GB].
+
+    The arrays are freed when the problem is made.
+    """
     forget_peak()
-    begun = resident_bytes()
+    initial_bytes = resident_bytes()
     cells, b, lower = tank.arrays()
-    given = resident_bytes() - begun
+    input_bytes = resident_bytes() - initial_bytes
     times = [time.perf_counter()]
     A = wl.GridPoisson(cells, device="cpu")
     times.append(time.perf_counter())
@@ -206,9 +229,9 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=work)
     times.append(time.perf_counter())
     for name, size in (
-        ("given", given),
-        ("peak", resident_bytes(peak=True) - begun),
-        ("kept", resident_bytes() - begun),
+        ("given", input_bytes),
+        ("peak", resident_bytes(peak=True) - initial_bytes),
+        ("kept", resident_bytes() - initial_bytes),
     ):
         samples[name].append(1e-9 * size)
     for part, (start, end) in zip(
@@ -272,7 +295,7 @@ def _table(records: Sequence[Record]) -> Table:
 
 
 def _failures(records: Sequence[Record]) -> list[str]:
-    """Return where a solve does not get there, or tells another residual than x has."""
+    """Return solves that do not converge or report a wrong residual."""
     lines = [f"{r.name}: {r.facts['status']}" for r in records if r.facts["status"] != "CONVERGED"]
     for r in records:
         told, own = r.figures["told"].value, r.figures["residual"].value

@@ -1,4 +1,7 @@
-"""All cores in one process: kernels, cycles, solves and steps of scenes on 1, 2, ... threads, in turns; what else the machine allows."""
+"""Suite `threads`: kernels, cycles, solves and steps on 1, 2, ... threads.
+
+Numbers of threads take turns. Independent copies on all cores show the machine's own limit.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,11 @@ from warp_lcp.scene.simulator import simulators
 
 TITLE = "All cores in one process"
 SIZES = (128, 256)
-# cells along the longest side; target
+# Cells along the longest side; target speedup.
 SCENES = {"dam-break": (96, 1.7), "floating-bodies": (96, 1.6), "column-collapse": (64, 1.7)}
-STEPS, LONGEST = 8, 0.005  # of a scene before it is measured; the longest one [s]
+STEPS, LONGEST = 8, 0.005  # steps before a scene is measured; the longest one [s]
 STEP = "whole step"
-# of what is done at once by as many copies as there are cores, each on one thread: how often each
-# copy does it
+# Repetitions of each copy when as many copies as cores run at once, each on one thread.
 TURNS = dict.fromkeys(
     ("x += z (what memory allows)", "product", "sweep", "restriction", "cycle"), 20
 ) | {STEP: 3}
@@ -59,12 +61,12 @@ def measure(options: Options, out: Path) -> Results:
         for label, group in _groups(options.sizes or SIZES):
             options.say(label)
             made = {count: group(count) for count in counts}
-            others = [made[1], *(group(1) for _ in range(counts[-1] - 1))]
+            copies = [made[1], *(group(1) for _ in range(counts[-1] - 1))]
             for name in made[1]:
                 work = {str(count): _on(count, made[count][name]) for count in counts}
                 if name in TURNS:
                     work["apart"] = _on(
-                        1, partial(_at_once, [other[name] for other in others], TURNS[name])
+                        1, partial(_at_once, [other[name] for other in copies], TURNS[name])
                     )
                 times = in_turns(work, options.repeat)
                 figures = {
@@ -72,7 +74,7 @@ def measure(options: Options, out: Path) -> Results:
                 }
                 if "apart" in times:
                     figures["apart"] = ratios(
-                        [len(others) * TURNS[name] * t for t in times["1"]], times["apart"]
+                        [len(copies) * TURNS[name] * t for t in times["1"]], times["apart"]
                     )
                 records.append(
                     Record(
@@ -118,7 +120,7 @@ def _on(count: int, work: Callable[[], object]) -> Callable[[], object]:
 
 
 def _at_once(copies: list[Callable[[], object]], turns: int) -> None:
-    """Run each of the copies some times, all of them at once."""
+    """Run all copies at once, each some times."""
 
     def several(run: Callable[[], object]) -> None:
         for _ in range(turns):
@@ -136,7 +138,7 @@ def _groups(sizes: tuple[int, ...]) -> Iterator[tuple[str, Callable[[int], Work]
 
 
 class _Grid:
-    """Kernels, a step and solves of the splash, as they are recorded for so many threads."""
+    """Kernels, a step and solves of the splash, recorded for a number of threads."""
 
     def __init__(self, n: int) -> None:
         scene = splash(n)
@@ -149,11 +151,11 @@ class _Grid:
         )
 
     def work(self, count: int) -> Work:
-        """Return what is measured."""
+        """Return the measured functions by name."""
         wl.set_threads(count)
-        kept: Any = wl.ProjectedMultigrid().init(self.problem)
-        wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept)
-        hierarchy: Hierarchy = kept.hierarchy
+        workspace: Any = wl.ProjectedMultigrid().init(self.problem)
+        wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
+        hierarchy: Hierarchy = workspace.hierarchy
         fine, coarse = hierarchy.levels[:2]
         sweep = fine.sweeping(fine.t, fine.x, 0.5, projected=False)
         return {
@@ -167,7 +169,7 @@ class _Grid:
             "restriction": _program(fine.restricting(coarse).launch),
             "cycle": hierarchy.cycle.run,
             "steps of a solve": lambda: wl.solve(
-                self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept
+                self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace
             ),
             "solve, cold": lambda: wl.solve(
                 self.problem, wl.ProjectedMultigrid(), stopping=STOPPING
@@ -182,7 +184,10 @@ def _program(build: Callable[[Launch], object]) -> Callable[[], object]:
 
 
 def _scene(name: str, resolution: int, count: int) -> Work:
-    """Return the steps of a scene: the same ones for each number of threads, whose bits do not differ."""
+    """Return the step function of a scene.
+
+    The steps have equal bits for each number of threads.
+    """
     wl.set_threads(count)
     scene = load_scene(name, [f"domain.resolution={resolution}"])
     simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())

@@ -1,12 +1,14 @@
 # mypy: ignore-errors
-"""What pairs of float32 would do to residuals, and to their time on an RTX 4090: `python -m benchmarks.two_floats`, in the source tree.
+"""Residuals in pairs of float32: accuracy, and estimated time on an RTX 4090.
 
-GPUs for games compute in float64 at 1/64 of float32's rate. Here the natural residual of a splash
-at solutions by projected multigrid is evaluated on the CPU in genuine float32: x and b are sums of
-two float32 (48 bits), all arithmetic is on such pairs, on differences of them, or on their first
-halves alone; `longdouble` is NumPy's, by no code of these kernels. A floor is what an evaluation
-gets wrong. Instructions of a cell are counted in PTX, compiled without a GPU; times follow from
-data sheets. Nothing here has been measured on a GPU.
+Run `python -m benchmarks.two_floats` in the source tree.
+
+Consumer GPUs compute in float64 at 1/64 of the rate of float32. Here the natural residual of a
+splash at solutions by projected multigrid is evaluated on the CPU in genuine float32. x and b are
+sums of two float32 (48 bits). All arithmetic is on such pairs, on differences of them, or on their
+first halves alone. `longdouble` is NumPy's and uses no code of these kernels. A floor is the error
+of an evaluation. The instructions of a cell are counted in PTX, compiled without a GPU; times
+follow from data sheets. Nothing here has been measured on a GPU.
 """
 
 import re
@@ -25,12 +27,12 @@ from warp_lcp.rows.layout import make_struct, put
 from warp_lcp.rows.pass_form import C
 from warp_lcp.rows.vectors import CUDA_BLOCK
 
-# of an RTX 4090: [Hz], [byte/s] that streaming kernels reach
+# Of an RTX 4090: clock [Hz], and bandwidth of streaming kernels [byte/s].
 ARCH, MULTIPROCESSORS, CLOCK, BANDWIDTH = 89, 128, 2.52e9, 0.8 * 1008e9
-# instructions a multiprocessor and cycle; conversions of float64 take as long
+# Instructions per multiprocessor and cycle; conversions of float64 take as long.
 RATE = {"f64": 2, "f32": 128}
-RECIPROCAL = 5  # such instructions that ptxas makes of `rcp.rn.f64`
-# a cell: x b unknown d free g code; x z q code
+RECIPROCAL = 5  # instructions of float64 into which ptxas expands `rcp.rn.f64`
+# Bytes of a cell: x b unknown d free g code; x z q code.
 BYTES = {"assess": 8 + 8 + 1 + 1 + 1 + 4 + 1, "update": 16 + 4 + 8 + 1}
 KINDS = {
     "add, mul, fma": "add sub mul fma",
@@ -47,35 +49,59 @@ PAIRS = """
 #pragma clang fp contract(off) reassociate(off)
 #endif
 struct Two { float hi, lo; };
-const auto sum = [](float a, float b) -> Two { const float s = a + b, t = s - a; return {s, (a - (s - t)) + (b - t)}; };
-const auto quick = [](float a, float b) -> Two { const float s = a + b; return {s, b - (s - a)}; };  // |a| >= |b|
-const auto product = [](float a, float b) -> Two { const float p = __fmul_rn(a, b); return {p, fmaf(a, b, -p)}; };
-const auto scaled = [&](float a, Two b) -> Two { const Two p = product(a, b.hi); return quick(p.hi, fmaf(a, b.lo, p.lo)); };
+const auto sum = [](float a, float b) -> Two {
+    const float s = a + b, t = s - a;
+    return {s, (a - (s - t)) + (b - t)};
+};
+const auto quick = [](float a, float b) -> Two {  // |a| >= |b|
+    const float s = a + b;
+    return {s, b - (s - a)};
+};
+const auto product = [](float a, float b) -> Two {
+    const float p = __fmul_rn(a, b);
+    return {p, fmaf(a, b, -p)};
+};
+const auto scaled = [&](float a, Two b) -> Two {
+    const Two p = product(a, b.hi);
+    return quick(p.hi, fmaf(a, b.lo, p.lo));
+};
 const auto add = [&](Two a, Two b) -> Two {
-    const Two s = sum(a.hi, b.hi), t = sum(a.lo, b.lo), u = quick(s.hi, s.lo + t.hi); return quick(u.hi, u.lo + t.lo); };
+    const Two s = sum(a.hi, b.hi), t = sum(a.lo, b.lo), u = quick(s.hi, s.lo + t.hi);
+    return quick(u.hi, u.lo + t.lo);
+};
 """
-# y = e x - sum of w x_neighbor + b, with weights and bounds that are float32
+# y = e x - sum of w x_neighbor + b, with weights and bounds in float32.
 PLAIN = """
 const auto gap = [&](F to) { return hi[c] - to; };
-const F y = e*hi[c] - (cx*(hi[c-1] + hi[c+1]) + cy*(hi[c-row] + hi[c+row]) + cz*(hi[c-plane] + hi[c+plane])) + b_hi[c];
+const F y = e*hi[c]
+    - (cx*(hi[c-1] + hi[c+1]) + cy*(hi[c-row] + hi[c+row]) + cz*(hi[c-plane] + hi[c+plane]))
+    + b_hi[c];
 """
 TWO = """
 const auto gap = [&](float to) { return (hi[c] - to) + lo[c]; };
 const auto x = [&](int at) -> Two { return {hi[at], lo[at]}; };
 const auto axis = [&](float w, int step) { return scaled(-w, add(x(c - step), x(c + step))); };
-const Two all = add(add(scaled(e, x(c)), add(add(axis(cx, 1), axis(cy, row)), axis(cz, plane))), Two{b_hi[c], b_lo[c]});
+const Two neighbors = add(add(axis(cx, 1), axis(cy, row)), axis(cz, plane));
+const Two all = add(add(scaled(e, x(c)), neighbors), Two{b_hi[c], b_lo[c]});
 const float y = all.hi + all.lo;
 """
 DIFFERENCES = """
 const auto gap = [&](float to) { return (hi[c] - to) + lo[c]; };
 float v = 0, rest = e;  // of e: faces to air
-const auto beside = [&](float open, int at) { v += open*((hi[c] - hi[at]) + (lo[c] - lo[at])); rest -= open; };
-const auto axis = [&](float w, int s) { beside(d[c-s] ? w : 0.0f, c - s); beside(d[c+s] ? w : 0.0f, c + s); };
+const auto beside = [&](float open, int at) {
+    v += open*((hi[c] - hi[at]) + (lo[c] - lo[at]));
+    rest -= open;
+};
+const auto axis = [&](float w, int s) {
+    beside(d[c-s] ? w : 0.0f, c - s);
+    beside(d[c+s] ? w : 0.0f, c + s);
+};
 axis(cx, 1); axis(cy, row); axis(cz, plane);
 const float y = ((v + rest*hi[c]) + b_hi[c]) + b_lo[c];
 """
 NATURAL = """
-const F f = e != 0 ? e : (F)1, l = code[c] & 1 ? g.least : -(F)INFINITY, u = code[c] & 2 ? g.most : (F)INFINITY;
+const F f = e != 0 ? e : (F)1;
+const F l = code[c] & 1 ? g.least : -(F)INFINITY, u = code[c] & 2 ? g.most : (F)INFINITY;
 const F below = f*gap(l), above = f*gap(u), low = below < y ? below : y;
 g.r.data[c] = g.unknown.data[c] == 1 ? (above > low ? above : low) : (F)0;
 """
@@ -103,12 +129,15 @@ def pairs_of(at: int, a: float, b: float, out: wp.array(dtype=wp.vec4f)): ...  #
 
 @wp.kernel(enable_backward=False, module="warp_lcp.benchmarks.two_floats")
 def pairs_kernel(a: wp.array(dtype=float), b: wp.array(dtype=float), out: wp.array(dtype=wp.vec4f)):
-    """Sums and products with their errors."""
+    """Compute sums and products with their errors."""
     pairs_of(wp.tid(), a[wp.tid()], b[wp.tid()], out)
 
 
 def check_pairs() -> None:
-    """Check them against float64, in which these numbers' sums and products are exact."""
+    """Check sums and products against float64.
+
+    In float64 those of the chosen numbers are exact.
+    """
     random, size = np.random.default_rng(1), 1 << 20
     a, b = (
         (random.uniform(-1, 1, size) * 2.0 ** random.integers(-13, 14, size)).astype(np.float32)
@@ -130,7 +159,10 @@ def check_pairs() -> None:
 
 @cache
 def evaluation(way: str) -> tuple[wp.Kernel, type]:
-    """Return a kernel that evaluates the natural residual, a thread a cell, and the struct that it takes."""
+    """Return a kernel that evaluates the natural residual, and its argument struct.
+
+    The kernel has one thread per cell.
+    """
     how, real = WAYS[way]
     types = (
         dict.fromkeys(CODES, wp.uint8) | dict.fromkeys((*FIELDS, "r"), real) | {"unknown": wp.int8}
@@ -165,7 +197,7 @@ def evaluation(way: str) -> tuple[wp.Kernel, type]:
 
 
 def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two float32 fields that add up to a float64 one, as far as they can."""
+    """Return two float32 fields whose sum is a float64 one, up to 48 bits."""
     hi = values.astype(np.float32)
     return hi, (values - hi).astype(np.float32)
 
@@ -183,22 +215,27 @@ def evaluated(problem: wl.LCP, way: str, x: np.ndarray) -> np.ndarray:
         for v in (layout.load(x, F64).numpy(), problem.b.numpy())
     ]
     parts = [wp.array(part, dtype=real, device="cpu") for pair in pairs for part in pair]
-    given = {
+    kernel_args = {
         "row": stencil.padding.row,
         "plane": stencil.padding.plane,
         "d": stencil.d,
         "code": problem.bounds.code,
     }
-    given |= dict(
+    kernel_args |= dict(
         zip(
             (*FIELDS, *NUMBERS),
             (*parts, stencil.unit, *stencil.coefficients, *problem.bounds.values),
             strict=True,
         )
     )
-    given |= {"unknown": problem.unknown, "r": wp.zeros_like(parts[0])}
-    wp.launch(kernel, x.shape, [put(Given(), given)], device="cpu")
-    return given["r"].numpy().reshape(layout.stored_shape)[1:-1, 1:-1, 1:-1].astype(np.longdouble)
+    kernel_args |= {"unknown": problem.unknown, "r": wp.zeros_like(parts[0])}
+    wp.launch(kernel, x.shape, [put(Given(), kernel_args)], device="cpu")
+    return (
+        kernel_args["r"]
+        .numpy()
+        .reshape(layout.stored_shape)[1:-1, 1:-1, 1:-1]
+        .astype(np.longdouble)
+    )
 
 
 def exact_residual(scene: Splash, x: np.ndarray) -> np.ndarray:
@@ -226,18 +263,18 @@ def table(title: str, columns: list[str], rows: list[list[object]]) -> None:
 
 
 def compare() -> None:
-    """Print residuals at solutions, and what each evaluation gets wrong at the last one."""
+    """Print residuals at solutions, and the error of each evaluation at the last one."""
     rows, floors = [], []
     for n in SIZES:
         scene = splash(n)
         problem = scene.lcp("walls", device="cpu")
         for rtol in TOLERANCES:
-            found = wl.solve(
+            result = wl.solve(
                 problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=rtol)
             )
             x, norm = (
-                found.x.numpy(),
-                lambda r, unit=found.history[0].residual: float(np.linalg.norm(r.ravel()) / unit),
+                result.x.numpy(),
+                lambda r, unit=result.history[0].residual: float(np.linalg.norm(r.ravel()) / unit),
             )
             residuals, exact = (
                 [evaluated(problem, way, x) for way in WAYS],
@@ -247,8 +284,8 @@ def compare() -> None:
                 [
                     f"{n}^3",
                     f"{rtol:.0e}",
-                    found.status.name,
-                    found.iterations,
+                    result.status.name,
+                    result.iterations,
                     *map(norm, residuals),
                     norm(exact),
                 ]
@@ -264,7 +301,10 @@ def compare() -> None:
 
 
 def count(module: str, kind: str, stored: str) -> list[int]:
-    """Return a cell's instructions of each kind and in all; a thread has one cell, each copy of an unrolled loop stores one `stored`."""
+    """Return the instructions of a cell, of each kind and in all.
+
+    A thread has one cell. Each copy of an unrolled loop stores one `stored`.
+    """
     user_modules[module].options["block_dim"] = CUDA_BLOCK
     with tempfile.TemporaryDirectory() as folder:
         wp.compile_aot_module(module, device=None, arch=[ARCH], module_dir=folder, use_ptx=True)
@@ -278,7 +318,7 @@ def count(module: str, kind: str, stored: str) -> list[int]:
 
 
 def instructions() -> None:
-    """Print counts and times of the solver's passes as they are, and of the evaluations."""
+    """Print instruction counts and times of the solver's passes and the evaluations."""
     made = {
         name: next(m for m in user_modules if m.startswith(f"warp_lcp.projected_multigrid.{name}."))
         for name in BYTES

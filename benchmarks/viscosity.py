@@ -1,8 +1,11 @@
-"""What a viscous solve costs beside a pressure solve of the same cells: `python -m benchmarks.viscosity [CELLS ...]`, in the source tree.
+"""Cost of a viscous solve relative to a pressure solve of the same cells.
 
-A tank of three fifths liquid with a wavy surface, whose velocity is a few smooth waves: the viscous
-step at several viscosities, and the pressure of that velocity, cold, with walls as equations and
-with walls that let go, all to 1e-4, in turns; medians of processor times.
+Run `python -m benchmarks.viscosity [CELLS ...]` in the source tree.
+
+The tank is filled to three fifths; its surface is wavy and its velocity is a few smooth waves. The
+benchmark measures the viscous step at several viscosities, and the pressure of that velocity, cold,
+with closed walls and with separating walls. All solve to 1e-4, interleaved; the results are medians
+of CPU times.
 """
 
 import sys
@@ -39,7 +42,7 @@ def tank(cells: int, viscosity: float, wall: str) -> LiquidSimulation:
 
 
 def wave(simulation: LiquidSimulation) -> None:
-    """Give the faces their velocity [m/s]."""
+    """Set the velocity of the faces [m/s]."""
     index = np.indices(simulation.grid.shape)[::-1] / max(simulation.grid.counts) * 2.0 * np.pi
     for axis, field in enumerate(simulation.velocity):
         field.assign(
@@ -51,13 +54,13 @@ def wave(simulation: LiquidSimulation) -> None:
 
 
 def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
-    """Return the seconds of a viscous solve, and its iterations."""
+    """Return the seconds and the iterations of a viscous solve."""
     wave(simulation)
     projection = simulation.projection
     projection.contact.fill_(1)
-    begun = time.process_time()
+    start_time = time.process_time()
     assert simulation.viscosity is not None
-    found = simulation.viscosity.solve(
+    result = simulation.viscosity.solve(
         simulation.velocity,
         simulation.grid.everywhere,
         projection.kind,
@@ -65,12 +68,12 @@ def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
         DT,
         1.0,
     )
-    assert found.converged, "the viscous solve must reach its tolerance"
-    return time.process_time() - begun, found.iterations
+    assert result.converged, "the viscous solve must reach its tolerance"
+    return time.process_time() - start_time, result.iterations
 
 
 def pressure(simulation: LiquidSimulation) -> tuple[float, int]:
-    """Return the seconds of a cold pressure solve, and its iterations."""
+    """Return the seconds and the iterations of a cold pressure solve."""
     wave(simulation)
     projection = simulation.projection
     projection.pressure.zero_()
@@ -90,7 +93,7 @@ def measure(cells: int) -> None:
         done: dict[object, tuple[float, int]] = {"held": pressure(held), "free": pressure(free)}
         done |= {viscosity: viscous(simulation) for viscosity, simulation in thick.items()}
         for name, found in done.items():
-            # the first turn loads kernels
+            # The first turn loads kernels.
             rows.setdefault(name, []).extend([found] if turn else [])
     seconds = {name: float(np.median([s for s, _ in found])) for name, found in rows.items()}
     pairs = {

@@ -1,4 +1,4 @@
-"""What tests read out of Markdown: code blocks, headings with their anchors, links."""
+"""Parser of Markdown for tests: code blocks, headings with anchors, links."""
 
 import linecache
 import re
@@ -19,7 +19,7 @@ def prose(page: Path) -> str:
 
 
 def run(code: str, page: Path) -> None:
-    """Run a block in a name space of its own; kernels in it find their source."""
+    """Run a block in its own name space, with sources available to its kernels."""
     linecache.cache[page.name] = (len(code), None, code.splitlines(keepends=True), page.name)
     exec(compile(code, page.name, "exec"), {"__name__": f"block_of_{page.stem}"})
 
@@ -30,7 +30,10 @@ def links(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as Python-Markdown makes them (and others where headings are plain)."""
+    """Return the anchors of a page's headings, as Python-Markdown makes them.
+
+    And others where headings are plain.
+    """
     found: dict[str, int] = {}
     for heading in re.findall(r"^#+ (.*)$", prose(page), flags=re.M):
         plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "")

@@ -1,4 +1,4 @@
-"""A simulator of falling dots: deterministic, NumPy only, and willing to fail on request."""
+"""Simulator of falling dots: deterministic, NumPy only, fails on request."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_lcp.simulation import Cells, Part, Points
 
 
 class Dots:
-    """Points that fall and bounce; the faster they are the shorter their steps."""
+    """Points that fall and bounce; the faster they are, the shorter are the steps."""
 
     def __init__(self, owner: DotsSimulator, scene: Scene) -> None:
         self.owner = owner
@@ -73,7 +73,7 @@ class Dots:
 
 
 class DotsSimulator:
-    """The plug-in, with knobs for the tests."""
+    """Plug-in with settings for the tests."""
 
     name = "dots"
     summary = "dots that fall"
@@ -95,7 +95,7 @@ class DotsSimulator:
 
 @pytest.fixture
 def dots(monkeypatch: pytest.MonkeyPatch) -> DotsSimulator:
-    """The simulator `dots`, installed as the only one."""
+    """Install the simulator `dots` as the only one."""
     simulator = DotsSimulator()
 
     class Entry:
@@ -110,7 +110,7 @@ def dots(monkeypatch: pytest.MonkeyPatch) -> DotsSimulator:
 
 @pytest.fixture
 def scene_file(dots: DotsSimulator, tmp_path: Path) -> Path:
-    """A minimal scene of dots."""
+    """Write a minimal scene of dots."""
     path = tmp_path / "dots.toml"
     path.write_text(MINIMAL)
     return path

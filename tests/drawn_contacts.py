@@ -1,4 +1,7 @@
-"""Contacts of rigid bodies, drawn by a seed: spheres in a box, stacks of boxes, and bodies of any inertia that touch anywhere."""
+"""Random contacts of rigid bodies, drawn by a seed.
+
+They are spheres in a box, stacks of boxes, and bodies of any inertia with any contacts.
+"""
 
 import numpy as np
 
@@ -9,7 +12,10 @@ FAMILIES = ("spheres", "stack", "any")
 
 
 def drawn(family, seed, *, friction=None, ratio=None, side=3, **more):
-    """A problem of a family; friction and the ratio of masses are drawn from 0 to 2 and from 1 to 1e4 unless given."""
+    """Return a problem of a family.
+
+    By default friction is drawn from 0 to 2 and the ratio of masses from 1 to 1e4.
+    """
     rng = np.random.default_rng([FAMILIES.index(family), seed])
     mu = rng.uniform(0.0, 2.0) if friction is None else friction
     ratio = 10.0 ** rng.uniform(0.0, 4.0) if ratio is None else ratio
@@ -23,7 +29,10 @@ def drawn(family, seed, *, friction=None, ratio=None, side=3, **more):
 
 
 def assembled(first, second, normals, arms, others, roots, speeds, mu, **more):
-    """The problem of contacts with these normals and arms from the centers of both bodies, G with G G' = M^-1, and velocities before."""
+    """Return the problem of contacts with these normals and arms.
+
+    Arms are from the centers of both bodies, G G' = M^-1, and `speeds` are the velocities before.
+    """
     tangents = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
     frames = np.stack([normals, tangents, np.cross(normals, tangents)], axis=1)
@@ -50,14 +59,17 @@ def assembled(first, second, normals, arms, others, roots, speeds, mu, **more):
 
 
 def falling(rng, n, speed):
-    """Velocities after gravity has acted for a step, with some of their own."""
+    """Return velocities after a step of gravity, with random ones added."""
     speeds = speed * rng.standard_normal((n, 6))
     speeds[:, 1] -= GRAVITY * DT
     return speeds
 
 
 def spheres(rng, ratio, side, layers=3):
-    """Spheres of radius 1 on a square lattice, layer in the hollows of layer, between five walls."""
+    """Return spheres of radius 1 on a square lattice between five walls.
+
+    Each layer lies in the hollows of the layer below.
+    """
     places = []
     for layer in range(layers):
         at = 1.0 + layer % 2 + 2.0 * np.arange(side - layer % 2)
@@ -100,7 +112,10 @@ def spheres(rng, ratio, side, layers=3):
 
 
 def stack(rng, ratio, height=4):
-    """Boxes one on the other, each touching by its four corners; the masses go up or down by the ratio."""
+    """Return a tower of boxes, each with contacts at its four corners.
+
+    The masses grow or fall by the ratio.
+    """
     corners = np.array([[x, z] for x in (-0.5, 0.5) for z in (-0.5, 0.5)])
     n, masses = height, ratio ** (rng.permutation(height) / (height - 1))
     first = np.repeat(np.arange(n), 4)
@@ -124,7 +139,10 @@ def stack(rng, ratio, height=4):
 
 
 def anything(rng, ratio, n=8, k=20):
-    """Bodies of any inertia, each contact of two of them or of one and a wall, with any normal and arms: normals and tangents couple."""
+    """Return bodies of any inertia with contacts of any normal and arms.
+
+    Each contact is between two bodies or a body and a wall; normals and tangents couple.
+    """
     first = rng.integers(0, n, k)
     second = (first + rng.integers(1, n + 1, k)) % (n + 1)
     normals, arms, others = (rng.standard_normal((k, 3)) for _ in range(3))

@@ -1,4 +1,4 @@
-"""Scenes drawn at random: liquid or sand, small, each with about half of the models that there are."""
+"""Random small scenes of liquid or sand, with about half of all models each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ Tables = dict[str, Any]
 
 
 def drawn(seed: int) -> Scene:
-    """Return the scene of a seed; drawn again until the scene's own rules allow it."""
+    """Return the scene of a seed.
+
+    It is drawn again until the rules of scenes allow it.
+    """
     rng = random.Random(seed)
     while True:
         tables = _tables(rng)
@@ -106,7 +109,7 @@ def _liquid(rng: random.Random, data: Tables, material: list[Tables], dimension:
 
 
 def _forces(rng: random.Random, data: Tables, dimension: int) -> None:
-    """Add what acts in and on liquid, and what is measured of it."""
+    """Add forces on the liquid, and measurements."""
     if _half(rng, 0.4):
         data["viscosity"] = {
             "value": 10.0 ** rng.uniform(-3.0, 4.0),
@@ -150,7 +153,7 @@ def _sand(rng: random.Random, data: Tables, material: list[Tables], dimension: i
 
 
 def _solids(rng: random.Random, dimension: int, *, bodies: bool, sand: bool) -> list[Tables]:
-    """Return up to a standing solid, a moving one and two bodies, apart from each other."""
+    """Return up to one fixed solid, one moving solid and two bodies, separate."""
     found: list[Tables] = []
     if _half(rng):
         found.append(_ball([0.15, 0.2], 0.1, dimension))

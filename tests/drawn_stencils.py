@@ -1,4 +1,7 @@
-"""Stencils drawn at random, and the matrices that NumPy assembles from the definition of `wl.Stencil`, cell by cell."""
+"""Random stencils, and their matrices assembled by NumPy from the definition.
+
+The definition is that of `wl.Stencil`, cell by cell.
+"""
 
 import itertools
 from dataclasses import dataclass
@@ -30,7 +33,7 @@ def falling_in_space(k: int, j: int, i: int):
     return -1.0 - float(j) * 0.25 - float(k)
 
 
-FUNCTIONS = {  # as Warp has them, and as NumPy does: of the center, of a neighbor
+FUNCTIONS = {  # for Warp and for NumPy: of the center, of a neighbor
     2: (rising, lambda j, i: 40 + 0.5 * i + j, falling, lambda j, i: -1 - 0.25 * j),
     3: (
         rising_in_space,
@@ -44,7 +47,10 @@ KINDS = ("numbers", "arrays", "mirrored", "half mirrored", "functions")
 
 @dataclass
 class DrawnStencil:
-    """Arguments of `wl.Stencil`; `plain` are the coefficients with Python functions in place of Warp's."""
+    """Arguments of `wl.Stencil`.
+
+    `plain` are the coefficients with Python functions in place of Warp's.
+    """
 
     cells: np.ndarray
     given: dict[tuple[int, ...], Any]
@@ -73,7 +79,10 @@ class DrawnStencil:
 
 
 def neighbor(cells, cell, offset, periodic, outside):
-    """The padded index of a cell's neighbor, where an axis is periodic the one that it stands for, and its type."""
+    """Return the padded index of a cell's neighbor, and its type.
+
+    Along a periodic axis, the index of the cell that it stands for.
+    """
     n, there, kind = cells.ndim, list(np.add(cell, offset)), None
     for axis, count in enumerate(cells.shape):
         if periodic[n - 1 - axis]:
@@ -84,14 +93,14 @@ def neighbor(cells, cell, offset, periodic, outside):
 
 
 def value_at(coefficient, cell, shape):
-    """A coefficient of a cell."""
+    """Return a coefficient of a cell."""
     return (
         coefficient(*cell) if callable(coefficient) else np.broadcast_to(coefficient, shape)[cell]
     )
 
 
 def assembled(cells, coefficients, shift, periodic, outside):
-    """The matrix on the FLUID cells, row by row from the definition."""
+    """Return the matrix on the FLUID cells, row by row from the definition."""
     number = {tuple(c): q for q, c in enumerate(np.argwhere(cells == wl.FLUID))}
     A = np.zeros((len(number), len(number)))
     for cell, q in number.items():
@@ -106,7 +115,7 @@ def assembled(cells, coefficients, shift, periodic, outside):
 
 
 def border_sums(drawn, padded):
-    """What values in AIR, a padded field, add to each row."""
+    """Return the contribution of values in AIR to each row; `padded` is their field."""
     cells = drawn.cells
     out = np.zeros(cells.shape)
     for cell in map(tuple, np.argwhere(cells == wl.FLUID)):
@@ -118,7 +127,10 @@ def border_sums(drawn, padded):
 
 
 def mirrored(given, shape, cells, rng, *, broken):
-    """Arrays with a_o(i) = a_-o(i + o), on a torus; if `broken`, between FLUID cells only."""
+    """Return arrays with a_o(i) = a_-o(i + o), on a torus.
+
+    If `broken`, that holds between FLUID cells only.
+    """
     made = {}
     for offset, a in given.items():
         opposite = tuple(-s for s in offset)
@@ -140,12 +152,12 @@ def mirrored(given, shape, cells, rng, *, broken):
 
 
 def drawn(seed, kind=None, *, thin=True):
-    """A stencil of any shape, cells and boundaries; the diagonal dominates.
+    """Return a stencil of any shape, cells and boundaries with a dominant diagonal.
 
     Args:
-        seed: of the draw.
-        kind: of the coefficients, one of `KINDS`; drawn if None.
-        thin: whether axes of one and two cells are drawn, too.
+        seed: seed of the draw.
+        kind: kind of the coefficients, one of `KINDS`; random if None.
+        thin: whether axes may have one or two cells.
     """
     rng = np.random.default_rng(seed)
     n, kind = int(rng.integers(2, 4)), kind or rng.choice(KINDS)
@@ -153,11 +165,11 @@ def drawn(seed, kind=None, *, thin=True):
     cells = rng.choice([wl.AIR, wl.FLUID, wl.FLUID, wl.FLUID, wl.SOLID], shape)
     cells.flat[0] = wl.FLUID
     periodic = tuple(bool(p) for p in rng.random(3) < 0.3)
-    # on a torus the sides beyond the array are other cells'
+    # On a torus the sides beyond the array belong to other cells.
     if kind in ("mirrored", "half mirrored"):
         periodic = tuple(p and shape[n - 1 - a] > 2 if a < n else p for a, p in enumerate(periodic))
     given = {(0,) * n: 60.0}
-    # few, or the kernels of each would have to be compiled: faces alone, all neighbors, some
+    # Few choices, since the kernels of each must be compiled: faces alone, all neighbors, some.
     chosen = int(rng.integers(3))
     for offset in itertools.product((-1, 0, 1), repeat=n):
         places = abs(np.array(offset)).sum(), sum((s + 1) * 3**a for a, s in enumerate(offset))
@@ -181,7 +193,7 @@ def drawn(seed, kind=None, *, thin=True):
 
 
 def beside(values, offset, periodic):
-    """What each cell's neighbor has, 0 beyond the array."""
+    """Return the values of each cell's neighbor, 0 beyond the array."""
     moved = np.roll(values, tuple(-s for s in offset), tuple(range(values.ndim)))
     for axis, step in enumerate(offset):
         if step and not periodic[values.ndim - 1 - axis]:
@@ -190,17 +202,20 @@ def beside(values, offset, periodic):
 
 
 def drawn_offsets(dimension, rng):
-    """All neighbors, or those across faces."""
+    """Return all neighbors, or those across faces."""
     offsets = [o for o in itertools.product((-1, 0, 1), repeat=dimension) if any(o)]
     return offsets if rng.random() < 0.5 else [o for o in offsets if sum(map(abs, o)) == 1]
 
 
-# what sums to 0; of the last one both, without symmetry
+# Sums that are 0; in the last kind both, without symmetry.
 SINGULAR = ("symmetric", "numbers", "rows", "columns", "circulant")
 
 
 def drawn_singular(seed, kind):
-    """A stencil between closed sides and periodic ones, whose rows or columns sum to 0."""
+    """Return a stencil whose rows or columns sum to 0.
+
+    It lies between closed sides and periodic ones.
+    """
     rng = np.random.default_rng([seed, 21])
     shape = (16 + seed % 3, 16) if rng.random() < 0.7 else (6, 7, 6)
     n, decades = len(shape), int(rng.integers(3))
@@ -238,7 +253,10 @@ def drawn_singular(seed, kind):
 
 
 def drawn_dominant(seed, side=40, side_in_space=10):
-    """An M-matrix that need not be symmetric: random coefficients, winds or anisotropy over up to four decades; and its data."""
+    """Return an M-matrix that need not be symmetric, and its data.
+
+    It has random coefficients, winds or anisotropy over up to four decades.
+    """
     rng = np.random.default_rng([seed, 31])
     shape = (side_in_space, side_in_space, side_in_space + 3) if seed % 3 == 2 else (side, side + 7)
     n, decades, form = (
@@ -287,6 +305,6 @@ def drawn_dominant(seed, side=40, side_in_space=10):
 
 
 def natural_residual(matrix, diagonal, x, b, lower, upper):
-    """||d (x - clip(x - (A x + b)/d, l, u))||."""
+    """Return ||d (x - clip(x - (A x + b)/d, l, u))||."""
     y = matrix @ x + b
     return float(np.linalg.norm(diagonal * (x - np.clip(x - y / diagonal, lower, upper))))

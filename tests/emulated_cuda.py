@@ -1,10 +1,12 @@
-"""Pytest plugin: tests in CUDA's form on the CPU, see `benchmarks/emulated_cuda.py`. `make emulated-cuda`, or
+"""Pytest plug-in that runs tests in CUDA's form on the CPU.
+
+See `benchmarks/emulated_cuda.py`. `make emulated-cuda`, or
 
     PYTHONPATH=tests:. ORDER=permuted python -m pytest -p emulated_cuda tests/solvers
 
-Tests of the CPU's own ways (`cpu_form`) are left out. With COMPARE=1 a kernel whose results depend
-on the order of threads, and that is not known to, fails the test that launched it. With CELLS=1 so
-does a pass by quads of cells that finds something else than it does by cells.
+Tests of CPU-only behavior (`cpu_form`) are left out. With COMPARE=1 a test fails if it launched a
+kernel whose results depend on the order of threads, except known kernels. With CELLS=1 it also
+fails if a pass by quads of cells has other results than by cells.
 """
 
 import pytest
@@ -13,7 +15,7 @@ from benchmarks.emulated_cuda import differs, otherwise
 
 
 def pytest_collection_modifyitems(items):
-    """Leave out what is not done on CUDA."""
+    """Leave out tests of CPU-only behavior."""
     for item in items:
         if marked := item.get_closest_marker("cpu_form"):
             item.add_marker(pytest.mark.skip(reason=marked.args[0]))
@@ -21,7 +23,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    """Fail a test that launched a kernel whose results depend on the order of threads, or on how many cells a thread takes."""
+    """Fail a test whose kernels depend on the thread order or on cells per thread."""
     differs.clear()
     otherwise.clear()
     result = yield

@@ -1,4 +1,4 @@
-"""Continue a simulation from its state after every step, in a fresh one, and compare the step that follows bit for bit."""
+"""Resume a simulation after every step and compare the next step bit for bit."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,12 +15,15 @@ Told = dict[str, Any]
 
 
 def made(scene: Scene) -> Simulation:
-    """Return a simulation as a run begins it."""
+    """Return a simulation as a run creates it."""
     return simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
 
 
 def told(simulation: Simulation, scene: Scene, index: int) -> Told:
-    """Take a step as the run loop does, and return all that is written of it: its row of the log, the state and a frame."""
+    """Take a step as the run loop does, and return all its output.
+
+    The output is its row of the log, the state and a frame.
+    """
     interval = 1.0 / scene.time.frames_per_second
     end = (int(simulation.time / interval * (1.0 + 1e-9)) + 1) * interval
     dt, retries, row = take_step(simulation, simulation.stable_dt(), end, scene.time)
@@ -28,7 +31,7 @@ def told(simulation: Simulation, scene: Scene, index: int) -> Told:
         "row": {"dt": dt, "retries": retries, **row},
         **{f"state {name}": value for name, value in simulation.state().items()},
     }
-    if index % 3 == 0:  # frames follow from the state, and take longer than a step
+    if index % 3 == 0:  # frames follow from the state and take longer than a step
         found |= shown(simulation.frame())
     return found
 
@@ -44,7 +47,7 @@ def shown(frame: list[Part]) -> Told:
 
 
 def differing(first: Told, second: Told) -> list[str]:
-    """Return the names of what is not the same bit for bit."""
+    """Return the names of arrays that differ in a bit."""
     names = [
         name
         for name in sorted(first.keys() | second.keys())
@@ -60,7 +63,7 @@ def differing(first: Told, second: Told) -> list[str]:
 
 
 def same(first: Any, second: Any) -> bool:
-    """Tell whether two values are the same bit for bit."""
+    """Return whether two values are equal bit for bit."""
     if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
         return (first.dtype, first.shape, first.tobytes()) == (
             second.dtype,
@@ -73,12 +76,14 @@ def same(first: Any, second: Any) -> bool:
 
 
 def differences_by_step(scene: Scene, steps: int, every: int = 1) -> dict[int, list[str]]:
-    """Return what differs in the step behind each from which a fresh simulation has continued.
+    """Return the differences of resumed simulations by step.
+
+    The compared step is the one after the step from which a fresh simulation has continued.
 
     Args:
-        scene: what to simulate.
-        steps: how many are taken without interruption.
-        every: continue behind each that this divides.
+        scene: scene to simulate.
+        steps: number of steps of the uninterrupted run.
+        every: interval of the steps after which a simulation is resumed.
     """
     whole, found = made(scene), {}
     for step in range(steps):
@@ -91,7 +96,7 @@ def differences_by_step(scene: Scene, steps: int, every: int = 1) -> dict[int, l
         kept = {
             name: array for name, array in resumed.state().items() if not same(array, state[name])
         }
-        resumed.frame()  # as a run does that goes on, to see what it will take on the disk
+        resumed.frame()  # as a resumed run does, to estimate its disk use
         if names := [f"restored {name}" for name in kept] + differing(
             expected, told(resumed, scene, step)
         ):

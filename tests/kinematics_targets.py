@@ -1,4 +1,7 @@
-"""Inverse kinematics with joint limits beside SciPy's bounded least squares: targets by seed, and counts of what both find."""
+"""Inverse kinematics with joint limits against SciPy's bounded least squares.
+
+Targets by seed, and counts of the results of both.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,8 @@ from warp_lcp.gallery.articulated_figure import (
 )
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, ReachedPose
 
-SAME = 1e-6  # of reach^2: objectives that differ by less are one optimum
-OUTSIDE = 1e-9  # [rad] beyond the limits
+SAME = 1e-6  # of reach^2: objectives with a smaller difference are one optimum
+OUTSIDE = 1e-9  # [rad] tolerance beyond the limits
 MODELS = {
     "Gauss-Newton": InverseKinematics(device="cpu"),
     "with curvature": InverseKinematics(device="cpu", curvature=True),
@@ -27,13 +30,13 @@ MODELS = {
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A goal for a figure and a start.
+    """Target of a figure, and its start.
 
     Args:
-        name: of the figure.
-        figure: what moves.
-        goals: g [m], shape (e, dimension).
-        start: angles [rad], shape (n,), strictly within the limits.
+        name: name of the figure.
+        figure: the articulated figure.
+        goals: goals g [m], shape (e, dimension).
+        start: initial angles [rad], shape (n,), strictly within the limits.
         reachable: whether some pose meets the goal.
     """
 
@@ -45,7 +48,10 @@ class Target:
 
 
 def figures(rng: np.random.Generator) -> dict[str, ArticulatedFigure]:
-    """Return one figure of each kind with random links and limits, the branching one but for its limits as it is."""
+    """Return one figure of each kind with random links and limits.
+
+    Of the branching one only the limits are random.
+    """
     made = {}
     for name, chain, links in (("planar", planar_chain, 4), ("spatial", spatial_chain, 6)):
         lower, upper = -rng.uniform(0.2, 2.5, links), rng.uniform(0.2, 2.5, links)
@@ -57,7 +63,10 @@ def figures(rng: np.random.Generator) -> dict[str, ArticulatedFigure]:
 
 
 def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
-    """Yield targets, a kind of figure after the other; every other round's goals are out of reach by a tenth to a half of the reach."""
+    """Yield targets for each kind of figure in turn.
+
+    In every other round the goals are out of reach by a tenth to a half of the reach.
+    """
     rng = np.random.default_rng(seed)
     for k in range(count):
         name, figure = list(figures(rng).items())[k % 3]
@@ -80,7 +89,10 @@ def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
 
 
 def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.OptimizeResult:
-    """Return the answer of scipy.optimize.least_squares (trust region, reflective) from the same start, with exact derivatives."""
+    """Return the answer of scipy.optimize.least_squares from the same start.
+
+    The method is its trust-region reflective one, with exact derivatives.
+    """
     figure, inside = target.figure, 1e-10 * (target.figure.upper - target.figure.lower)
     return scipy.optimize.least_squares(
         lambda theta: (figure.positions(theta) - target.goals).ravel(),
@@ -101,20 +113,20 @@ class Comparison:
     """Counts over targets.
 
     Args:
-        targets: how many.
-        converged: how many of our runs did.
-        same: how many objectives agree to SAME.
-        better: how many other optima of ours are lower than SciPy's.
-        worse: how many are higher.
-        both_stay: of the other optima, how many each code keeps when it starts from the other's
-            answer and ours from ours.
-        outside: the most by which a limit was passed [rad].
-        overshoot: the most by which a solution of an LCP left its bounds before it was clipped
-            [rad].
-        grew: steps after which the objective was higher.
-        iterations: of all our runs.
-        evaluations: of all of SciPy's.
-        worst: the largest difference where ours is higher, in units of reach^2.
+        targets: number of targets.
+        converged: number of our converged runs.
+        same: number of objectives that agree to SAME.
+        better: number of our other optima that are lower than SciPy's.
+        worse: number of our other optima that are higher.
+        both_stay: number of other optima that both codes keep, SciPy from our answer and ours
+            from its own.
+        outside: largest violation of a limit [rad].
+        overshoot: largest violation of the bounds by a solution of an LCP before it was
+            clipped [rad].
+        grew: number of steps that raised the objective.
+        iterations: iterations of all our runs.
+        evaluations: evaluations of all of SciPy's runs.
+        worst: largest difference if ours is higher, in units of reach^2.
     """
 
     targets: int = 0
@@ -167,7 +179,7 @@ class Comparison:
 def compare(
     count: int, solvers: dict[str, InverseKinematics], *, seed: int = 134
 ) -> dict[str, dict[str, Comparison]]:
-    """Return, for each of the solvers, counts by figure and whether the goal is in reach."""
+    """Return, for each solver, counts by figure and reachability of the goal."""
     counts: dict[str, dict[str, Comparison]] = {name: {} for name in solvers}
     for target in targets(count, seed=seed):
         key, other = (

@@ -1,11 +1,14 @@
-"""Independent checks of surfaces: closed, consistently turned, and how much they enclose."""
+"""Independent checks of surfaces: closed, oriented, and enclosed volume."""
 
 import numpy as np
 
 
 def assert_closed(corners: np.ndarray) -> None:
-    """Every edge of a triangle belongs to exactly one other, which runs through it the other way; every point of an outline has one segment
-    that leaves it and one that arrives."""
+    """Assert that triangles form a closed surface, or segments a closed outline.
+
+    Every edge of a triangle belongs to exactly one other, which runs through it the other way.
+    Every point of an outline has one segment that leaves it and one that arrives.
+    """
     if corners.shape[1] == 2:
         for side in corners.T:
             assert len(np.unique(side)) == len(side)
@@ -20,7 +23,10 @@ def assert_closed(corners: np.ndarray) -> None:
 
 
 def enclosed(points: np.ndarray, corners: np.ndarray) -> float:
-    """Return the volume inside triangles, or the area inside an outline, by the divergence theorem; > 0 if they face outward."""
+    """Return the volume inside triangles, or the area inside an outline.
+
+    The result follows from the divergence theorem. It is positive if they face outward.
+    """
     x = points.astype(np.float64)[corners]
     if corners.shape[1] == 2:
         a, b = x[:, 0], x[:, 1]
@@ -29,7 +35,7 @@ def enclosed(points: np.ndarray, corners: np.ndarray) -> float:
 
 
 def pieces(points: np.ndarray, corners: np.ndarray) -> int:
-    """Return how many separate surfaces there are."""
+    """Return the number of separate surfaces."""
     label = np.arange(len(points))
     while True:
         before = label.copy()

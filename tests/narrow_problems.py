@@ -1,4 +1,7 @@
-"""Boxed problems with narrow matrices by seed: chains, convection, wide bands, beams, with bounds everywhere or in windows."""
+"""Boxed problems with narrow matrices by seed.
+
+They are chains, convection, wide bands and beams, with bounds everywhere or in windows.
+"""
 
 import numpy as np
 import scipy.sparse
@@ -20,7 +23,10 @@ M_MATRICES = KINDS[:5]
 
 
 def narrow_problem(kind, seed, n):
-    """Return a problem of about n unknowns; loads and coefficients are smooth in the index unless the kind says otherwise."""
+    """Return a problem of about n unknowns.
+
+    Loads and coefficients are smooth in the index, unless the kind says otherwise.
+    """
     rng = np.random.default_rng([seed, n, KINDS.index(kind)])
     A, b = _frame(rng, n) if kind == "frame" else _matrix(kind, rng, n)
     return SmallProblem(
@@ -45,7 +51,7 @@ def _matrix(kind, rng, n):
             c = 10 ** rng.uniform(-2, 2, n + 1)
         elif kind == "pinched chain":
             c[rng.random(n + 1) < 0.01] = 1e-4
-        # upwind differences: the cell Peclet number is small
+        # Upwind differences: the cell Peclet number is small.
         wind = rng.uniform(-5, 5) * h if kind == "convection" else 0.0
         lower, upper = c[1:-1] + max(wind, 0), c[1:-1] + max(-wind, 0)
         A = scipy.sparse.diags_array(
@@ -78,7 +84,7 @@ def _matrix(kind, rng, n):
 
 
 def _frame(rng, n):
-    """Hermite elements: deflection and slope at each node, clamped ends."""
+    """Return Hermite elements: deflection and slope at each node, clamped ends."""
     nodes, h = n // 2, 1 / (n // 2 + 1)
     own, other, slopes = 12.0, 6 * h, h * h
     K = np.array(

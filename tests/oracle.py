@@ -1,4 +1,7 @@
-"""Independent answers for small problems: dense assembly, Lemke's method, exhaustive search. No code of the library is used."""
+"""Independent answers for small problems, without code of the library.
+
+They are dense assembly, Lemke's method and exhaustive search.
+"""
 
 import itertools
 
@@ -7,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 
 def assemble(cells, faces=(1.0, 1.0, 1.0), shift=None, periodic=(False, False, False)):
-    """Dense matrix of the grid operator, written from its definition face by face."""
+    """Return the dense matrix of the grid operator, face by face from its definition."""
     cells = np.asarray(cells)
     grid = cells.reshape((1,) * (3 - cells.ndim) + cells.shape)
     index, n = np.arange(grid.size).reshape(grid.shape), grid.size
@@ -38,7 +41,10 @@ def assemble(cells, faces=(1.0, 1.0, 1.0), shift=None, periodic=(False, False, F
 
 
 def lemke(M, q, limit=10_000):
-    """Solve 0 <= z, w = M z + q >= 0, z'w = 0 by Lemke's method with the lexicographic rule; None on a ray."""
+    """Solve 0 <= z, w = M z + q >= 0, z'w = 0 by Lemke's method.
+
+    The rule is lexicographic. The result is None on a ray.
+    """
     n = len(q)
     if (q >= 0).all():
         return np.zeros(n)
@@ -74,7 +80,10 @@ def lemke(M, q, limit=10_000):
 
 
 def boxed(A, b, lower, upper):
-    """Solve the boxed problem of at most 8 unknowns by trying every assignment of lower, upper, free."""
+    """Solve a boxed problem of at most 8 unknowns by enumeration.
+
+    Of every assignment of lower, upper, free.
+    """
     n = len(b)
     for kind in itertools.product("fLU", repeat=n):
         low, up, free = (np.array([k == c for k in kind]) for c in "LUf")
@@ -94,8 +103,11 @@ def boxed(A, b, lower, upper):
 
 
 def natural_scale(A):
-    """The natural residual's d: |A_ii| where no other transversal of A has a larger product than the diagonal (by assignment), else that of
-    columns scaled to 1 and then rows."""
+    """Return the natural residual's scale d.
+
+    It is |A_ii| where no other transversal of A has a larger product than the diagonal (by
+    assignment), otherwise that of columns scaled to 1 and then rows.
+    """
     size = np.abs(np.asarray(A, dtype=np.float64))
     full = (size > 0).any(axis=0) | (size > 0).any(axis=1)
     inner, d = size[np.ix_(full, full)], np.ones(len(size))
@@ -103,7 +115,7 @@ def natural_scale(A):
         cost = -np.log(inner)
     allowed = np.isfinite(cost)
     if np.diag(allowed).all():
-        # as good as forbidden
+        # Practically forbidden.
         far = 4.0 * len(cost) * (np.abs(cost[allowed]).max(initial=0.0) + 1.0)
         best = np.where(allowed, cost, far)[
             linear_sum_assignment(np.where(allowed, cost, far))
@@ -116,7 +128,7 @@ def natural_scale(A):
 
 
 def natural_residual(A, b, lower, upper, x):
-    """Norm of the natural residual, from its definition."""
+    """Return the norm of the natural residual, from its definition."""
     d = natural_scale(A)
     y = A @ x + b
     return np.linalg.norm(d * (x - np.clip(x - y / d, lower, upper)))

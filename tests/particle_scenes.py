@@ -1,4 +1,4 @@
-"""The built-in scenes of a material that particles carry: all but those of rigid bodies alone."""
+"""Built-in scenes of particle materials, without those of rigid bodies alone."""
 
 import functools
 
@@ -8,5 +8,5 @@ from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 @functools.cache
 def particle_scenes() -> list[str]:
-    """Return their names."""
+    """Return the names of the scenes."""
     return [name for name in built_in_scenes() if isinstance(load_scene(name), ParticleScene)]

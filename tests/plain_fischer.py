@@ -1,4 +1,7 @@
-"""The Fischer-Burmeister map of a box, its penalized form and the minimum map, row by row from their definitions, without the library."""
+"""Fischer-Burmeister map, its penalized form and the minimum map of a box.
+
+They are evaluated row by row from their definitions, without the library.
+"""
 
 import math
 
@@ -10,22 +13,26 @@ KINK = 1e-14  # times the size of b: rounding of a point at a kink
 
 
 def psi(a, b):
-    """a + b - sqrt(a^2 + b^2): 0 where a >= 0, b >= 0 and a b = 0."""
+    """Return a + b - sqrt(a^2 + b^2): 0 where a >= 0, b >= 0 and a b = 0."""
     return a + b - math.hypot(a, b)
 
 
 def slopes_of_psi(a, b, kink, scale):
-    """Derivatives of psi by a and by b, and whether there are none: `kink` where both are 0."""
+    """Return the derivatives of psi by a and b, and whether it is a kink.
+
+    The derivatives are `kink` where both arguments are 0.
+    """
     rho = math.hypot(a, b)
     return (*kink, True) if rho <= KINK * scale else (1 - a / rho, 1 - b / rho, False)
 
 
 def plain_row(form, d, x, y, lower, upper, *, share, scale, kink):
-    """f of one row, p and q of the element p d + q A_i of its generalized Jacobian, and whether it is at a kink.
+    """Return f, p and q of one row, and whether it is at a kink.
 
-    With a = d (x - l) and c = d (u - x): h = -psi(-y, c) takes the place of y where there is an
-    upper bound, and f = psi(a, h) where there is a lower one. Penalized: share f + (1 - share) (a+
-    y+ - c+ (-y)+) / scale. The minimum map is max(min(y, a), -c).
+    p d + q A_i is the row of the generalized Jacobian. With a = d (x - l) and c = d (u - x): h =
+    -psi(-y, c) replaces y where there is an upper bound, and f = psi(a, h) where there is a lower
+    one. Penalized: share f + (1 - share) (a+ y+ - c+ (-y)+) / scale. The minimum map is max(min(y,
+    a), -c).
     """
     low, high = math.isfinite(lower), math.isfinite(upper)
     a, c = d * (x - lower) if low else 0.0, d * (upper - x) if high else 0.0
@@ -51,12 +58,12 @@ def plain_row(form, d, x, y, lower, upper, *, share, scale, kink):
 
 
 class PlainMap:
-    """f and a generalized Jacobian of a whole problem.
+    """Map f and a generalized Jacobian of a whole problem.
 
     Args:
         form: "natural", "fischer" or "penalized".
         A, b, lower, upper: the problem.
-        share: of the penalized map.
+        share: share of the penalized map.
         kink: (p, q) at kinks.
     """
 
@@ -66,7 +73,7 @@ class PlainMap:
         self.scale = math.sqrt(b @ b / len(b))
 
     def rows(self, x):
-        """f, p, q and the kinks, each an array."""
+        """Return f, p, q and the kinks, an array each."""
         y = self.A @ x + self.b
         given = {"share": self.share, "scale": self.scale, "kink": self.kink}
         rows = [
@@ -76,18 +83,21 @@ class PlainMap:
         return tuple(np.array(column) for column in zip(*rows, strict=True))
 
     def merit(self, x):
-        """f'f / 2."""
+        """Return the merit f'f / 2."""
         f = self.rows(x)[0]
         return 0.5 * float(f @ f)
 
     def jacobian(self, x):
-        """diag(p d) + diag(q) A."""
+        """Return the Jacobian diag(p d) + diag(q) A."""
         _, p, q, _ = self.rows(x)
         return np.diag(p * self.d) + q[:, None] * self.A
 
 
 def armijo(merit, along, limit, slope, least=1e-8):
-    """The first of the halved steps whose merit is at most limit + 1e-4 t slope; 0 if there is none."""
+    """Return the first halved step that meets Armijo's condition; 0 if none does.
+
+    The merit must be at most limit + 1e-4 t slope.
+    """
     t = 1.0
     while t >= least:
         if merit(along(t)) <= limit + DECREASE * t * slope:

@@ -1,9 +1,9 @@
-"""Random convex quadratic programs with known verdicts and minimizers, badly scaled.
+"""Random convex quadratic programs with known answers, badly scaled.
 
-Each is made around a point x and multipliers, from which q follows by the first-order conditions;
-some are then made infeasible by a contradiction or unbounded by a direction of descent without end.
+Each is constructed from a point x and multipliers; q follows by the first-order conditions. Some
+are then made infeasible by a contradiction, or unbounded by an unlimited direction of descent.
 Costs, rows and unknowns are scaled afterwards, so that the program in plain units is known as well:
-solvers that fail on the scaled one are asked for that.
+it tests solvers that fail on the scaled one.
 """
 
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ import scipy.sparse
 
 INFINITIES = (1e20, 1e30, np.inf)
 VERDICTS = ("solvable",) * 7 + ("infeasible",) * 2 + ("unbounded",)
-# singular value of the active rows and P, relative, from which a minimizer counts as unique
+# Relative singular value of the active rows and P from which a minimizer counts as unique.
 DISTINCT = 1e-3
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A program, its verdict and, where it is solvable, a minimizer.
+    """Program, its verdict and, if it is solvable, a minimizer.
 
     Attributes:
         plain: keyword arguments of qpsolvers.Problem, in plain units, infinity as inf.
         scaled: the same in other units, infinity as 1e20, 1e30 or inf.
         verdict: "solvable", "infeasible" or "unbounded".
         x: a minimizer in plain units, which are those of `scaled` times `units`.
-        unique: whether there is no other.
+        unique: whether x is the only minimizer.
         cost: factor of P and q.
-        units: what a unit of x in `scaled` is in plain units, shape (n,).
+        units: unit of x in `scaled`, in plain units, shape (n,).
     """
 
     plain: dict
@@ -44,10 +44,10 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
     """Return a program.
 
     Args:
-        seed: of the draw.
-        widest: costs and rows are scaled by powers of 10 up to this.
-        columns: unknowns are, too.
-        most: unknowns.
+        seed: seed of the draw.
+        widest: largest exponent of the powers of 10 that scale costs and rows.
+        columns: whether unknowns are scaled, too.
+        most: largest number of unknowns.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, most + 1))
@@ -71,7 +71,7 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
         G[-1] = G[0] if rng.random() < 0.5 else G[0] + G[m // 2]
     if k > 1 and rng.random() < 0.4:
         A[-1] = A[0] if rng.random() < 0.5 else A[0] - A[k // 2]
-    # active rows: their slack is 0, and their multiplier mostly not
+    # Active rows: their slack is 0, and most of their multipliers are not.
     tight, sides = (
         rng.random(m) < 0.3,
         rng.choice([-1, 0, 1], n, p=[0.2, 0.6, 0.2]) * (rng.random() < 0.7),
@@ -115,7 +115,7 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
 
 
 def _contradicted(rng, x, G, h, A, b, lower, upper):
-    """Add rows that no point meets: a pair, a row and the box, or two equations."""
+    """Add contradictory rows: a pair, a row and the box, or two equations."""
     n, row = len(x), rng.standard_normal(len(x))
     way = rng.choice(["pair", "box", "equations", "sum"])
     gap = rng.uniform(0.2, 3.0)
@@ -146,7 +146,10 @@ def _contradicted(rng, x, G, h, A, b, lower, upper):
 
 
 def _opened(rng, P, q, G, A, lower, upper):
-    """Make a direction d without curvature, rows or bounds in its way, along which costs fall."""
+    """Add a direction of unlimited descent.
+
+    d has no curvature, and no rows or bounds limit it.
+    """
     n = len(q)
     d = rng.standard_normal(n)
     d /= np.linalg.norm(d)
@@ -176,7 +179,7 @@ def _scaled(rng, plain, cost, units, widest, sparse):
         "ub": infinite(p["ub"] / units, 1.0),
     }
     for matrix, right in (("G", "h"), ("A", "b")):
-        if not len(found[right]) and rng.random() < 0.7:  # else a matrix without rows
+        if not len(found[right]) and rng.random() < 0.7:  # otherwise a matrix without rows
             found[matrix] = found[right] = None
     for side in ("lb", "ub"):
         if not (np.abs(found[side]) < INFINITIES[0]).any() and rng.random() < 0.5:

@@ -1,4 +1,7 @@
-"""Scenes drawn by seed that together have every table, every shape and every motion, thin and thick, from 1 mm to 1 km."""
+"""Scenes by seed that together have every table, every shape and every motion.
+
+They have thin and thick solids, and sides from 1 mm to 1 km.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,13 @@ GRAVITY = 9.81
 
 
 class Draw:
-    """One scene: lengths are in units of the domain's longest side, times in those of a fall through it.
+    """Draw one scene.
+
+    Lengths are in units of the domain's longest side, times in those of a fall through it.
 
     Args:
-        seed: scenes of seeds that follow each other go through sides, dimensions, materials and
-            shapes in turn.
+        seed: seed of the scene; consecutive seeds cycle through sides, dimensions, materials
+            and shapes.
     """
 
     def __init__(self, seed: int) -> None:
@@ -33,7 +38,10 @@ class Draw:
         self.speed = math.sqrt(self.side * GRAVITY)  # [m/s]
 
     def point(self, *coordinates: float) -> list[float]:
-        """Return a point or a shift [m] with as many coordinates as the scene has; z is the middle unless given."""
+        """Return a point or a shift [m] with the coordinates of the scene.
+
+        By default z is in the middle.
+        """
         return [self.side * c for c in (*coordinates, 0.3)[: self.dimension]]
 
     def velocity(self, *parts: float) -> list[float]:
@@ -41,7 +49,10 @@ class Draw:
         return [self.speed * c for c in (*parts, 0.0)[: self.dimension]]
 
     def shape(self, kind: str, x: float, y: float, size: float, *, thin: bool = False) -> Tables:
-        """Return a shape about a point; a thin one is a fifth of a cell thick, where its kind has a thickness."""
+        """Return a shape about a point.
+
+        A thin one is a fifth of a cell thick, if its kind has a thickness.
+        """
         thick = 0.01 if thin else size
         if kind == "box":
             low, high = (
@@ -97,7 +108,7 @@ class Draw:
 
 
 def scene_of_every_table(seed: int) -> Tables:
-    """Return the tables of a scene file, which `load_scene` takes."""
+    """Return the tables of a valid scene file."""
     draw = Draw(seed)
     rng, side, fall = draw.rng, draw.side, draw.fall
     data: Tables = {
@@ -158,7 +169,10 @@ def scene_of_every_table(seed: int) -> Tables:
 
 
 def _turn(draw: Draw, values: tuple[str, ...], step: int) -> str:
-    """Return one of some values, by the seed: which go together changes from one round of seeds to the next."""
+    """Return one of some values, by the seed.
+
+    Combinations change from one round of seeds to the next.
+    """
     return values[(draw.turn // 2 + draw.turn // 10 * step) % len(values)]
 
 
@@ -172,12 +186,12 @@ def _source(draw: Draw) -> Tables:
 
 
 def _solids(draw: Draw) -> list[Tables]:
-    """Return one that stands, one that moves and a rigid body, apart from each other."""
+    """Return a fixed solid, a moving one and a rigid body, separate."""
     rng = draw.rng
     kind = _turn(draw, SHAPES, 1)
     standing = draw.shape(kind, 0.2, 0.02 if kind == "plane" else 0.2, 0.08, thin=draw.thin)
     if kind != "plane" and rng.random() < 0.5:
-        # a mesh turns before it is moved there
+        # A mesh is rotated before it is moved.
         about = {} if kind == "mesh" else {"about": draw.point(0.2, 0.2)}
         standing |= {"rotate": 20.0 if draw.dimension == 2 else [0.0, 0.0, 20.0], **about}
     moving = draw.shape(_turn(draw, SHAPES[:3], 1), 0.5, 0.3, 0.08, thin=draw.thin) | {
@@ -203,7 +217,10 @@ def _solids(draw: Draw) -> list[Tables]:
 
 
 def _liquid(draw: Draw, data: Tables, material: list[Tables]) -> None:
-    """Add what a liquid has; its band, its unilateral pressure and its tension exclude each other."""
+    """Add the tables of a liquid.
+
+    Its band, its unilateral pressure and its tension exclude each other.
+    """
     rng, weight = draw.rng, data["physics"].setdefault("density", 1000.0) * GRAVITY * draw.side
     data["liquid"] = material
     choice = draw.turn // 2 % 3
@@ -245,7 +262,10 @@ def _liquid(draw: Draw, data: Tables, material: list[Tables]) -> None:
 
 
 def _sand(draw: Draw, data: Tables, material: list[Tables]) -> None:
-    """Add what sand has; every fourth is a layer without ends, which much does not go with."""
+    """Add the tables of sand.
+
+    Every fourth is a periodic layer, which excludes many models.
+    """
     rng = draw.rng
     data["sand"] = material
     weight = 1600.0 * GRAVITY * draw.side

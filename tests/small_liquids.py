@@ -1,4 +1,4 @@
-"""Scenes of a little liquid, and how to run them."""
+"""Scenes of a small liquid, and functions to run them."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,11 @@ STEPS = 2000
 def scene(
     *, size: list[float], resolution: int, liquid: list[dict[str, Any]], **tables: Any
 ) -> LiquidScene:
-    """Return a scene; `wall`, `solids` and `cfl` are short for domain.wall, domain.solids and time.cfl, the rest are tables."""
+    """Return a scene.
+
+    `wall`, `solids` and `cfl` are short for domain.wall, domain.solids and time.cfl; the rest are
+    tables.
+    """
     data: dict[str, Any] = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 10.0, "cfl": tables.pop("cfl", 2.0)},
@@ -63,7 +67,10 @@ def advance(
 
 
 def random_tank(seed: int) -> dict[str, Any]:
-    """Return the tables of a pool with a few solids in it, whole or cut, that stand apart or in each other, in 2-D or 3-D."""
+    """Return the tables of a pool with a few solids in 2-D or 3-D.
+
+    They are whole or cut, separate or overlapping.
+    """
     rng = np.random.default_rng(seed)
     dimension = int(rng.integers(2, 4))
     solids: list[dict[str, Any]] = []

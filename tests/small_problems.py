@@ -1,4 +1,7 @@
-"""Small and narrow problems by seed, as NumPy and SciPy have them, and a plain active set in NumPy to compare with."""
+"""Small and narrow problems by seed, and a plain active set in NumPy.
+
+They are in the forms of NumPy and SciPy.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +16,15 @@ import scipy.sparse
 
 @dataclass(frozen=True)
 class SmallProblem:
-    """A x + b = y with bounds, and a guess.
+    """Problem A x + b = y with bounds, and an initial guess.
 
     Args:
-        name: what it is.
+        name: description of the problem.
         A: numpy array or scipy.sparse matrix, shape (n, n).
         b: shape (n,), units of y.
         lower: l, shape (n,).
         upper: u, shape (n,).
-        start: a guess, shape (n,); None: a cold start.
+        start: initial guess, shape (n,); None for a cold start.
     """
 
     name: str
@@ -33,12 +36,15 @@ class SmallProblem:
 
     @property
     def first(self) -> np.ndarray:
-        """Where a method starts."""
+        """Initial iterate of a method."""
         return np.clip(0.0 if self.start is None else self.start, self.lower, self.upper)
 
 
 def option(seed: int, *, n: int | None = None, kind: str | None = None) -> SmallProblem:
-    """Return a time step of an American put or call by Crank and Nicolson's or Euler's implicit method, from its payoff; tridiagonal."""
+    """Return a time step of an American put or call from its payoff; tridiagonal.
+
+    The method is Crank and Nicolson's or Euler's implicit one.
+    """
     rng = np.random.default_rng(seed)
     n = n or int(rng.integers(3, 400))
     kind = kind or ("put", "call")[int(rng.integers(2))]
@@ -66,7 +72,10 @@ def option(seed: int, *, n: int | None = None, kind: str | None = None) -> Small
 
 
 def string(seed: int, *, n: int | None = None, between: bool = True) -> SmallProblem:
-    """Return an elastic string, fixed at its ends, over an obstacle or between two; tridiagonal."""
+    """Return an elastic string over an obstacle or between two; tridiagonal.
+
+    Its ends are fixed.
+    """
     rng = np.random.default_rng(seed)
     n = n or int(rng.integers(1, 400))
     s = np.linspace(0.0, 1.0, n + 2)[1:-1]
@@ -85,7 +94,10 @@ def string(seed: int, *, n: int | None = None, between: bool = True) -> SmallPro
 
 
 def banded(seed: int, *, kind: str = "m-matrix") -> SmallProblem:
-    """Return a random banded problem, bandwidth 1 to 3: an M-matrix, another diagonally dominant P-matrix, or definite and unsymmetric."""
+    """Return a random banded problem, bandwidth 1 to 3.
+
+    It is an M-matrix, another diagonally dominant P-matrix, or definite and unsymmetric.
+    """
     rng = np.random.default_rng(seed)
     width, n = int(rng.integers(1, 4)), int(rng.integers(5, 300))
     offsets = [k for d in range(1, width + 1) for k in (-d, d)]
@@ -112,7 +124,10 @@ def dense(seed: int, *, symmetric: bool = True) -> SmallProblem:
 
 
 def _random_rows(name: str, A: Any, rng: np.random.Generator) -> SmallProblem:
-    """Return a problem whose rows are one-sided, boxed, equations or held, all alike or mixed; half of them with a guess."""
+    """Return a problem with one-sided, boxed, equation or held rows.
+
+    All alike or mixed; half of the problems have an initial guess.
+    """
     n = A.shape[0]
     kind = rng.integers(0, 5, n) if rng.random() < 0.5 else np.full(n, rng.integers(0, 3))
     lower = np.where(np.isin(kind, (0, 2)), -rng.random(n), np.where(kind == 4, 0.2, -np.inf))
@@ -134,19 +149,21 @@ FAMILIES: dict[str, Callable[[int], SmallProblem]] = {
 
 
 def stepped(problem: SmallProblem, x: np.ndarray) -> SmallProblem:
-    """Return the next time step of an implicit option, from the last one's x."""
+    """Return the next time step of an implicit option, from the last x."""
     return replace(problem, b=problem.b + problem.first - x, start=x)
 
 
 def plain_active_set(
     problem: SmallProblem, bands: np.ndarray | None = None, limit: int = 1000
 ) -> tuple[np.ndarray, int]:
-    """Return x and steps of the active-set method as one writes it in NumPy: solve on the free set until the set stays.
+    """Return x and steps of a plain active-set method in NumPy.
+
+    Solve on the free set until the set stays.
 
     Args:
-        problem: the problem; its matrix dense unless `bands` are given.
-        bands: of a tridiagonal A as `scipy.linalg.solve_banded` takes them.
-        limit: the most steps.
+        problem: the problem; its matrix is dense if `bands` is None.
+        bands: bands of a tridiagonal A in the form of `scipy.linalg.solve_banded`.
+        limit: largest number of steps.
     """
     A, b, lower, upper, x = problem.A, problem.b, problem.lower, problem.upper, problem.first
     d, y = A.diagonal(), A @ x + b

@@ -1,4 +1,4 @@
-"""Folders of runs written by hand, with surfaces and bodies, for tests of their images."""
+"""Hand-written run folders with surfaces and bodies, for tests of images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +33,10 @@ checkpoint_every = 4
 def run_into(
     scene: Scene, out: Path, *, observer: Observer | None = None, **options: Any
 ) -> RunRecord:
-    """Run a scene into a folder on the CPU; options are those of a RunRequest or of `run_scene`."""
+    """Run a scene into a folder on the CPU.
+
+    Options are those of a RunRequest or of `run_scene`.
+    """
     asked = {
         name: options.pop(name)
         for name in ("last_frame", "resume", "force", "force_memory", "record_problems")
@@ -49,7 +52,10 @@ def run_into(
 def write_run(
     folder: Path, frames: Sequence[list[Part]], text: str = "", size: Sequence[float] = (1.0, 1.0)
 ) -> Path:
-    """Write a run of the simulator `dots`: 10 cells along a side of 1 m, 20 frames a second."""
+    """Write a run of the simulator `dots`.
+
+    It has 10 cells along a side of 1 m, and 20 frames per second.
+    """
     folder.mkdir()
     source = folder / "source.toml"
     source.write_text(
@@ -67,7 +73,10 @@ def write_run(
 def ball(
     center: Sequence[float], radius: float, name: str = "surface", body: int | None = None
 ) -> Surface:
-    """Return a sphere of triangles, counterclockwise seen from outside; in 2-D (two coordinates) a circle, its inside on the left."""
+    """Return a sphere of triangles, in 2-D (two coordinates) a circle.
+
+    Triangles are counterclockwise seen from outside; a circle has its inside on the left.
+    """
     if len(center) == 2:
         angle = np.linspace(0.0, 2.0 * np.pi, 97)[:-1]
         points = np.stack(
@@ -85,7 +94,10 @@ def ball(
 
 
 def box(low: Sequence[float], high: Sequence[float], name: str = "surface") -> Surface:
-    """Return a box of twelve triangles whose corners belong to one side each, so that its normals are those of the sides."""
+    """Return a box of twelve triangles.
+
+    Its corners belong to one side each, so that its normals are those of the sides.
+    """
     points, corners = [], []
     for axis in range(3):
         for side in range(2):
@@ -103,7 +115,7 @@ def box(low: Sequence[float], high: Sequence[float], name: str = "surface") -> S
 
 
 def sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Return a unit sphere: an octahedron whose triangles were divided four times."""
+    """Return a unit sphere: an octahedron whose triangles are divided four times."""
     points = [tuple(row) for sign in (1.0, -1.0) for row in sign * np.eye(3)]
     corners = [
         (0, 1, 2),

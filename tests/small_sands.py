@@ -1,4 +1,4 @@
-"""Scenes of a little sand, and how to run them."""
+"""Scenes of a small amount of sand, and functions to run them."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,11 @@ def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
 def scene(
     *, size: list[float], resolution: int, sand: list[dict[str, Any]], **tables: Any
 ) -> SandScene:
-    """Return a scene; `friction` (not a table), `solids`, `open`, `periodic` are of the domain, `cfl` is time.cfl, the rest are tables."""
+    """Return a scene.
+
+    `friction` (not a table), `solids`, `open`, `periodic` are of the domain, `cfl` is time.cfl, the
+    rest are tables.
+    """
     of_domain = ("friction", "solids", "open", "periodic")
     domain = {
         key: tables.pop(key)

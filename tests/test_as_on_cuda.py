@@ -1,4 +1,7 @@
-"""Steps of every built-in scene in CUDA's form against the CPU's; only with the plugin `emulated_cuda`, see there."""
+"""Steps of every built-in scene in CUDA's form against the CPU's.
+
+Only with the plug-in `emulated_cuda`, see there.
+"""
 
 import json
 import os
@@ -35,13 +38,16 @@ for line in sys.stdin:
 
 
 def made(name: str, cells: int = 32, *changes: str) -> Any:
-    """Return the simulation of a built-in scene, small, with other keys changed."""
+    """Return the simulation of a small built-in scene with other keys changed."""
     scene = load_scene(name, [f"domain.resolution={CELLS.get(name, cells)}", *changes])
     return simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
 
 
 def stepped(name: str) -> dict[str, list[float]]:
-    """Return the number of particles or bodies after some steps, where they are and how fast, in the middle and around it."""
+    """Return number, positions and velocities after some steps.
+
+    They are the mean over particles or bodies, and the spread around it.
+    """
     simulation = made(name)
     for _ in range(STEPS):
         simulation.step(min(simulation.stable_dt(), DT))
@@ -59,7 +65,7 @@ def stepped(name: str) -> dict[str, list[float]]:
 
 @pytest.fixture(scope="module")
 def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
-    """Return a function that steps a scene in another process, which has no plugin."""
+    """Return a function that steps a scene in a process without the plug-in."""
     keep = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
     command = [sys.executable, "-c", PLAIN]
@@ -84,8 +90,8 @@ def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
         yield ask
 
 
-# of velocities [m/s] and their gradients [1/s], which stresses solved to 1e-3 leave uncertain in
-# sand that begins to move
+# Differences of velocities [m/s] and their gradients [1/s]: stresses solved to 1e-3 leave them
+# uncertain in sand that begins to move.
 SMALL = 1e-2
 LONG = ("balls-on-sand-2d", "pouring-pile")  # a minute each
 EMULATED = pytest.mark.skipif(
@@ -119,7 +125,10 @@ def test_a_scene_goes_as_on_the_cpu(
 
 @EMULATED
 def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
-    """The host waits for the device at each readback, and graphs hold no allocations."""
+    """Number of readbacks of a liquid's step.
+
+    The host waits for the device at each readback, and graphs hold no allocations.
+    """
     from benchmarks.emulated_cuda import meter
 
     simulation, counts = made("dam-break"), []
@@ -127,15 +136,15 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
         meter.clear()
         simulation.step(min(simulation.stable_dt(), DT))
         counts.append([meter["readbacks"], meter["launches"], meter["allocations"]])
-    # of steps after the kernels have been loaded
+    # Of steps after the kernels have been loaded.
     readbacks, launches, allocations = np.array(counts[2:]).max(axis=0)
     assert allocations == 0
-    assert readbacks <= 2  # what the solve has come to, and what the step has
-    # most of them in graphs: levels of 16^3 cells are quicker so than in one block
+    assert readbacks <= 2  # the result of the solve, and that of the step
+    # Most of them are in graphs: levels of 16^3 cells are faster so than in one block.
     assert launches <= 200
 
 
-# less than there is: the correction moves particles in each step
+# Less than the actual density: the correction moves particles in each step.
 CROWDED = "density_correction.max_density=0.9"
 
 
@@ -145,7 +154,7 @@ CROWDED = "density_correction.max_density=0.9"
     [
         ("dam-break", {"calls": 4, "readbacks": 2, "launches": 230}),
         ("dam-break-2d " + CROWDED, {"calls": 6, "readbacks": 3, "launches": 260}),
-        # of which a correction takes one
+        # One of these is by a correction.
         ("floating-bodies-2d", {"calls": 8, "readbacks": 4, "launches": 450}),
         pytest.param(
             "column-collapse", {"calls": 7, "readbacks": 3, "launches": 900}, marks=pytest.mark.slow
@@ -166,7 +175,10 @@ CROWDED = "density_correction.max_density=0.9"
 def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
     name: str, most: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The host waits for the device at each readback, and graphs hold no allocations."""
+    """Graphs of a step: equal bits with few calls.
+
+    The host waits for the device at each readback, and graphs hold no allocations.
+    """
     from benchmarks.emulated_cuda import meter
 
     states, counts = [], []
@@ -186,7 +198,7 @@ def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
             | {"row": repr(row)}
         )
     assert [key for key in states[0] if states[0][key] != states[1][key]] == []
-    # of the last step: the first ones load kernels and capture graphs
+    # Of the last step: the first ones load kernels and capture graphs.
     for what, number in most.items():
         assert counts[-1][what] <= number, what
         assert counts[-1][what] > number // 2, f"{what}: lower the bound"
@@ -198,7 +210,11 @@ def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
 def test_bodies_with_more_entries_than_there_is_room_for_are_solved_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A GPU learns how many cells touch bodies with the solve; one that left some out must not count."""
+    """Bodies with more entries than allocated: solved again.
+
+    A GPU learns the number of cells at bodies with the solve; a solve with missing entries must not
+    count.
+    """
     states = []
     for least in (coupling.LEAST, 2):
         monkeypatch.setattr(coupling, "LEAST", least)
@@ -208,7 +224,7 @@ def test_bodies_with_more_entries_than_there_is_room_for_are_solved_again(
         states.append(simulation.state())
         assert simulation.projection.coupling.columns.capacity > 2
     one, other = (state["bodies"] for state in states)
-    # sums over entries are rounded otherwise
+    # Sums over entries are rounded differently.
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
     assert np.abs(one[:, 3:]).max() > 0.01  # they move
 

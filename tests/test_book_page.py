@@ -1,4 +1,7 @@
-"""The table of docs/api/book.md leads from every algorithm and figure of the book to what exists; figures are those of the kept results."""
+"""Table of docs/api/book.md: from each algorithm and figure to the code.
+
+Figures are those of the stored results.
+"""
 
 import re
 from pathlib import Path

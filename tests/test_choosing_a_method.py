@@ -1,4 +1,7 @@
-"""The page on choosing a method says what the code does: its list is the rules, its claims about matrices are tried out."""
+"""Page on choosing a method against the code.
+
+Its list is the rules, and its claims about matrices are tested.
+"""
 
 import re
 from pathlib import Path
@@ -21,7 +24,10 @@ LIMITS = {"max_iterations": 400, "patience": 100}
 
 
 def indefinite(n=60, seed=71):
-    """Return a planted problem with a symmetric matrix of which a tenth of the eigenvalues is negative."""
+    """Return a planted problem with a symmetric matrix.
+
+    A tenth of its eigenvalues is negative.
+    """
     rng = np.random.default_rng(seed)
     values = np.where(np.arange(n) < n // 10, -0.3, np.geomspace(0.1, 1, n))
     return planted(
@@ -43,7 +49,7 @@ MATRICES = {
 
 
 def outcome(name, problem):
-    """Return how a method ends on a problem: "solved", "refuses" or a status."""
+    """Return the end of a method on a problem: "solved", "refuses" or a status."""
     method = wl.METHODS[name]
     try:
         result = wl.solve(
@@ -55,14 +61,14 @@ def outcome(name, problem):
 
 
 def section(title, text=TEXT):
-    """The text under a heading."""
+    """Return the text under a heading."""
     return re.search(
         rf"^## {re.escape(title)}.*?\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S
     ).group(1)
 
 
 def table(title, text=TEXT):
-    """First cells, without quotes, and the other cells of a section's table."""
+    """Return the first cells, without quotes, and the other cells of a table."""
     rows = [
         [cell.strip() for cell in line.strip("| ").split("|")]
         for line in section(title, text).splitlines()

@@ -1,4 +1,4 @@
-"""Registers, stacks and spills of all kernels, as ptxas assembles them, which is in the extra `ptxas`.
+"""Registers, stacks and spills of all kernels, by ptxas (extra `ptxas`).
 
 TABLE=path keeps the table, PTX=folder what was compiled.
 """
@@ -21,8 +21,8 @@ from benchmarks.sass import tool, tools_missing
 from test_cuda_compiles import compile_for_cuda, modules_of_every_kernel
 
 ARCHS = ("sm_80", "sm_90", "sm_100")
-REGISTERS = 65536  # of a multiprocessor, on all of them
-# Kernels that may spill, and why.
+REGISTERS = 65536  # registers of all threads of a multiprocessor
+# Kernels that may spill, and the reason.
 SPILLS = {
     "warp_lcp.blocked_gauss_seidel.*_[56]:*": "a thread enumerates the sets of a block of 5 or 6 "
     "unknowns with its matrix at hand",
@@ -31,8 +31,8 @@ SPILLS = {
     "is of it",
     "warp_lcp.coarsest.invert_*": "20 bytes once a solve, in one block",
 }
-# Kernels that take more than 128 registers, so that fewer than 512 threads fit on a multiprocessor,
-# and why that is how it is.
+# Kernels with more than 128 registers, so that fewer than 512 threads fit on a multiprocessor, and
+# the reason.
 LARGE = {
     "warp_lcp.blocked_gauss_seidel.*_[23456]:*": "as above",
     "granular.stress_3d_float64_residual_rate*": "the residual's step with friction that grows "
@@ -46,7 +46,7 @@ LARGE = {
     "fluids.coupling:*": "bodies' cells only",
 }
 
-# Instructions that passes may issue a cell, of the finer grid of a transfer, on sm_90.
+# Instructions that passes may issue per cell, of the finer grid of a transfer, on sm_90.
 ISSUED = {
     "stencil.product": 45,
     "cycle.sweep": 55,
@@ -59,12 +59,15 @@ ISSUED = {
 
 
 def known(kernel: str, among: dict[str, str]) -> bool:
-    """Return whether a kernel is one of those."""
+    """Return whether a kernel is in a list of patterns."""
     return any(fnmatch.fnmatchcase(kernel, pattern) for pattern in among)
 
 
 class Cost(NamedTuple):
-    """What a kernel takes on an architecture [a thread: registers, bytes; shared: bytes a block]."""
+    """Resources of a kernel on an architecture.
+
+    Registers and bytes are per thread, shared bytes per block.
+    """
 
     kernel: str
     arch: str
@@ -77,7 +80,7 @@ class Cost(NamedTuple):
 
 
 def costs(ptx: Path, arch: str) -> list[Cost]:
-    """Assemble a module; return what its kernels take."""
+    """Assemble a module; return the resources of its kernels."""
     ptxas = tool("ptxas")
     assert ptxas
     text = ptx.read_text().rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
@@ -112,7 +115,10 @@ def costs(ptx: Path, arch: str) -> list[Cost]:
 
 
 def table(rows: list[Cost]) -> str:
-    """Return a line a kernel: registers on each architecture, else what it takes on the one where that is most."""
+    """Return a line per kernel.
+
+    Registers on each architecture, other resources on the one where they are largest.
+    """
     lines = ["\t".join(["kernel", *ARCHS, *Cost._fields[3:]])]
     for kernel, group in itertools.groupby(sorted(rows), key=lambda row: row.kernel):
         by_arch = {row.arch: row for row in group}
@@ -152,7 +158,7 @@ def test_kernels_stay_within_their_budgets(tmp_path: Path) -> None:
     assert {kernel for kernel in spilling if not known(kernel, SPILLS)} == set()
     assert {kernel for kernel in large if not known(kernel, LARGE)} == set()
     for among, found in ((SPILLS, spilling), (LARGE, large)):
-        # nobody is excused for nothing
+        # Each exception must be needed.
         assert [pattern for pattern in among if not fnmatch.filter(found, pattern)] == []
 
 

@@ -1,4 +1,4 @@
-"""Every kernel compiles for CUDA without a GPU: a machine with one must meet no surprise."""
+"""Compilation of every kernel for CUDA, without a GPU."""
 
 import gc
 import importlib
@@ -40,7 +40,7 @@ from warp_lcp.solvers.mprgp import MPRGP
 # Modules that have compiled for CUDA, with the hash of their sources.
 # `python tests/test_cuda_compiles.py` compiles the others and writes it.
 COMPILED = Path(__file__).with_name("compiled_for_cuda.txt")
-# as GPUs cycle
+# As GPUs cycle.
 ONE_LAUNCH = [
     CycleSettings(one_launch_cpu=4096),
     CycleSettings(one_launch_cpu=4096, coarsest_cpu=8),
@@ -56,7 +56,7 @@ METHODS = [
 
 
 def use_every_kernel(reals):
-    """Instantiate the kernels that are made on demand by solving small problems in every precision."""
+    """Instantiate on-demand kernels by solving small problems in every precision."""
     cells = np.ones((4, 4, 4), dtype=int)
     cells[-1] = wl.AIR
     face = np.full((4, 4, 5), 0.5)
@@ -169,7 +169,7 @@ def use_gradient_projection_kernels(reals):
         for A in operators:
             for precision in ("mixed", "double"):
                 assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
-                # releases all
+                # Releases all unknowns.
                 assert wl.solve(
                     wl.LCP(A, -np.ones(A.shape), 0.0),
                     MPRGP(precision=precision),
@@ -178,7 +178,10 @@ def use_gradient_projection_kernels(reals):
 
 
 def use_newton_kernels(reals):
-    """Instantiate the kernels of Newton-type methods on grids, and of cold starts and scalings of sparse matrices."""
+    """Instantiate the kernels of Newton-type methods on grids.
+
+    And those of cold starts and scalings of sparse matrices.
+    """
     T = scipy.sparse.diags_array([-1.0, 2.01, -1.0], offsets=[-1, 0, 1], shape=(1200, 1200)).tocsr()
     cells = np.ones((4, 4, 4), dtype=int)
     cells[-1] = wl.AIR
@@ -205,7 +208,10 @@ def drift(j: int, i: int):
 
 
 def use_stencil_kernels(reals):
-    """Instantiate the kernels of compact stencils: of numbers, arrays and functions, of lines and aggregates, and of matrices."""
+    """Instantiate the kernels of compact stencils.
+
+    They are those of numbers, arrays and functions, of lines and aggregates, and of matrices.
+    """
     nine = np.array([[-1.0, -1.0, -1.0], [-1.0, 9.0, -1.0], [-1.0, -1.0, -1.0]])
     cells, wind = (
         np.ones((12, 12), dtype=int),
@@ -240,7 +246,10 @@ def use_stencil_kernels(reals):
 
 
 def use_kernels_of_gradients(reals):
-    """Instantiate those of vector-Jacobian products on every kind of bounds and diagonal."""
+    """Instantiate the kernels of vector-Jacobian products.
+
+    They are instantiated for every kind of bounds and diagonal.
+    """
     cells, T = (
         np.array([[0, 1, 1, 1]]),
         scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr(),
@@ -267,7 +276,10 @@ def use_kernels_of_gradients(reals):
 
 
 def use_coupled_kernels(reals):
-    """Instantiate the kernels of grids with a term of low rank, heavy enough that the preconditioner is corrected for it."""
+    """Instantiate the kernels of grids with a low-rank term.
+
+    It is heavy enough that the preconditioner is corrected for it.
+    """
     cells = np.ones((4, 4, 4), dtype=int)
     cells[-1] = wl.AIR
     columns = np.zeros((4, 4, 4, 2))
@@ -308,15 +320,18 @@ def use_contact_kernels():
 
 
 def family(name):
-    """Return what the variants of a module share: its name without types and switches, and how many kernels it has."""
+    """Return the common name of a module's variants, and its number of kernels.
+
+    The name is without types and switches.
+    """
     from warp._src.context import user_modules
 
     package, module, *variant = name.split(".")
-    # its switches are in the module's name; the longest variant has walls that cut and a rate, or a
-    # box
+    # Its switches are in the module's name; the longest variant has walls that cut and a rate, or a
+    # box.
     if package == "granular":
         module = re.sub("_(2d|3d|float32|float64|rate|cut)(?=_|$)", "", module)
-    # the longest variant has all switches
+    # The longest variant has all switches.
     if package == "fluids" and module.startswith(("pressure", "viscosity")):
         module = re.sub("_(2d|cut|ghost|moving)(?=_|$)", "", module)
     return (
@@ -373,9 +388,9 @@ def modules_of_every_kernel(reals):
     use_sand_kernels()
     use_contact_kernels()
     for form in [made for made in gc.get_objects() if isinstance(made, Form)]:
-        assert form.kernel  # of the pass alone, which the CPU launches in waves
+        assert form.kernel  # kernel of the pass alone, which the CPU launches in waves
         if form.by_quads:
-            assert form.by_quads.kernel  # in place of it on CUDA
+            assert form.by_quads.kernel  # its replacement on CUDA
     from warp._src.context import user_modules
 
     return sorted(
@@ -386,8 +401,8 @@ def modules_of_every_kernel(reals):
 
 
 def kernels_not_taken():
-    """Return the kernels of headers that nothing of the above has made a pass of."""
-    interleaved_passes(2)  # which a CPU alone runs
+    """Return the kernels of headers that no pass above has used."""
+    interleaved_passes(2)  # for a CPU alone
     taken = {
         (made.header.resolve(), made.declared)
         for made in gc.get_objects()
@@ -407,7 +422,7 @@ def one_a_family(names):
 
 
 def source_hash(name):
-    """Return the hash of a module, less what only its compilation for CPUs depends on."""
+    """Return the hash of a module, without parts for the CPU's compilation alone."""
     from warp._src.context import user_modules
 
     module = user_modules[name]
@@ -422,12 +437,12 @@ def source_hash(name):
 
 
 def lines_of(names):
-    """Return a line for each module: its name, the hash of its source and Warp's version."""
+    """Return a line for each module: name, hash of its source, Warp's version."""
     return sorted(f"{name} {source_hash(name)[:20]} {wp.__version__}" for name in names)
 
 
 def compile_for_cuda(name, archs, folder):
-    """Compile a module for CUDA, its blocks as large as they are launched."""
+    """Compile a module for CUDA, with blocks as large as they are launched."""
     from warp._src.context import user_modules
 
     module = user_modules[name]
@@ -446,14 +461,17 @@ def compile_for_cuda(name, archs, folder):
     ids=["one", "all"],
 )
 def test_kernels_compile_for_cuda(reals, archs, tmp_path):
-    """One variant of each family of modules but for those that have compiled as they are, or all of them."""
+    """Compilation for CUDA of one variant of each family, or all.
+
+    Modules that have compiled unchanged are left out.
+    """
     names = modules_of_every_kernel(reals)
     assert len(names) > 15
     assert not kernels_not_taken()
     if len(archs) == 1:
         compiled = set(COMPILED.read_text().splitlines())
         names = [line.split()[0] for line in lines_of(one_a_family(names)) if line not in compiled]
-    # minutes for all modules, so each once while it stays as it is
+    # All modules take minutes, so each is compiled once while it is unchanged.
     known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"
     known.mkdir(exist_ok=True)
     for name in names:

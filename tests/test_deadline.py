@@ -1,4 +1,7 @@
-"""Solves that end by time: each method, wherever the clock runs out. The clock is a counter: each look at it is a second."""
+"""Time limits of solves: each method, wherever the clock runs out.
+
+The clock is a counter: each reading of it is a second.
+"""
 
 import itertools
 import math
@@ -17,7 +20,7 @@ from warp_lcp.problem.protocol import families
 S = wl.SolveStatus
 CRITERIA = wl.StoppingCriteria(rtol=1e-8, max_iterations=25, patience=25)
 LIMITS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144)
-MORE = 2  # looks at a clock that has run out before: of the solve of a block, and of the outer loop
+MORE = 2  # readings after the time limit: by the solve of a block, and by the outer loop
 LONG = (
     "fischer-newton",
     "gradient-descent",
@@ -30,12 +33,15 @@ LONG = (
 
 
 def chain(n):
-    """Second differences on n points, symmetric positive definite."""
+    """Return second differences on n points, symmetric positive definite."""
     return scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
 
 
 def case(family, name):
-    """Return a problem, its matrix and its b: 60 points of a membrane, a pool of 7 x 12 cells, 3 points for enumeration."""
+    """Return a problem, its matrix and its b.
+
+    It has 60 points of a membrane, a pool of 7 x 12 cells, or 3 points for enumeration.
+    """
     few, rng = name == "direct-enumeration", np.random.default_rng(7)
     if family == "grid":
         cells = np.full((2, 3) if few else (8, 12), wl.FLUID)
@@ -62,7 +68,7 @@ def case(family, name):
 
 @pytest.fixture
 def solve(monkeypatch):
-    """Solve with a clock that counts; return the result and how often it was looked at."""
+    """Solve with a counting clock; return the result and the number of readings."""
 
     def by_counting(problem, method, seconds, **options):
         ticks = itertools.count()
@@ -71,7 +77,7 @@ def solve(monkeypatch):
             result = wl.solve(
                 problem, method, stopping=replace(CRITERIA, max_seconds=seconds), **options
             )
-        return result, next(ticks) - 1  # the first look is when the time begins to run
+        return result, next(ticks) - 1  # the first reading is the begin of the time limit
 
     return by_counting
 
@@ -88,7 +94,7 @@ def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
     for seconds in LIMITS:
         result, looks = solve(problem, method, seconds, workspace=work)
         again = wl.solve(problem, method, workspace=work, stopping=CRITERIA)
-        # what was cut short leaves nothing behind
+        # An interrupted solve leaves no trace.
         np.testing.assert_array_equal(again.x.numpy(), whole.x.numpy())
         if result.status is not S.TIME_LIMIT:
             assert (result.status, result.iterations) == (whole.status, whole.iterations)
@@ -117,7 +123,11 @@ def test_long_steps_look_at_the_clock_inside(name, solve):
 
 
 def test_inner_iterations_look_at_the_clock(solve):
-    """Those of conjugate gradients and GMRES, on grids and on matrices that are not narrow, whose systems would be factored."""
+    """Inner iterations within the time limit.
+
+    Those of conjugate gradients and GMRES, on grids and on matrices that are not narrow, whose
+    systems would be factored.
+    """
     skew, b = (
         scipy.sparse.diags_array([-1.2, 2.5, -0.8], offsets=[-1, 0, 1], shape=(60, 60)).tocsr(),
         case("dense", "")[2],
@@ -129,7 +139,7 @@ def test_inner_iterations_look_at_the_clock(solve):
     for problem in (case("grid", "")[0], *(wl.LCP(A, b) for A in numbered)):
         result, looks = solve(problem, wl.InteriorPoint(), 1e6)
         assert result.linear_iterations > result.iterations
-        # whose inner loop ends by itself when its time is over
+        # Its inner loop ends by itself when its time is over.
         native = isinstance(problem.A, wl.GridPoisson)
         assert looks > (result.iterations if native else result.linear_iterations - 1)
         assert solve(problem, wl.InteriorPoint(), looks - 2)[0].status is S.TIME_LIMIT
@@ -142,11 +152,14 @@ def test_pivots_before_the_end_are_counted(solve):
         pivots = [result.linear_iterations for result in results if result.iterations == 1]
         assert {result.status for result in results} == {S.TIME_LIMIT}
         assert pivots == list(range(len(pivots)))
-        assert len(pivots) >= 15  # the rest of the time goes into what comes before
+        assert len(pivots) >= 15  # the rest of the time is used before the pivots
 
 
 def test_set_up_counts(monkeypatch):
-    """A method whose `init` takes all the time there is makes no step, and x is clip(0, l, u)."""
+    """Set-up within the time limit.
+
+    A method whose `init` uses all the time makes no step, and x is clip(0, l, u).
+    """
     problem, _, _ = case("dense", "psor")
     seconds = [0.0]
 
@@ -208,7 +221,11 @@ def test_time_is_up_for_all_ranks_as_soon_as_it_is_for_one(monkeypatch):
 
 
 def test_lemke_on_an_american_put_ends_in_time():
-    """In real time: 1,500 prices of the stock, the first step of a Crank-Nicolson scheme from the payoff."""
+    """Lemke on an American put: time limit in real time.
+
+    It has 1,500 prices of the stock and is the first step of a Crank-Nicolson scheme from the
+    payoff.
+    """
     n, rate, volatility, dt = 1500, 0.05, 0.3, 0.02
     price = np.linspace(0.0, 4.0, n + 2)[1:-1]
     payoff, k = np.maximum(1 - price, 0.0), np.arange(1, n + 1)
@@ -216,10 +233,10 @@ def test_lemke_on_an_american_put_ends_in_time():
     L = scipy.sparse.diags_array([down[1:], -(up + down + rate), up[:-1]], offsets=[-1, 0, 1])
     A = scipy.sparse.csr_array(scipy.sparse.eye_array(n) - 0.5 * dt * L)
     b = -(payoff + 0.5 * dt * (L @ payoff))
-    b[0] -= dt * down[0]  # the option is worth 1 where the stock is worth nothing
+    b[0] -= dt * down[0]  # the option is worth 1 where the stock is worthless
     problem, method = wl.LCP(A.toarray(), b, lower=payoff), wl.Lemke()
     work = method.init(problem)
-    assert wl.solve(problem, method, workspace=work)  # loads what it needs
+    assert wl.solve(problem, method, workspace=work)  # loads the kernels
     begun = time.perf_counter()
     wl.solve(problem, method, workspace=work)
     whole = time.perf_counter() - begun

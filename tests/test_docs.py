@@ -1,4 +1,4 @@
-"""The documentation's table of methods is what the registry says, and its examples and tables of scenes work as they stand."""
+"""Documentation against the code: table of methods, examples, tables of scenes."""
 
 import re
 from pathlib import Path
@@ -46,7 +46,11 @@ def test_rows_say_what_the_classes_say(row):
 
 
 def test_what_the_text_says_of_all_methods_holds():
-    """Boxed bounds by all, affine ones by those of one table, every kind of A by all but three."""
+    """Statements about all methods.
+
+    All take boxed bounds, those of one table take affine ones, and all except three take every kind
+    of A.
+    """
     assert all(getattr(method, "boxed", True) for method in wl.METHODS.values())
     assert {
         name
@@ -62,7 +66,10 @@ def test_what_the_text_says_of_all_methods_holds():
 
 
 def test_capabilities_have_their_rows():
-    """The table of operators is what protocols and methods say, in their order."""
+    """Rows of the capabilities.
+
+    The table of operators follows protocols and methods, in their order.
+    """
     rows = re.findall(
         r"^\| `(\w+)` \| (.*) \| (.*) \| (.*) \|$", (DOCS / "operators.md").read_text(), flags=re.M
     )
@@ -88,7 +95,7 @@ def test_prices_name_methods():
     assert set(named) <= set(wl.METHODS)
 
 
-# The tutorial has a test of its own.
+# The tutorial has a separate test.
 EXAMPLES = [
     (page, code)
     for page in sorted(DOCS.rglob("*.md"))
@@ -136,7 +143,7 @@ max = [1.0, 0.5, 1.0]
     ("page", "text"), TABLES, ids=lambda value: value.stem if isinstance(value, Path) else ""
 )
 def test_tables_of_scenes_are_valid(page, text, tmp_path):
-    """What pages show is a table of a scene, or a scene."""
+    """Tables of scenes on pages: valid, alone or as a scene."""
     file = tmp_path / "scene.toml"
     file.write_text(text if "[scene]" in text else SCENE + text)
     assert load_scene(str(file), []).time.duration > 0.0

@@ -1,4 +1,7 @@
-"""The documentation as a whole, without a network and without MkDocs: links, anchors, names, citations, what is generated."""
+"""Documentation as a whole, without a network and without MkDocs.
+
+Links, anchors, names, citations, generated pages.
+"""
 
 import importlib
 import importlib.util
@@ -50,7 +53,10 @@ def test_links_and_anchors_lead_somewhere(page):
 
 
 def test_the_link_test_sees_what_is_wrong(tmp_path):
-    """Headings in code are none, links in code are none, and repeated headings are counted."""
+    """Link test on wrong links.
+
+    Headings and links in code are ignored, and repeated headings are counted.
+    """
     page = tmp_path / "page.md"
     page.write_text(
         "# A `b` c: d\n\n```sh\n# no heading\n[x](y)\n```\n\n## Same\n\n## "
@@ -77,7 +83,10 @@ def test_the_page_of_the_command_line_has_every_command():
 
 
 def test_a_value_passes_through_five_files_at_most_from_its_key_to_its_kernel():
-    """Each file of a walk is there, and has the names that the page says."""
+    """Path of a value from its key to its kernel: at most five files.
+
+    Each file of the path exists and has the names on the page.
+    """
     page = (
         (DOCS / "architecture.md").read_text().partition("## Four walks\n")[2].partition("\n## ")[0]
     )
@@ -117,7 +126,11 @@ def test_the_page_of_the_architecture_has_every_room_in_the_contract_s_order():
 
 
 def test_the_search_works_from_the_disk():
-    """The plug-in `offline` puts the index into a script, but loads another, for browsers that allow no workers there, from the network."""
+    """Search from the disk.
+
+    The plug-in `offline` puts the index into a script, but loads another from the network, for
+    browsers that allow no workers there.
+    """
     assert re.search(r"^  - search\n  - offline\b", SITE, flags=re.M)
     spec = importlib.util.spec_from_file_location("site_pages", DOCS / "generate" / "site_pages.py")
     pages = importlib.util.module_from_spec(spec)
@@ -134,7 +147,10 @@ def test_the_search_works_from_the_disk():
 
 
 def test_commands_of_pages_take_their_scenes_with_what_they_set():
-    """A resolution that does not divide a domain's sides was refused."""
+    """Commands of pages with their scenes and settings.
+
+    A resolution that does not divide a domain's sides was refused.
+    """
     tried = 0
     for page in PAGES:
         for line in re.findall(
@@ -199,7 +215,10 @@ def test_generated_pages_are_up_to_date(name):
 
 
 def test_the_page_of_scene_files_has_every_key():
-    """From the schemas themselves, not by way of the generator."""
+    """Every key on the page of scene files, from the schemas themselves.
+
+    The generator is not used.
+    """
     from warp_lcp.scene.scene_file import installed_simulators
 
     text = (DOCS / "scenes.md").read_text()

@@ -1,4 +1,4 @@
-"""Every command line that the documentation shows names a module, a command, options, suites and built-in scenes that are there."""
+"""Commands in the documentation: modules, options, suites, scenes exist."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,10 @@ FILE = re.compile(r"[./\\]|^[<$\"'*]")
 
 
 def shown(page):
-    """Return what a page shows as typed: lines of blocks, continued ones as one, and what stands between backticks."""
+    """Return the typed text of a page.
+
+    It is the lines of blocks, continued ones as one, and the text between backticks.
+    """
     lines = [
         line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines()
     ]

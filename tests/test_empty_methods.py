@@ -1,4 +1,7 @@
-"""Methods of serial classes that do nothing, or return an argument or a constant, for a subclass to override: each has a reason."""
+"""Empty methods of serial classes that a subclass overrides: each has a reason.
+
+They do nothing, or return an argument or a constant.
+"""
 
 import ast
 from collections import defaultdict
@@ -6,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-# class, or class and method: why a subclass may replace what does nothing here
+# Class, or class and method: why a subclass may replace an empty method.
 ALLOWED = {
     "GridPart": "the one place where one process and a rank differ; here nothing is exchanged",
     "ParticleExchange": "likewise for particles",
@@ -21,7 +24,10 @@ ALLOWED = {
 
 
 def is_empty(method: ast.FunctionDef) -> bool:
-    """Return whether the body is a docstring, `pass` or the return of arguments or constants."""
+    """Return whether the body is a docstring, `pass` or a trivial return.
+
+    Trivial: the return of arguments or constants.
+    """
     arguments = {argument.arg for argument in (*method.args.args, *method.args.kwonlyargs)}
 
     def plain(value: ast.expr | None) -> bool:
@@ -47,7 +53,10 @@ def is_empty(method: ast.FunctionDef) -> bool:
 
 
 def overridden(sources: list[str]) -> Iterator[str]:
-    """Yield Class.method of what is empty, is not abstract, is of no protocol, and is overridden by a class below."""
+    """Yield Class.method of overridden empty methods.
+
+    They are not abstract, of no protocol, and overridden by a class below.
+    """
     methods: dict[str, dict[str, ast.FunctionDef]] = defaultdict(dict)
     below: dict[str, set[str]] = defaultdict(set)
     protocols = set()

@@ -1,4 +1,7 @@
-"""What `.numpy()` returns is the array's memory on the CPU and a copy on CUDA: whoever writes to it must say how it gets to the device."""
+"""Writes to the result of `.numpy()`: each has a reason.
+
+It is the array's memory on the CPU and a copy on CUDA.
+"""
 
 import ast
 from pathlib import Path
@@ -18,7 +21,10 @@ WRITES = {  # function: why it may
 
 
 def is_view(node: ast.expr) -> bool:
-    """Return whether an expression may be memory of a Warp array: `.numpy()`, below subscripts and what makes views."""
+    """Return whether an expression may be memory of a Warp array.
+
+    `.numpy()`, below subscripts and calls that make views.
+    """
     while True:
         call = isinstance(node, ast.Call)
         inner = node.func if isinstance(node, ast.Call) else node
@@ -32,7 +38,7 @@ def is_view(node: ast.expr) -> bool:
 
 
 def pairs(node: ast.AST) -> list[tuple[ast.expr, ast.expr]]:
-    """Return the targets of an assignment with their values, those of tuples one by one."""
+    """Return the targets of an assignment with their values, tuples item by item."""
     if isinstance(node, ast.AugAssign):
         return [(node.target, node.value)]
     if not isinstance(node, ast.Assign):
@@ -47,7 +53,7 @@ def pairs(node: ast.AST) -> list[tuple[ast.expr, ast.expr]]:
 
 
 def writes(function: ast.FunctionDef) -> bool:
-    """Return whether a function writes to what `.numpy()` gave it."""
+    """Return whether a function writes to a result of `.numpy()`."""
     assigned = [
         (node, target, value) for node in ast.walk(function) for target, value in pairs(node)
     ]

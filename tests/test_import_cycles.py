@@ -1,4 +1,4 @@
-"""Modules import each other in one direction, at run time: no circles, not even by imports within functions."""
+"""Imports at run time: no cycles, not even by imports within functions."""
 
 import ast
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ def modules() -> dict[str, Path]:
 
 
 def imported(node: ast.AST, names: dict[str, Path]) -> Iterator[str]:
-    """Yield the modules that a module imports at run time, with the packages that they lie in."""
+    """Yield the modules that a module imports at run time, with their packages."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             continue
@@ -70,7 +70,7 @@ def circles(edges: dict[str, set[str]]) -> list[list[str]]:
 
 
 def edges_of_all() -> dict[str, set[str]]:
-    """Return which modules of the project each one imports, packages that those lie in included."""
+    """Return the imports of each module of the project, packages included."""
     names, found = modules(), {}
     for name, path in names.items():
         direct = {

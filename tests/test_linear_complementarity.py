@@ -1,4 +1,7 @@
-"""wl.linear_complementarity: what SciPy's users pass and expect, checked by SciPy's own solvers and by enumeration."""
+"""`wl.linear_complementarity` with the conventions of SciPy.
+
+The results are checked by SciPy's own solvers and by enumeration.
+"""
 
 import numpy as np
 import pyamg
@@ -27,13 +30,16 @@ KINDS = {
 
 
 def least_squares(seed):
-    """C and d of min ||C x - d||, with C'C positive definite, representable in float32."""
+    """Return C and d of min ||C x - d||.
+
+    C'C is positive definite, and all entries are float32 numbers.
+    """
     rng = np.random.default_rng(seed)
     return rng.integers(-8, 9, (N + 5, N)) / 4.0, rng.integers(-8, 9, N + 5) / 4.0
 
 
 def check(found, A, b, lower, upper, x):
-    """The result says the same thing in each of its fields."""
+    """Check that all fields of the result agree."""
     assert found.success, found.message
     assert found.status == 0
     assert found.message.startswith("CONVERGED: ")
@@ -122,7 +128,7 @@ def test_grids():
 
 
 def sweeps(**options):
-    """A problem that takes many steps."""
+    """Return a problem that takes many steps."""
     n = 40
     A = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
     return wl.linear_complementarity(A, np.sin(np.linspace(0, 20, n)), method="psor", **options)
@@ -181,7 +187,7 @@ ARRAYS = (np.zeros(2), np.array([0.4, 3.0]))
         ([0, 1], ([0, 0], [1, 1])),
         ((None, [0.4, 3]), ([-np.inf, -np.inf], [0.4, 3])),
         ([None, None], ([-np.inf, -np.inf], [np.inf, np.inf])),
-        ([[0, 1], [1, 3]], ([0, 1], [1, 3])),  # both readings are one
+        ([[0, 1], [1, 3]], ([0, 1], [1, 3])),  # both readings are equal
     ],
 )
 def test_pairs_of_two_unknowns(bounds, expected):
@@ -363,7 +369,10 @@ def test_what_is_refused(arguments, options, message):
 
 
 def test_callbacks_see_the_iterates_of_alternatives_and_stop_them():
-    """Lemke's method follows sweeps, which go round in a circle here: each step's x has the residual that is told with it."""
+    """Callbacks during alternatives: iterates, and stopping.
+
+    Lemke's method follows sweeps, which cycle here: each step's x has the reported residual.
+    """
     A, b, lower, upper = next(drawn for drawn in map(circling, range(100)) if drawn is not None)
     seen = []
 
@@ -392,7 +401,10 @@ def test_callbacks_see_the_iterates_of_alternatives_and_stop_them():
 
 
 def circling(seed):
-    """A matrix with a negative diagonal in a box on which sweeps do not converge, None if they do."""
+    """Return a boxed matrix with a negative diagonal on which sweeps diverge.
+
+    None if they converge.
+    """
     rng = np.random.default_rng([seed, 223])
     S = rng.standard_normal((12, 12))
     A, b, lower = -np.eye(12) - 3 * (S - S.T), rng.standard_normal(12), -rng.random(12)

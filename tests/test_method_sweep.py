@@ -1,4 +1,6 @@
-"""Random problems: families x methods x precisions x seeds. Nothing that is no solution is called one; failures say the right thing.
+"""Random problems: families x methods x precisions x seeds.
+
+No false success; failures have the right status.
 
 `test_sweep` runs two seeds of each combination with the other tests, about 800 problems;
 `test_full_sweep` (slow) ten, over 4,000. What a result says is checked against NumPy: the natural
@@ -25,7 +27,7 @@ LIMITS = {"max_iterations": 400, "patience": 100}
 S = wl.SolveStatus
 NEVER = {S.INFEASIBLE, S.NON_FINITE}
 GAVE_UP = {S.MAX_ITERATIONS, S.STAGNATED, S.FLOOR}
-# sure of a solution wherever the matrix is a symmetric positive definite M-matrix
+# These always solve symmetric positive definite M-matrices.
 SURE = {
     "incremental-pivoting",
     "lemke",
@@ -62,7 +64,7 @@ def solver(cls, precision):
 
 
 def as_kind(problem, seed):
-    """The problem with another kind of operator for every seed."""
+    """Return the problem with another kind of operator for every seed."""
     return (problem, problem.sparse(), problem.dense())[seed % 3]
 
 
@@ -76,7 +78,7 @@ def takes(cls, problem, n):
 
 
 def allowed(name, facts):
-    """Statuses that a problem with these facts may end with."""
+    """Return the statuses with which a problem with these facts may end."""
     ends = {S.CONVERGED} | GAVE_UP
     strongly_monotone = {"symmetric", "positive-definite"} <= facts
     if not strongly_monotone or name in MAY_DIVERGE:
@@ -87,7 +89,10 @@ def allowed(name, facts):
 
 
 def error_bound(p, r):
-    """Largest ||D^1/2 (x - x*)|| that a natural residual r leaves where A is symmetric positive definite (Pang 1987)."""
+    """Return the largest ||D^1/2 (x - x*)|| for a natural residual r.
+
+    Where A is symmetric positive definite (Pang 1987).
+    """
     d = np.diag(p.A)
     scaled = p.A / np.sqrt(np.outer(d, d))
     low, high = np.linalg.eigvalsh(scaled)[[0, -1]]
@@ -100,7 +105,7 @@ def residual_vector(p, x):
 
 
 def faults(name, method, problem, precision):
-    """Solve; return how it ended and what is wrong with that."""
+    """Solve; return the status and the faults of the result."""
     p = problem.dense()
     fluid = (
         problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(problem.b.shape) == wl.FLUID
@@ -133,7 +138,7 @@ def faults(name, method, problem, precision):
         wrong.append(
             f"false CONVERGED: residual {own:.1e}, asked for {RTOL[precision] * reference:.1e}"
         )
-    # bounds are rounded as x is
+    # Bounds are rounded as x is.
     low, high = (v.astype(np.float32) if precision == "single" else v for v in (p.lower, p.upper))
     if result and not ((x >= low) & (x <= high)).all():
         wrong.append(f"CONVERGED {max((low - x).max(), (x - high).max()):.1e} outside the bounds")
@@ -181,7 +186,7 @@ def some(name):
 
 @pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if families(cls)])
 def test_sweep(name, monkeypatch):
-    # many that end there would go on to the full sweep's limit
+    # Many of these would otherwise run to the full sweep's limit.
     monkeypatch.setitem(LIMITS, "max_iterations", 150)
     cls = some(name)
     outcomes, found = sweep(name, cls, [1000 + sum(map(ord, name)), 2000 + sum(map(ord, name))])
@@ -204,7 +209,10 @@ def test_full_sweep():
 
 
 class FlippedRightSide(wl.MinimumMapNewton):
-    """Broken on purpose: solves y = A x - b, residual included, and says CONVERGED."""
+    """Wrong on purpose: solves y = A x - b and reports CONVERGED.
+
+    The residual is that of the other problem.
+    """
 
     def init(self, problem):
         work = super().init(wl.LCP(problem.A, -problem.b.numpy(), problem.lower, problem.upper))
@@ -213,7 +221,7 @@ class FlippedRightSide(wl.MinimumMapNewton):
 
 
 class FlippedStep(wl.ProjectedSOR):
-    """Broken on purpose: sweeps uphill."""
+    """Wrong on purpose: steps uphill."""
 
     def step(self, problem, work, x):
         wp.copy(before := wp.clone(x), x)

@@ -34,7 +34,7 @@ def test_plots_have_the_relative_residuals_of_each_solve():
     axes = wl.plot_convergence(results)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == list(results)
     for line, result in zip(axes.get_lines(), results.values(), strict=True):
-        first = np.linalg.norm(np.minimum(0.0, PROBLEM.b.numpy()))  # the natural residual at x = 0
+        first = np.linalg.norm(np.minimum(0.0, PROBLEM.b.numpy()))  # natural residual at x = 0
         expected = np.array([record.residual for record in result.history]) / first
         drawn = np.asarray(line.get_ydata(), dtype=float)
         np.testing.assert_allclose(drawn[expected > 0.0], expected[expected > 0.0], rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Liquid in the worlds of newton: bodies float, sink and set off as they must, and momentum is handed over."""
+"""Liquid in worlds of newton: bodies float, sink, and exchange momentum."""
 
 from types import SimpleNamespace
 
@@ -13,11 +13,15 @@ from newton.solvers import SolverXPBD  # noqa: E402
 from warp_lcp.newton.solver import SolverLiquid  # noqa: E402
 
 GRAVITY, WATER = 9.81, 1000.0
-pytestmark = pytest.mark.filterwarnings("default")  # newton's own
+pytestmark = pytest.mark.filterwarnings("default")  # newton's own warnings
 
 
 def world(*bodies, ground=True, gravity=-GRAVITY):
-    """Return a model of bodies (position, density, shape, its sizes, ...), which are added to one body after the first."""
+    """Return a model of bodies.
+
+    A body is (position, density, shape, its sizes, ...); each one after the first is added to one
+    body.
+    """
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, gravity))
     for position, density, *shapes in bodies:
         body = builder.add_body(xform=wp.transform(wp.vec3(*position), wp.quat_identity()))
@@ -30,7 +34,7 @@ def world(*bodies, ground=True, gravity=-GRAVITY):
 
 
 def pool(cells=16, depth=0.5, **more):
-    """Return the tables of a liquid in a unit cube, whose middle is at the world's origin."""
+    """Return the tables of a liquid in a unit cube centered at the world's origin."""
     liquid = [{"shape": "box", "min": [0.0] * 3, "max": [1.0, 1.0, depth]}]
     return {"domain": {"size": [1.0] * 3, "resolution": cells}, "liquid": liquid, **more}
 
@@ -62,7 +66,10 @@ def heights(state):
 
 
 def under(z, half, liquid):
-    """Return the share of a box's volume that is under the level of a liquid of a volume in the unit cube."""
+    """Return the share of a box's volume below the level of a liquid.
+
+    The liquid has a volume in the unit cube.
+    """
     area = 4.0 * half**2
     level = (liquid - area * (z - half)) / (1.0 - area)
     return (level - (z - half)) / (2.0 * half)
@@ -99,7 +106,11 @@ def test_dense_bodies_sink_onto_the_world_s_floor_and_light_ones_rise():
 @pytest.mark.parametrize("ratio", [0.1, 2.0])
 @pytest.mark.parametrize("alone", [True, False])
 def test_a_sphere_sets_off_with_its_added_mass(ratio, alone):
-    """Half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q diameters."""
+    """Added mass of a sphere.
+
+    It is half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q
+    diameters.
+    """
     q, dt = 0.25, 1e-3
     added = 0.5 * (1.0 + 2.0 * q**3) / (1.0 - q**3)
     model = world(((0.0, 0.0, 0.5), ratio * WATER, "sphere", {"radius": 0.5 * q}), ground=False)
@@ -112,7 +123,11 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio, alone):
 
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_momentum_is_handed_over(iterations):
-    """A dumbbell of light balls flies into a drop: it gets what the liquid gave, with one iteration the last impulse a step later."""
+    """Exchange of momentum.
+
+    A dumbbell of light balls flies into a drop: it gets the momentum of the liquid, with one
+    iteration the last impulse a step later.
+    """
     balls = [
         "sphere",
         {"radius": 0.08, "xform": wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity())},
@@ -136,7 +151,7 @@ def test_momentum_is_handed_over(iterations):
         liquid.simulation.particles.velocity.numpy().astype(float).sum(axis=0)
         * liquid.simulation.particle_mass
     )
-    # particles near a body have velocities of faces inside it
+    # Particles near a body have velocities of faces inside it.
     assert flowing[2] == pytest.approx(-given[-1][2], rel=0.15)
 
 
@@ -188,7 +203,7 @@ def test_kinematic_bodies_push_liquid_and_take_nothing(alone):
     assert liquid.bodies.impulses[0, 0] < 0.0
     assert liquid.simulation.particles.velocity.numpy()[:, 0].mean() > 0.05
     x = liquid.particles().numpy()[:, 0]
-    assert not ((x > -0.35) & (x < -0.25)).any()  # where the plate is
+    assert not ((x > -0.35) & (x < -0.25)).any()  # place of the plate
 
 
 def test_reset_puts_the_liquid_back_and_other_masses_are_taken():
@@ -273,7 +288,11 @@ def test_worlds_that_it_cannot_hold_are_refused():
 
 
 def test_newton_s_basic_shapes_fall_into_liquid():
-    """Its example's world: ellipsoid, cylinder, ball, capsule, box, a mesh and a cone, as dense as water, fall from 2 m."""
+    """newton's basic shapes falling into liquid.
+
+    Its example's world: ellipsoid, cylinder, ball, capsule, box, a mesh and a cone, as dense as
+    water, fall from 2 m.
+    """
     pytest.importorskip("pxr", reason="OpenUSD, with which the example reads its mesh, is missing")
     from newton.examples.basic.example_basic_shapes import Example
     from newton.viewer import ViewerNull

@@ -1,4 +1,4 @@
-"""Notebooks run without Jupyter, print the text that they hold, show pictures, and name no place of a machine."""
+"""Notebooks without Jupyter: stored output, pictures, no paths of a machine."""
 
 import importlib.util
 import json
@@ -19,7 +19,7 @@ def load(name):
     return module
 
 
-TITLES = {  # cells that print, and pictures
+TITLES = {  # cells with output, and pictures
     "first-steps": ("First steps", 4, 4),
     "driving-a-run": ("Driving a run", 4, 3),
     "inverse-problem": ("An obstacle from the shape of a membrane", 4, 3),
@@ -42,7 +42,10 @@ def test_every_notebook_is_tested():
 
 
 def test_cells_print_what_the_notebook_holds(notebook, name, monkeypatch):
-    """Nothing is drawn here, which takes longer than all else."""
+    """Printed output of the cells: the stored one.
+
+    Nothing is drawn here, since that takes longer than all else.
+    """
     monkeypatch.setitem(sys.modules, "matplotlib", MagicMock())
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", MagicMock())
     outputs = load("notebook_outputs")
@@ -52,7 +55,7 @@ def test_cells_print_what_the_notebook_holds(notebook, name, monkeypatch):
 
 
 def test_the_notebook_is_clean(notebook):
-    """No counts of execution, no errors, no paths."""
+    """Clean notebooks: no execution counts, no errors, no paths."""
     for cell in notebook["cells"]:
         assert cell.get("execution_count") is None
         texts = [

@@ -1,4 +1,7 @@
-"""Quadratic programs by qpsolvers: another of its solvers, and the conditions of Karush, Kuhn and Tucker, say what is right."""
+"""Quadratic programs by qpsolvers.
+
+They are compared with another of its solvers, and with the conditions of Karush, Kuhn and Tucker.
+"""
 
 import subprocess
 import sys
@@ -38,7 +41,7 @@ def program(use, rank, seed, sparse):
     if "h" in use:
         h[2] = np.inf
     made = scipy.sparse.csc_matrix if sparse else np.asarray
-    # in P's range: there is a minimizer
+    # In P's range: a minimizer exists.
     q = root @ rng.standard_normal(rank) if "-" in use or rank < n else rng.standard_normal(n)
     rows = ((made(G), h) if "G" in use else (None, None)) + (
         (made(A), A @ x) if "A" in use else (None, None)
@@ -49,7 +52,7 @@ def program(use, rank, seed, sparse):
 
 
 def satisfied(problem, found, accuracy=1e-6):
-    """The first-order conditions, written out."""
+    """Check the first-order conditions, written out."""
     P, q, G, h, A, b, lower, upper = problem.unpack_as_dense()
     x, gradient = found.x, P @ found.x + q
     if A is not None:
@@ -98,7 +101,10 @@ def test_least_squares_of_qpsolvers():
 
 
 def test_linear_programs():
-    """max x + 2 y, x + y <= 4, x + 3 y <= 6, x, y >= 0: at (3, 1)."""
+    """Linear program: max x + 2 y, x + y <= 4, x + 3 y <= 6, x, y >= 0.
+
+    The maximum is at (3, 1).
+    """
     x = qpsolvers.solve_qp(
         np.zeros((2, 2)),
         np.array([-1.0, -2.0]),

@@ -14,7 +14,10 @@ OTHERS = [name for name in ("clarabel", "piqp") if name in qpsolvers.available_s
 
 
 def check(seed, **options):
-    """Compare verdict, objective and minimizer with the construction, and test optimality."""
+    """Compare verdict, objective and minimizer with the construction.
+
+    Optimality is tested too.
+    """
     drawn = draw(seed, **options)
     found = qp.solve_problem(qpsolvers.Problem(**drawn.scaled))
     message = (seed, drawn.verdict, found.extras["result"].message)
@@ -67,7 +70,7 @@ def optimal(given, found, message, accuracy=2e-8):
         )
         if inequality:
             assert (multiplier >= 0).all()
-            # complementary, exactly
+            # Exactly complementary.
             assert ((multiplier == 0) | (np.abs(rest) <= accuracy * sizes)).all(), message
         gradient, terms = gradient + M.T @ multiplier, terms + np.abs(M).T @ np.abs(multiplier)
     lower, upper = dense.get("lb", np.full(n, -np.inf)), dense.get("ub", np.full(n, np.inf))
@@ -86,7 +89,7 @@ def test_drawn_programs(seed):
     check(seed)
 
 
-# the last: multipliers of an equation and a bound that cancel
+# The last one: multipliers of an equation and a bound that cancel.
 @pytest.mark.parametrize("seed", [*range(900, 906), 620237])
 def test_drawn_programs_whose_unknowns_are_scaled(seed):
     check(seed, columns=3.0, most=30)
@@ -95,7 +98,10 @@ def test_drawn_programs_whose_unknowns_are_scaled(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20_000, 20_500))
 def test_as_clarabel_and_piqp_say(seed):
-    """On the program in plain units, for in the others they fail themselves."""
+    """Verdicts of Clarabel and PIQP, on the program in plain units.
+
+    They fail in the other units.
+    """
     drawn, found = check(seed)
     sparse = {
         name: scipy.sparse.csc_matrix(v) if v.ndim == 2 else v
@@ -110,11 +116,11 @@ def test_as_clarabel_and_piqp_say(seed):
             else {"eps_abs": 1e-10, "eps_rel": 1e-10}
         )
         with warnings.catch_warnings():
-            # Clarabel's statuses of programs without a solution
+            # Clarabel's statuses of programs without a solution.
             warnings.simplefilter("ignore", UserWarning)
             other = qpsolvers.solve_problem(qpsolvers.Problem(**sparse), name, **options)
         if bool(other.found) != found.found:
-            continue  # PIQP gives up on 3 of 500
+            continue  # PIQP fails on 3 of 500
         x, p = found.x * drawn.units if found.found else None, drawn.plain
         if x is None:
             agreed.append(0.0)
@@ -123,13 +129,16 @@ def test_as_clarabel_and_piqp_say(seed):
         near = np.abs(x - other.x).max() / max(1.0, np.abs(x).max()) if drawn.unique else 0.0
         agreed.append(max(near, abs(costs - least) / (1 + np.abs(p["q"] * x).sum())))
     # `check` has compared with the constructed minimizer to 1e-6; theirs is off by 1e-4 where
-    # multipliers vanish
+    # multipliers vanish.
     assert not OTHERS or min(agreed, default=1.0) <= 2e-4, seed
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-9, 1.0, 1e6, 1e9, 1e12, 1e100])
 def test_costs_in_any_unit(scale):
-    """x + y <= 1, costs (x^2 + y^2) / 2 - x - y: at (.5, .5), with a multiplier of .5 units."""
+    """Costs in any unit.
+
+    x + y <= 1, costs (x^2 + y^2) / 2 - x - y: at (0.5, 0.5), with a multiplier of 0.5 units.
+    """
     found = qp.solve_problem(
         qpsolvers.Problem(scale * np.eye(2), -scale * np.ones(2), G=np.ones((1, 2)), h=np.ones(1))
     )
@@ -176,7 +185,10 @@ def test_what_is_just_below_infinity_is_a_number():
 
 
 def test_a_large_row_hides_no_other():
-    """q_2 = 1e16 holds x_2 at 0; x_1 is still to be found."""
+    """Large row that hides no other.
+
+    q_2 = 1e16 holds x_2 at 0; x_1 must still be found.
+    """
     P, q = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-1.0, 1e16])
     for given in ({"lb": np.zeros(2)}, {"G": -np.eye(2), "h": np.zeros(2)}):
         found = qp.solve_problem(qpsolvers.Problem(P, q, **given))
@@ -217,7 +229,10 @@ def test_rows_that_contradict_each_other_by_little(gap):
 
 
 def test_figures_are_those_of_qpsolvers():
-    """x_0 + x_1 = 1, x_0 - x_2 <= .2, -1 <= x <= .7: all kinds of multipliers, and qpsolvers' own three figures."""
+    """Figures of qpsolvers: its own three figures.
+
+    The program x_0 + x_1 = 1, x_0 - x_2 <= 0.2, -1 <= x <= 0.7 has all kinds of multipliers.
+    """
     P, q = np.diag([1.0, 2.0, 0.0]), np.array([-2.0, 0.5, 1.0])
     rows = {
         "G": np.array([[1.0, 0.0, -1.0]]),

@@ -1,4 +1,4 @@
-"""The README's examples work as they stand."""
+"""Examples of the README, as they stand."""
 
 import tomllib
 from pathlib import Path

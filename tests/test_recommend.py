@@ -1,4 +1,7 @@
-"""`wl.recommend`: what it recommends converges; what it says of a matrix is checked against NumPy's eigenvalues."""
+"""`wl.recommend`: recommended methods converge.
+
+Its verdicts on matrices are compared with NumPy's eigenvalues.
+"""
 
 import numpy as np
 import pytest
@@ -16,14 +19,18 @@ from warp_lcp.rules import RULES
 from warp_lcp.traits import traits_of
 
 SEEDS = range(700, 703)  # neither those of the rules nor those of the published check
-# contacts at rest are tried below
+# Contacts at rest are tested below.
 COUNTED = [family for family in FAMILIES if not family.startswith("scene")]
 NO_INDEFINITE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize("family", COUNTED)
 def test_recommended_methods_converge(family):
-    """60 problems in all, each to the accuracy asked for, within the limit of steps that comes with the recommendation."""
+    """Convergence of recommended methods.
+
+    There are 60 problems, each with its required accuracy, within the step limit of the
+    recommendation.
+    """
     for seed in SEEDS:
         name, lcp, accuracy = make(family, seed)
         advice = wl.recommend(lcp, accuracy=accuracy)
@@ -43,7 +50,11 @@ def test_there_are_sixty():
 
 @pytest.mark.parametrize("family", [family for family in FAMILIES if family.startswith("scene")])
 def test_contacts_get_a_method_that_takes_them(family):
-    """Most scenes converge; friction in boxes has no proof, and scenes pulled by joints are ill conditioned."""
+    """Recommended methods for contacts.
+
+    Most scenes converge; friction in boxes has no proof, and scenes pulled by joints are ill
+    conditioned.
+    """
     for seed in SEEDS:
         _, lcp, _ = make(family, seed)
         advice = wl.recommend(lcp, accuracy="rough")
@@ -74,7 +85,10 @@ def test_the_answer_is_one_by_another_codes_residual():
 
 
 def eigenvalue_verdict(A):
-    """What the least eigenvalue of the symmetric part says; the matrices below have none between 0 and 1e-4 in size."""
+    """Return the verdict of the least eigenvalue of the symmetric part.
+
+    The matrices below have none between 0 and 1e-4 in size.
+    """
     least = np.linalg.eigvalsh(0.5 * (A + A.T))[0]
     return "indefinite" if least < -1e-6 else "semidefinite" if least < 1e-6 else "definite"
 
@@ -86,7 +100,7 @@ def random_matrix(seed):
     A = B @ B.T + (0.05 * np.eye(n) if seed % 3 else 0.0)
     if seed % 4 == 0:
         C = rng.standard_normal((n, n))
-        A = A + C - C.T  # x'Ax is the same
+        A = A + C - C.T  # x'Ax is unchanged
     return A - 3.0 * np.outer(v := np.eye(n)[0] + np.eye(n)[1], v) if seed % 5 == 0 else A
 
 
@@ -123,7 +137,10 @@ def test_bounds_and_diagonals_are_named():
 
 
 def test_the_trial_foresees_how_many_sweeps():
-    """To a factor of 2, where the rate has settled; a rate taken over another number of sweeps would be far off."""
+    """Number of sweeps estimated by the trial, to a factor of 2.
+
+    Where the rate has settled; a rate over another number of sweeps would be far off.
+    """
     for problem in (gallery.banded(400, seed=77), gallery.poisson((12, 12), seed=77, device="cpu")):
         lcp = problem.lcp(device="cpu")
         sweeps = wl.solve(
@@ -176,7 +193,10 @@ def test_wrong_budgets_are_named(wrong, message):
 
 @pytest.mark.parametrize("n", [120, 3000])
 def test_small_and_narrow_matrices_get_the_default(n):
-    """Directly on the host: NumPy's sweeps would do, the dense one's eigenvalues are positive."""
+    """Default for small and narrow matrices: directly on the host.
+
+    NumPy's sweeps would suffice, and the dense one's eigenvalues are positive.
+    """
     lcp = (gallery.definite(n, seed=76) if n == 120 else gallery.banded(n, seed=76)).lcp(
         device="cpu"
     )
@@ -213,7 +233,7 @@ def test_a_budget_of_seconds_is_tried():
     assert hurried.name == "psor"
     assert hurried.stopping.max_iterations == 1
     assert wl.recommend(lcp, budget=wl.Budget(seconds=1e4)).name == "minimum-map-newton"
-    # beta rows: no sweep helps, but one can start
+    # beta rows: sweeps do not help, but can start.
     slow = gallery.contact(3, seed=80).lcp(device="cpu")
     assert wl.recommend(slow, budget=wl.Budget(seconds=1e4)).name == "lemke"
 
@@ -231,7 +251,10 @@ BOXES = ("low rank", "ridge", "support vectors")
 
 
 def check_default(kind, seed):
-    """The default solves a problem to 1e-6, and takes first what is recommended."""
+    """Check that the default solves a problem to 1e-6.
+
+    It first takes the recommended method.
+    """
     lcp = draw(kind, seed)
     result = wl.solve(lcp)
     assert result, (
@@ -268,7 +291,10 @@ def test_the_default_solves_convex_boxes_of_low_rank(kind, seed, piqp, monkeypat
 
 @pytest.fixture
 def misled():
-    """A box whose matrix has negative diagonal entries: sweeps stagnate on it, pivots solve it."""
+    """Return a box whose matrix has negative diagonal entries.
+
+    Sweeps stagnate on it, pivots solve it.
+    """
     rng = np.random.default_rng([12, 2])
     return wl.LCP(rng.standard_normal((12, 12)), rng.standard_normal(12), 0.0, 1.0)
 
@@ -307,7 +333,11 @@ def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
 
 
 def test_alternatives_keep_the_limits(misled):
-    """No step beyond max_iterations, none after StopIteration or a time limit; the best x of all is returned."""
+    """Limits of alternatives.
+
+    No step beyond max_iterations, none after StopIteration or a time limit; the best x of all is
+    returned.
+    """
     few = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=30))
     assert few.status is wl.SolveStatus.MAX_ITERATIONS
     assert few.iterations == few.history[-1].iteration == 30

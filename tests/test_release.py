@@ -1,4 +1,4 @@
-"""What a release says of itself in several places is the same in all of them."""
+"""Consistency of release data in several files."""
 
 import re
 import shutil
@@ -38,7 +38,10 @@ def test_the_recipe_wants_what_the_package_wants():
 
 
 def test_the_container_has_what_ranks_need():
-    """The packages of the tests on ranks, which are those of the extra, and a Python and PETSc that are new enough."""
+    """Packages of the container for ranks.
+
+    The packages of the tests on ranks are those of the extra; Python and PETSc are new enough.
+    """
     packages = re.search(
         r"^packages=\((.*)\)$", (ROOT / ".ci" / "mpi-environment").read_text(), flags=re.M
     )[1]

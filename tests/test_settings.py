@@ -1,4 +1,7 @@
-"""What a setting may be, drawn from its annotation, so that new methods are covered; and the rules themselves by hand."""
+"""Values of settings, drawn from their annotations, and the rules by hand.
+
+New methods are covered automatically.
+"""
 
 import dataclasses
 import inspect
@@ -41,7 +44,7 @@ KINDS = [
     Plant,
 ]
 KINDS = [kind for kind in [*KINDS, *SAND.values()] if dataclasses.fields(kind)]
-# that are none
+# Values that are no numbers.
 NUMBERS = [
     None,
     True,
@@ -57,7 +60,7 @@ NUMBERS = [
 
 
 def ranged(annotation):
-    """The range of a number, as it is or as an alternative, None where there is none."""
+    """Return the range of a number, also within alternatives; None if there is none."""
     parts = (
         [annotation]
         if get_origin(annotation) is Annotated
@@ -85,7 +88,10 @@ def limits(annotation):
 
 
 def beyond(annotation):
-    """Numbers outside a range: by each of its ends, and the ends themselves where they do not belong to it."""
+    """Return numbers outside a range.
+
+    Beyond each of its ends, and open ends themselves.
+    """
     kind, found = limits(annotation)
     for limit in found:
         match limit:
@@ -104,7 +110,10 @@ def beyond(annotation):
 
 
 def test_settings_of_every_method_are_checked():
-    """A method whose class is no `Settings`, or a number without a range, would take anything."""
+    """Checked settings of every method.
+
+    A method whose class is no `Settings`, or a number without a range, would accept anything.
+    """
     assert all(issubclass(kind, Settings) and kind() == kind() for kind in KINDS)
     assert not [
         (kind.__name__, name)
@@ -215,7 +224,7 @@ def test_messages_name_setting_value_and_range(make, message):
 
 
 def test_the_limits_themselves():
-    """By hand: a range whose end is turned around refuses what users take."""
+    """Limits by hand: a range with a wrong end refuses valid values."""
     taken = wl.StoppingCriteria(
         rtol=0, max_iterations=1e4, max_seconds=math.inf, divergence=math.inf, patience=np.int32(1)
     )

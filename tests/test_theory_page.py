@@ -1,4 +1,7 @@
-"""What docs/theory.md says in numbers, by enumeration of active sets; its examples, pictures and links."""
+"""Numbers of docs/theory.md, by enumeration of active sets.
+
+Its examples, pictures and links are tested too.
+"""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Every block of the tutorial works as it stands: its Python, its scenes and its commands."""
+"""Every block of the tutorial, as it stands: Python, scenes and commands."""
 
 import csv
 import json
@@ -20,7 +20,7 @@ COMMANDS = [
     for line in block.splitlines()
     if re.match(r"warp-lcp ", line)
 ]
-# the text's films take longer
+# The text's films take longer.
 SHORTER = ["--set", "time.duration=0.05", "--set", "domain.resolution=24"]
 
 
@@ -61,7 +61,10 @@ def test_scenes_run(text, tmp_path):
 
 
 def test_commands_work(tmp_path, monkeypatch):
-    """In the text's order, in one folder that holds the scenes under the names the text gives them."""
+    """Commands in the text's order, in one folder.
+
+    The folder holds the scenes under the names in the text.
+    """
     monkeypatch.chdir(tmp_path)
     Path("crate.toml").write_text(SCENES[0])
     Path("sand.toml").write_text(SCENES[1])
@@ -92,7 +95,7 @@ def test_commands_work(tmp_path, monkeypatch):
 
 
 def test_the_scene_with_a_body_has_one(tmp_path):
-    """At the text's own resolution, until the crate meets the water."""
+    """Scene with a body, at the text's resolution, until the crate meets the water."""
     scene = tmp_path / "crate.toml"
     scene.write_text(SCENES[0])
     invoke("run", str(scene), "--out", str(tmp_path / "out"), "--frames", "3")

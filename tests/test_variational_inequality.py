@@ -1,4 +1,7 @@
-"""Problems over convex sets that are no boxes, by methods of their own: the loop, its limits and statuses are `wl.solve`'s."""
+"""Problems over convex sets that are no boxes, by user-defined methods.
+
+The loop, its limits and statuses are those of `wl.solve`.
+"""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -9,7 +12,7 @@ import warp as wp
 
 import warp_lcp as wl
 
-MU = 0.5  # of the cones
+MU = 0.5  # friction coefficient of the cones
 
 
 def onto_cones(x: np.ndarray) -> np.ndarray:
@@ -24,7 +27,7 @@ def onto_cones(x: np.ndarray) -> np.ndarray:
 
 
 class Contacts(wl.VariationalInequality):
-    """y = A x + b over a product of friction cones, A symmetric positive definite."""
+    """Problem y = A x + b over a product of friction cones, A SPD."""
 
     def __init__(self, count: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -40,7 +43,7 @@ class Contacts(wl.VariationalInequality):
 
 
 class Work:
-    """The impulses, their residual |x - P(x - y)|, and the best ones so far."""
+    """Workspace: impulses, their residual |x - P(x - y)|, and the best ones so far."""
 
     precision = wl.Precision.DOUBLE
 
@@ -73,11 +76,14 @@ class Work:
 
 @dataclass(frozen=True)
 class ProjectedGradient:
-    """Several steps x <- P(x - t y) at once, of which the residual is due only now and then."""
+    """Method of several steps x <- P(x - t y) at once.
+
+    It evaluates the residual only now and then.
+    """
 
     problems: ClassVar = Contacts
     at_once: int = 1
-    due: int = 1  # calls from one residual to the next
+    due: int = 1  # calls between two residuals
     length: float = 1.0
     final: bool = False
 
@@ -101,7 +107,10 @@ STOPPING = wl.StoppingCriteria(rtol=0.0, atol=1e-9, max_iterations=5000)
 
 
 def test_impulses_in_friction_cones_meet_the_conditions_of_optimality() -> None:
-    """x in K, y in its dual, x'y = 0: of some contacts that hold, some that slide, some that part."""
+    """Optimality conditions of impulses in friction cones.
+
+    x in K, y in its dual, x'y = 0: some contacts stick, some slide, some separate.
+    """
     problem = Contacts(40, 2024)
     result = wl.solve(problem, ProjectedGradient(), stopping=STOPPING)
     x = result.x.numpy()

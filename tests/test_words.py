@@ -1,4 +1,4 @@
-"""Plain words: summary lines of the public API, help texts, messages, phrases of the documentation, the glossary."""
+"""Plain words in docstrings, help texts, messages and documentation."""
 
 import ast
 import inspect
@@ -17,7 +17,7 @@ from warp_lcp.cli.commands import app
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
 LONGEST = 80  # characters of a summary line
-# a summary line begins with a noun or a verb
+# A summary line begins with a noun or a verb.
 RIDDLES = {"what", "which", "how", "who", "that", "in", "of", "where", "when"}
 
 # Old names and phrases, each with the plain one that replaces it.
@@ -50,7 +50,7 @@ NOT_IN_MESSAGES = {
     r"\banew\b": "again",
     r"\bunless given\b": "Default:",
 }
-# a module of kernels; names with a deprecation
+# A module of kernels; names with a deprecation.
 for old_name in (r"\bcrowding\b", r"\bangle_of\b", r"\bConvexSetProblem\b"):
     del NOT_IN_MESSAGES[old_name]
 
@@ -61,7 +61,10 @@ def parsed(file: Path) -> ast.Module:
 
 
 def documented() -> dict[str, str]:
-    """Return the summary line of everything that docs/api shows or that `run` and `scene` have: modules, classes, functions."""
+    """Return the summary line of everything in docs/api, `run` and `scene`.
+
+    It covers modules, classes and functions.
+    """
     found: dict[str, str] = {}
     for reference in re.findall(
         r"^::: (\S+)",
@@ -94,7 +97,7 @@ def _add_summaries(found: dict[str, str], name: str, node: ast.AST) -> None:
         "kernel" in word or "wp." in word
         for word in map(ast.unparse, getattr(node, "decorator_list", []))
     ):
-        # a setter comes second; the text of a kernel is part of its module's hash
+        # A setter comes second; the text of a kernel is part of its module's hash.
         found[name] = (ast.get_docstring(node, clean=False) or "").split("\n")[0]  # type: ignore[arg-type]
     if isinstance(node, ast.ClassDef | ast.Module):
         for inner in node.body:
@@ -103,7 +106,10 @@ def _add_summaries(found: dict[str, str], name: str, node: ast.AST) -> None:
 
 
 def messages(phrases: re.Pattern[str]) -> Iterator[str]:
-    """Yield the place and the text of each string of the packages that has one of the phrases, except docstrings."""
+    """Yield place and text of each string with one of the phrases.
+
+    Docstrings are left out.
+    """
     for file in (
         file
         for package in ("warp_lcp", "fluids", "granular")

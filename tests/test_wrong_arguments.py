@@ -1,4 +1,4 @@
-"""What a user may pass by mistake: each is a ValueError that names the argument, whatever it is."""
+"""Wrong arguments: each is a ValueError that names the argument."""
 
 import numpy as np
 import pytest
@@ -90,7 +90,10 @@ OPERATORS = {
 
 @pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if families(cls)])
 def test_workspaces_of_another_method_problem_or_kind_are_refused(name, device):
-    """A workspace that is taken for another's gives an AttributeError in the middle of a solve, or the other method's iterates."""
+    """Workspaces of another method, problem or kind: refused.
+
+    Otherwise the solve fails with an AttributeError, or has the other method's iterates.
+    """
     method = wl.METHODS[name]()
     if name == "quadratic-program":
         pytest.importorskip("piqp")
@@ -102,7 +105,7 @@ def test_workspaces_of_another_method_problem_or_kind_are_refused(name, device):
         with pytest.raises(ValueError, match="workspace was made for another problem"):
             wl.solve(problem, method, workspace=method.init(twin))
         for other, cls in wl.METHODS.items():
-            # two blocks are staggered
+            # Two blocks are staggered.
             shared = (name, other) == ("blocked-gauss-seidel", "staggering")
             if other not in (name, "quadratic-program") and family in families(cls) and not shared:
                 with pytest.raises(
@@ -161,7 +164,10 @@ def test_arrays_of_every_kind_are_taken(made, device):
 
 
 class Frame:
-    """A stand-in for what pandas has: no array, but made into one by `__array__`; it has an `apply` of its own."""
+    """Stand-in for a pandas object.
+
+    It is no array, but `__array__` makes one of it; it has an `apply` of its own.
+    """
 
     def __init__(self, values):
         self.values = values
@@ -174,7 +180,7 @@ class Frame:
 
 
 class Table:
-    """Another one, made into an array by `to_numpy` only."""
+    """Stand-in that `to_numpy` alone makes into an array."""
 
     def __init__(self, values):
         self.values = values
@@ -308,7 +314,7 @@ def test_bounds_beyond_single_precision(bounds, message):
     ):
         wl.solve(problem, wl.ProjectedSOR(precision="single"))
     assert wl.solve(problem, wl.ProjectedSOR(precision="mixed"))
-    # a bound beyond all x is none
+    # A bound beyond all x is no bound.
     assert wl.solve(wl.LCP(A, B, 0.0, 1e39), wl.ProjectedSOR(precision="single"))
 
 

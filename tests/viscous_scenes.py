@@ -1,4 +1,7 @@
-"""Scenes of thick liquid drawn at random: it meets solids of any shape, whose walls hold it, let it go or let it slip."""
+"""Random scenes of viscous liquid at solids of any shape.
+
+Their walls are no-slip, separating or free-slip.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,10 @@ from warp_lcp.fluids import LiquidScene
 
 
 def viscous_scene(seed: int) -> LiquidScene:
-    """Return the scene of a seed: a unit square or cube with a block or two, maybe a source, and up to three solids in its middle."""
+    """Return the scene of a seed: a unit square or cube with a block or two.
+
+    It may have a source, and up to three solids in its middle.
+    """
     rng = np.random.default_rng(seed)
     dimension = int(rng.choice([2, 3, 3]))
     resolution = int(rng.integers(24, 65) if dimension == 2 else rng.integers(14, 29))
@@ -82,7 +88,10 @@ def viscous_scene(seed: int) -> LiquidScene:
 
 
 def stirred_scene(seed: int) -> LiquidScene:
-    """Return the scene of a seed: a square or cube with liquids of several viscosities, solids that turn or swing, bodies, a source."""
+    """Return the scene of a seed: a square or cube with several viscosities.
+
+    With solids that turn or swing, bodies, and a source.
+    """
     rng = np.random.default_rng(seed)
     dimension = int(rng.choice([2, 2, 3]))
     resolution = int(rng.integers(16, 41) if dimension == 2 else rng.integers(10, 17))

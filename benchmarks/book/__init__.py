@@ -1,4 +1,7 @@
-"""The experiments of [Book] appendix C and of figures 2.3, 2.10 and 2.12: as the book has them, and as they should be, side by side."""
+"""Experiments of [Book] appendix C and figures 2.3, 2.10 and 2.12.
+
+Each experiment runs twice, side by side: as the book states it, and corrected.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Figures C.1 to C.4 and tables C.1 and C.2: patterns, convergence, final states, kinks, and the factors lambda and omega."""
+"""[Book] figures C.1 to C.4, tables C.1 and C.2.
+
+The experiments cover sparsity patterns, convergence, final states, kinks of the Fischer map, and
+the factors lambda and omega.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +20,9 @@ from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, T
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, splash
 
-# the book's methods: monotone searches without fallbacks, no cycles first, linear systems solved.
-# Num4LCP's default at kinks, "random", leaves their rows of the Jacobian empty, as "zero" does
+# The book's methods: monotone searches without fallbacks, no preceding cycles, linear systems
+# solved. Num4LCP's default at kinks, "random", leaves their rows of the Jacobian empty, as "zero"
+# does.
 FISCHER = wl.FischerNewton(
     fischer_weight=1.0, kink="zero", safeguard=False, scaled=False, monotone_cycles=0, eta=1e-8
 )
@@ -36,7 +41,7 @@ METHODS: dict[str, Method] = {
     "MinimumMapNewton()": (wl.MinimumMapNewton(), Merit.MINIMUM),
     "InteriorPoint()": (wl.InteriorPoint(), Merit.MINIMUM),
 }
-# state and iterations in tables C.1 and C.2
+# Final states and iterations of tables C.1 and C.2.
 PUBLISHED = {
     "fluid, recipe: Fischer-Newton": "100 absolute, 5.00 (5 to 5, 0.00)",
     "fluid, recipe: minimum map": "100 absolute, 4.07 (3 to 5, 0.29)",
@@ -45,7 +50,7 @@ PUBLISHED = {
     "contact, recipe: Fischer-Newton": "100 absolute, 14.54 (9 to 26, 2.79)",
     "contact, recipe: minimum map": "100 non-descent",
 }
-# as the book has them, and as they should be
+# The book's problems and the corrected ones.
 COMPARED = ("fluid, recipe", "fluid, 7-point, planted", "contact, recipe", "contact, rigid bodies")
 KINKS = {
     **{kink: replace(FISCHER, kink=kink) for kink in ("random", "zero", "perturbation")},
@@ -54,8 +59,8 @@ KINKS = {
 SHARES = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)  # lambda
 FACTORS = (0.6, 0.8, 1.0, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7, 1.8, 1.9)  # omega
 SWEEPS = 2000
-SHOWN = 50  # iterations that figure C.2 shows
-NEAR = 1e-9  # relative residual at which a rate is measured
+SHOWN = 50  # iterations shown in figure C.2
+NEAR = 1e-9  # relative residual at which the convergence rate is measured
 UNIT = "residual / residual at x = 0"
 
 
@@ -78,7 +83,7 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
 
 
 def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
-    """Draw figure C.1, and look at the solutions that the recipes plant."""
+    """Draw figure C.1 and check the solutions that the recipes plant."""
     rows, panels = list[list[str]](), list[Lines]()
     for kind, of_kind in problems.items():
         infeasible, worst, held = 0, 0.0, list[float]()
@@ -200,7 +205,10 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
 
 
 def _rate(of_method: Outcome) -> float:
-    """Return by which factor the residual falls in the step that takes it below NEAR, or in the last one: the median."""
+    """Return the median factor by which the residual falls in a late step.
+
+    The step is the one that takes the residual below NEAR, or the last one.
+    """
     factors = []
     for trace in of_method.traces:
         last = next(
@@ -218,7 +226,7 @@ def _curve(residuals: Sequence[float]) -> tuple[list[float], list[float]]:
 
 
 def _kinks(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
-    """Compare what stands for the Fischer map's derivative at a kink, in the book's loop (figure C.3)."""
+    """Compare derivatives of the Fischer map at a kink, in the book's loop (fig. C.3)."""
     rows, panels = list[list[str]](), list[Lines]()
     for kind, few in problems.items():
         row, curves = [kind], {}
@@ -245,7 +253,10 @@ def _kinks(results: Results, problems: dict[str, list[Problem]], options: Option
 
 
 def _lambda(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
-    """Vary lambda of the penalized Fischer map, in the book's loop and with this library's safeguards."""
+    """Vary lambda of the penalized Fischer map.
+
+    The method runs with the book's loop, and with the safeguards of this library.
+    """
     rows = list[list[str]]()
     solved, steps = (
         dict[str, tuple[Sequence[float], list[float]]](),
@@ -259,19 +270,19 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
             options.say(f"book: lambda, {kind}, {label}")
             row, name = [kind, label], f"{kind}, {label}"
             for share in SHARES:
-                found = outcome(
+                solves = outcome(
                     f"lambda: {name}: {share:g}",
                     few,
                     replace(solver, fischer_weight=share),
                     Merit.FISCHER,
                     options.device,
                 )
-                results.records.append(found.record())
-                row.append(found.share)
-                solved.setdefault(name, (SHARES, []))[1].append(100 * len(found.solved) / len(few))
-                if found.solved:
+                results.records.append(solves.record())
+                row.append(solves.share)
+                solved.setdefault(name, (SHARES, []))[1].append(100 * len(solves.solved) / len(few))
+                if solves.solved:
                     steps.setdefault(name, ([], []))[0].append(share)
-                    steps[name][1].append(statistics.fmean(found.solved))
+                    steps[name][1].append(statistics.fmean(solves.solved))
             rows.append(row)
     remark = (
         f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps. 1 is the "

@@ -1,4 +1,7 @@
-"""Figures 2.3, 2.10 and 2.12: orders of sweeps, subspace minimization and NNCG on the scenes of figures 2.9 and 2.11."""
+"""[Book] figures 2.3, 2.10 and 2.12, on the scenes of figures 2.9 and 2.11.
+
+The methods are sweep orders of PGS, subspace minimization and NNCG.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,12 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import contact_scenes
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
 
-# scenes of figure 2.3, which has dense structured ones: brick walls
+# Scenes in place of figure 2.3, whose scenes are dense and structured: brick walls.
 ORDERED = ("wall", "box-stack", "leaning-wall", "gear-pyramid")
-ROUNDS = 100  # of figure 2.3
+ROUNDS = 100  # sweeps shown in figure 2.3
 LEVELS = (1e-3, 1e-6, 1e-10)
-METHODS: dict[str, tuple[Any, int]] = {  # and how many sweeps a step of theirs takes at least
+# Method, and the least number of sweeps that one of its steps costs.
+METHODS: dict[str, tuple[Any, int]] = {
     "PGS": (wl.ProjectedSOR(omega=1.0), 1),
     "NNCG": (wl.NNCG(), 1),
     "PGS-SM": (wl.SubspaceMinimization(precision="double", backtracks=-1), 6),
@@ -76,13 +80,17 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
             height = np.concatenate(
                 [np.repeat(assembly.contacts.point[:, 2], 3), np.full(len(system.lower), np.inf)]
             )
-            found = {
+            residual_curves = {
                 label: _order(problem, make(system, height), options)
                 for label, make in ORDERS.items()
             }
-            ordered.append(Lines(name, system.name, "sweeps or rounds", UNIT, found, log="y"))
-            order_rows.append([name, *(f"{min(r, default=0.0):.1e}" for _, r in found.values())])
-            last = {label: Figure(min(r, default=0.0)) for label, (_, r) in found.items()}
+            ordered.append(
+                Lines(name, system.name, "sweeps or rounds", UNIT, residual_curves, log="y")
+            )
+            order_rows.append(
+                [name, *(f"{min(r, default=0.0):.1e}" for _, r in residual_curves.values())]
+            )
+            last = {label: Figure(min(r, default=0.0)) for label, (_, r) in residual_curves.items()}
             results.records.append(Record(f"orders: {name}", last))
     remark = (
         f"At most {scale.sweeps} sweeps; least: the smallest residual met. Boxed friction, "

@@ -1,4 +1,4 @@
-"""Solves seen iterate by iterate: how the book's tests would have ended them, and when the natural residual was small."""
+"""Convergence tests of the book and the natural residual, for each iterate."""
 
 from __future__ import annotations
 
@@ -16,19 +16,23 @@ from warp_lcp.benchmarks.harness.record import Record
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.gallery import Problem
 
-RTOL = 1e-6  # of the natural residual: what this library calls solved
-DEEP = 1e-12  # tolerance of the solves: far enough to see how fast a method is at its end
+RTOL = 1e-6  # relative natural residual at which this library calls a problem solved
+DEEP = 1e-12  # tolerance of the solves, small enough to show the final convergence rate
 
 
 class Merit(Enum):
-    """What Num4LCP tests: half the squared norm of the Fischer-Burmeister map or of the minimum map, or the product x'|y|."""
+    """Merit function that Num4LCP tests.
+
+    It is half the squared norm of the Fischer-Burmeister map or of the minimum map, or the product
+    x'|y|.
+    """
 
     FISCHER = "Fischer"
     MINIMUM = "minimum map"
     PRODUCT = "x'|y|"
 
     def of(self, x: np.ndarray, y: np.ndarray) -> float:
-        """Return it for an iterate, shape (n,) each."""
+        """Return the merit of an iterate; x and y have shape (n,)."""
         if self is Merit.PRODUCT:
             return float(x @ np.abs(y))
         f = np.hypot(x, y) - x - y if self is Merit.FISCHER else np.minimum(x, y)
@@ -37,7 +41,7 @@ class Merit(Enum):
 
 @dataclass(frozen=True)
 class Limits:
-    """The book's tests: relative change of the merit, its size, and the number of iterations."""
+    """Limits of the book's tests: relative change and size of the merit, iterations."""
 
     rtol: float = 1e-6
     atol: float = 1e-3
@@ -46,12 +50,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Trace:
-    """A solve.
+    """Iterates of a solve: merits and natural residuals.
 
     Args:
-        merits: the merit of each iterate, the start's first.
-        residuals: the natural residual of each over the first one's.
-        status: how the solve ended.
+        merits: merit of each iterate, that of the start first.
+        residuals: natural residual of each iterate over that of the first.
+        status: end status of the solve.
     """
 
     merits: Sequence[float]
@@ -60,14 +64,14 @@ class Trace:
 
     @property
     def solved(self) -> int | None:
-        """Steps after which the natural residual was RTOL times the first one, None if never."""
+        """Steps until the natural residual is RTOL times the first; None if never."""
         return next((k for k, r in enumerate(self.residuals) if r <= RTOL), None)
 
     def verdict(self, merit: Merit, limits: Limits) -> tuple[str, int, float]:
-        """Return state, iterations and relative residual where Num4LCP's tests would have ended the solve.
+        """Return state, iterations and relative residual at Num4LCP's stopping point.
 
-        Sweeps are tested after each one; Newton methods before each step, whose first test is
-        iteration 1.
+        Sweeps are tested after each step. Newton methods are tested before each step, the first
+        time as iteration 1.
         """
         first = 1 if merit is Merit.PRODUCT else 0
         before = np.inf
@@ -95,7 +99,7 @@ class Trace:
 def follow(
     problem: Problem, solver: Any, merit: Merit, device: str, *, most: int = 100, x0: Any = None
 ) -> Trace:
-    """Solve a dense or sparse problem and keep the merit of each iterate."""
+    """Solve a dense or sparse problem and record the merit of each iterate."""
     lcp = problem.lcp(device=device)
     work = solver.init(lcp)
     merits: list[float] = []
@@ -114,20 +118,20 @@ def follow(
 
 @dataclass(frozen=True)
 class Outcome:
-    """A method's solves of the problems of a kind, with the book's verdicts."""
+    """Solves of one kind of problem by one method, with the book's verdicts."""
 
-    name: str  # of the record
+    name: str  # name of the record
     traces: Sequence[Trace]
     verdicts: Sequence[tuple[str, int, float]]
 
     @property
     def solved(self) -> list[int]:
-        """Steps to RTOL of those that got there within the limit."""
+        """Steps to RTOL of the problems solved within the limit."""
         return [n for t in self.traces if (n := t.solved) is not None]
 
     @property
     def accepted(self) -> list[int]:
-        """Iterations of those that one of the book's two tests of convergence ended."""
+        """Iterations of the solves that one of the book's two convergence tests ended."""
         return [
             iterations
             for state, iterations, _ in self.verdicts
@@ -136,18 +140,18 @@ class Outcome:
 
     @property
     def states(self) -> str:
-        """How often each final state came, the most frequent first."""
+        """Frequency of each final state, the most frequent first."""
         return counted(state for state, _, _ in self.verdicts)
 
     @property
     def share(self) -> str:
-        """How many were solved to RTOL, with the mean of their steps."""
+        """Number of problems solved to RTOL, with the mean of their steps."""
         return f"{len(self.solved)} of {len(self.traces)}" + (
             f", {statistics.fmean(self.solved):.2f}" if self.solved else ""
         )
 
     def record(self) -> Record:
-        """Return the figures."""
+        """Return the record of figures."""
         figures: dict[str, float] = {
             "solved": len(self.solved),
             "problems": len(self.traces),
@@ -160,7 +164,11 @@ class Outcome:
         return Record(self.name, {name: Figure(value) for name, value in figures.items()}, facts)
 
     def row(self) -> list[str]:
-        """Return states, iterations and largest residual by the book's tests, then problems solved to RTOL and their steps."""
+        """Return a table row: the book's verdicts, then problems solved to RTOL.
+
+        The columns are final states, iterations and largest residual by the book's tests, and then
+        the problems solved to RTOL and their steps.
+        """
         worst = max(residual for _, _, residual in self.verdicts)
         return [
             self.states,
@@ -181,7 +189,7 @@ def outcome(
     limits: Limits | None = None,
     starts: Sequence[Any] | None = None,
 ) -> Outcome:
-    """Solve all problems by a method, from x = 0 or the starts."""
+    """Solve all problems by a method, from x = 0 or the given starts."""
     limits = limits or Limits()
     given = starts or [None] * len(problems)
     traces = [
@@ -192,7 +200,7 @@ def outcome(
 
 
 def counted(words: Iterable[str]) -> str:
-    """Return how often each word comes, the most frequent first."""
+    """Return the frequency of each word, the most frequent first."""
     return ", ".join(f"{n} {word}" for word, n in Counter(words).most_common())
 
 

@@ -1,4 +1,4 @@
-"""The problems of [Book] appendix C twice: by the recipes of its code, Num4LCP, and with a solution that is one."""
+"""Problems of [Book] appendix C, by Num4LCP's recipes and with true solutions."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from warp_lcp.gallery.matrices import banded_matrix, spectrum_matrix
 BLOCK = 6  # unknowns of a contact: normal, four tangents, slip speed
 ZEROS = 0.25  # share of zeros in x in all experiments of Num4LCP
 SEED = 2015
-SMALL = 32  # cells along a side of the largest grid below which all experiments are small
+SMALL = 32  # cells along the longest side; all experiments are small if no grid has more
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How large the experiments are.
+    """Sizes of the experiments.
 
     Args:
         problems: number of random problems of each kind.
@@ -43,7 +43,7 @@ class Scale:
 
     @staticmethod
     def of(options: Options) -> Scale:
-        """Return the book's numbers, or small ones where only small grids are asked for."""
+        """Return the book's sizes, or small ones if only small grids are requested."""
         grids = options.sizes or (16, 32, 64)
         if max(grids) < SMALL:
             return Scale(2 * options.repeat, 4, 3, 12, grids, (2, 4), 40)
@@ -53,9 +53,9 @@ class Scale:
 def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
     """Return the problem that Num4LCP's `make_lcp` makes of a matrix.
 
-    Its `solution` is the x that it plants, uniform in (0, 1) with a quarter set to 0, b = -A x
-    where x > 0 and 0 elsewhere. That x is no solution where (A x)_i < 0 at a zero: with an M-matrix
-    everywhere.
+    Its `solution` is the planted x, uniform in (0, 1) with a quarter set to 0. b is -A x where x >
+    0, and 0 elsewhere. The planted x is no solution where (A x)_i < 0 at a zero. With an M-matrix
+    that holds at every zero.
     """
     x = rng.random(A.shape[0])
     x[x < ZEROS] = 0
@@ -64,7 +64,10 @@ def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
 
 
 def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
-    """Return a problem with a complementary solution: a quarter of x at zero with y > 0 there, b = y - A x."""
+    """Return a problem with a complementary solution: b = y - A x.
+
+    A quarter of x is 0, with y > 0 there.
+    """
     return planted(A, rng, Plant(active=ZEROS), name=name, facts=frozenset())
 
 
@@ -75,16 +78,17 @@ RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {
 
 
 def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -> np.ndarray:
-    """Return Num4LCP's contact matrix, which no contact of bodies has.
+    """Return the contact matrix of Num4LCP.
 
-    Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern
-    of Stewart and Trinkle written over those that are left.
+    No contact of rigid bodies has such a matrix. It consists of random symmetric 6 x 6 blocks, half
+    of them zero, shifted to be positive definite. The pattern of Stewart and Trinkle is written
+    over the nonzero blocks.
 
     Args:
         contacts: number of contacts, six unknowns each.
         rng: random numbers.
-        tangents: how many of a contact's tangents have the pattern: all 4 in Num4LCP's Matlab code,
-            3 in its Python code.
+        tangents: number of a contact's tangents with the pattern: all 4 in Num4LCP's Matlab
+            code, 3 in its Python code.
     """
     n = BLOCK * contacts
     R = rng.random((n, n))
@@ -97,7 +101,8 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
     blocks = A.reshape(contacts, BLOCK, contacts, BLOCK)
     i, j = np.nonzero(blocks[:, 0, :, 0])
     last, among = BLOCK - 1, slice(1, 1 + tangents)
-    blocks[i, last, j, 0] = 0.5  # mu
+    # Rows and columns of a block: normal impulse, four tangents, slip speed.
+    blocks[i, last, j, 0] = 0.5  # friction coefficient mu
     blocks[i, last, j, last] = blocks[i, 0, j, last] = 0.0
     blocks[i, last, j, among] = -1.0
     blocks[i, among, j, last] = 1.0
@@ -105,7 +110,10 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
 
 
 def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
-    """Return a dense positive semi-definite problem: eigenvalues 1/n, 2/n, ... 1, the smallest share `zeros` of them set to 0."""
+    """Return a dense positive semi-definite problem with zero eigenvalues.
+
+    The eigenvalues are 1/n, 2/n, ... 1; the smallest ones, a share `zeros`, are set to 0.
+    """
     n, rng = scale.dense, np.random.default_rng([SEED + 2, number, int(1000 * zeros)])
     eigenvalues = np.arange(1, n + 1) / n
     eigenvalues[: int(n * zeros)] = 0
@@ -113,7 +121,7 @@ def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
 
 
 def kinds(scale: Scale) -> dict[str, Callable[[int], Problem]]:
-    """Return what makes the fluid and the contact problems, by kind, each a function of the problem's number."""
+    """Return functions that make fluid and contact problems from a number, by kind."""
     n = scale.side**3
 
     def fluid(rule: str) -> Callable[[int], Problem]:

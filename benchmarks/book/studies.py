@@ -1,4 +1,7 @@
-"""Figures C.5 and C.6 and the experiment with zero eigenvalues: cost against size, warm starts, semi-definite problems."""
+"""[Book] figures C.5 and C.6, and problems with zero eigenvalues.
+
+The studies are cost against size, warm starts and semi-definite problems.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, T
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, contact, splash
 
-STEPS = 10  # figure C.5 has the time of so many
-# unknowns from which on exponents of grids are fitted: below, launches cost as much as the work
+STEPS = 10  # steps that figure C.5 times
+# Fewest unknowns for fitted exponents on grids: below, launches cost as much as the work.
 LEAST = 3000
 GRID: dict[str, tuple[Any, int]] = {  # method, most steps
     "ProjectedMultigrid": (wl.ProjectedMultigrid(), 100),
@@ -41,7 +44,7 @@ DENSE: dict[str, tuple[Any, int]] = {
     "InteriorPoint": (wl.InteriorPoint(), 100),
     "Lemke": (wl.Lemke(), 1000),
 }
-SWEPT = 10  # sweeps of PGS before a warm start
+SWEPT = 10  # PGS sweeps before a warm start
 ZEROS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SEMIDEFINITE: dict[str, Method] = {
     "Fischer-Newton, approximation": (APPROXIMATION, Merit.FISCHER),
@@ -124,7 +127,7 @@ def _cost(results: Results, scale: Scale, options: Options) -> None:
 
 
 def _timed(problem: wl.LCP, solver: Any, most: int, repeat: int) -> tuple[wl.SolveResult, float]:
-    """Return a solve and the least seconds of those made, after one that loads kernels."""
+    """Return a solve and its least time [s]; the first solve only loads kernels."""
     work, stopping = (
         solver.init(problem),
         wl.StoppingCriteria(rtol=RTOL, max_iterations=most, patience=most),
@@ -137,7 +140,10 @@ def _timed(problem: wl.LCP, solver: Any, most: int, repeat: int) -> tuple[wl.Sol
 
 
 def exponent(sizes: np.ndarray, seconds: Sequence[float], least: int) -> float:
-    """Return p of seconds = c sizes^p by least squares of logarithms; NaN unless there are two sizes and all were solved."""
+    """Return p of seconds = c sizes^p, a least-squares fit of the logarithms.
+
+    The result is NaN if there are fewer than two sizes or a problem is unsolved.
+    """
     kept = sizes >= least if (sizes >= least).sum() > 1 else sizes > 0
     if np.isnan(seconds).any() or kept.sum() < 2:
         return math.nan
@@ -145,7 +151,7 @@ def exponent(sizes: np.ndarray, seconds: Sequence[float], least: int) -> float:
 
 
 def _warm(results: Results, scale: Scale, options: Options) -> None:
-    """Count iterations of Newton methods from zero and from ten sweeps (figure C.6)."""
+    """Count Newton iterations from zero and from ten PGS sweeps (figure C.6)."""
     rows, panels = list[list[str]](), list[Lines]()
     limits = Limits(rtol=1e-6, atol=1e-2, most=30)
     for rule in RULES:
@@ -165,7 +171,7 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
         }.items():
             for start, starts in (("from 0", None), (f"from {SWEPT} sweeps", swept)):
                 name = f"{method} {start}"
-                found = outcome(
+                solves = outcome(
                     f"warm: {rule}: {name}",
                     problems,
                     solver,
@@ -174,14 +180,14 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
                     limits=limits,
                     starts=starts,
                 )
-                results.records.append(found.record())
+                results.records.append(solves.record())
                 rows.append(
-                    [rule, method, start, found.states, spread(found.accepted), found.share]
+                    [rule, method, start, solves.states, spread(solves.accepted), solves.share]
                 )
                 shown = range(1, 8)
                 curves[name] = (
                     [float(k) for k in shown],
-                    [float(found.accepted.count(k)) for k in shown],
+                    [float(solves.accepted.count(k)) for k in shown],
                 )
         panels.append(Lines(rule, rule, "iterations", "problems", curves, log=""))
     remark = (
@@ -197,7 +203,10 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
 
 
 def solvable(problem: Problem) -> bool:
-    """Return whether some x >= 0 has A x + b >= 0, which for a positive semi-definite A makes the LCP solvable."""
+    """Return whether some x >= 0 has A x + b >= 0.
+
+    If A is positive semi-definite, the LCP then has a solution.
+    """
     n = len(problem.b)
     return bool(
         scipy.optimize.linprog(
@@ -208,7 +217,7 @@ def solvable(problem: Problem) -> bool:
 
 
 def _zeros(results: Results, scale: Scale, options: Options) -> None:
-    """Solve problems with more and more zero eigenvalues."""
+    """Solve problems with a growing number of zero eigenvalues."""
     rows, panels = list[list[str]](), list[Lines]()
     few, limits = max(2, scale.problems // 10), Limits(rtol=1e-4, atol=1e-2)
     for rule in RULES:
@@ -225,7 +234,7 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
             )
             shares = {"solvable": able}
             for method, (solver, merit) in SEMIDEFINITE.items():
-                found = outcome(
+                solves = outcome(
                     f"zeros: {rule}: {zeros:.0%}: {method}",
                     problems,
                     solver,
@@ -233,10 +242,10 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
                     options.device,
                     limits=limits,
                 )
-                results.records.append(found.record())
+                results.records.append(solves.record())
                 ends = results.records[-1].facts["statuses"]
-                rows.append([rule, f"{zeros:.0%}", f"{able} of {few}", method, *found.row(), ends])
-                shares[method] = len(found.solved)
+                rows.append([rule, f"{zeros:.0%}", f"{able} of {few}", method, *solves.row(), ends])
+                shares[method] = len(solves.solved)
             for name, count in shares.items():
                 curves[name][0].append(100 * zeros)
                 curves[name][1].append(100 * count / few)

@@ -1,8 +1,9 @@
-"""Hostile cases with an outcome that is fixed beforehand, judged by NumPy and SciPy in float64; `warp-lcp bench extremes` runs them all.
+"""Suite `extremes`: hostile cases with a fixed expected outcome.
 
-A case is solved to its tolerance, refused before the start with a message that names the argument,
-or stopped with a status that says so. Solvers that are wrong on purpose are among the cases: the
-checks must catch each of them. Random problems come last, new ones each time.
+NumPy and SciPy judge the results in float64. `warp-lcp bench extremes` runs all cases. A case is
+solved to its tolerance, refused before the start with a message that names the argument, or stopped
+with a status that says why. Some solvers are wrong on purpose: the checks must catch each of them.
+Random problems come last, new ones in each run.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 
-ORDINARY = ("CONVERGED", REFUSED, "done")  # statuses that the report does not list case by case
+ORDINARY = ("CONVERGED", REFUSED, "done")  # statuses that the report does not list by case
 TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (
     shapes.sizes,
@@ -54,7 +55,7 @@ def cases(seed: int) -> Iterator[Case]:
     """Yield all cases, family by family.
 
     Args:
-        seed: first one of the random problems.
+        seed: first seed of the random problems.
 
     Raises:
         ValueError: two cases share a name.
@@ -68,7 +69,7 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Try every case in each of its precisions."""
+    """Run every case in each of its precisions."""
     verdicts, family = list[Verdict](), ""
     seed = SystemRandom().choice(FRESH) if options.seed is None else options.seed
     for case in cases(seed):
@@ -81,20 +82,20 @@ def measure(options: Options, out: Path) -> Results:
             verdicts.append(judge(case, precision, options.device))
             if verdicts[-1].wrong:
                 options.say(f"{verdicts[-1].name}: {verdicts[-1].outcome}")
-    found = by_family(verdicts)
+    family_records = by_family(verdicts)
     unseen, beyond = judging.summary(verdicts, seed)
     wrong = [v for v in verdicts if v.wrong]
     records = [
         machine(options.device, elements=1 << 22, repeat=options.repeat),
-        *found,
+        *family_records,
         *map(record, wrong),
     ]
     failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in wrong] + beyond
-    return Results(records, [families(found), unseen, table(verdicts)], failures=failures)
+    return Results(records, [families(family_records), unseen, table(verdicts)], failures=failures)
 
 
 def record(verdict: Verdict) -> Record:
-    """Return what the file keeps of a case that is not as it must be."""
+    """Return the record of a failed case."""
     attempt, case = verdict.attempt, verdict.case
     facts = {
         "family": case.family,
@@ -112,7 +113,7 @@ def record(verdict: Verdict) -> Record:
 
 
 def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
-    """Return how many cases of each family are as they must be."""
+    """Return the number of passed cases of each family."""
     records = []
     for family in dict.fromkeys(v.case.family for v in verdicts):
         own = [v for v in verdicts if v.case.family == family]
@@ -172,10 +173,12 @@ def families(records: Sequence[Record]) -> Table:
 
 
 def table(verdicts: Sequence[Verdict]) -> Table:
-    """Return a row for each noteworthy case, with status, relative residual and seconds in each precision.
+    """Return a row for each noteworthy case.
 
-    Noteworthy: a verdict is wrong, a solve stops before its tolerance, or it takes a second or
-    more. Random problems are listed only if a verdict is wrong.
+    A row has status, relative residual and seconds in each precision.
+
+    A case is noteworthy if a verdict is wrong, a solve stops before its tolerance, or it takes a
+    second or more. Random problems are listed only if a verdict is wrong.
     """
     by_case = defaultdict[tuple[str, str], list[Verdict]](list)
     for v in (v for v in verdicts if v.wrong or v.case.family not in judging.FAMILIES):

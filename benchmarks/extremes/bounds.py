@@ -1,4 +1,8 @@
-"""Families of right-hand sides and bounds: scales, degenerate solutions, all or none at a bound, tolerances below rounding."""
+"""Hostile right-hand sides and bounds.
+
+The families are scales, degenerate solutions, active sets of all or no unknowns, and tolerances
+below rounding.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +54,7 @@ def scales() -> Iterator[Case]:
     yield from case("one cell of b at 1e12", b=but((17, 19), -1e12, NOISE))
     yield from case("b over 30 decades", b=NOISE * 10 ** chance(11).uniform(-15, 15, SHAPE))
     yield from case("bounds at 1e30", lower=-1e30, upper=1e30)
-    # far beyond what b can do, so that one cell pushes all others
+    # Far beyond the range of b, so that one cell pushes all others.
     yield from case(
         "b of 1e-30 beside a bound of 1e10",
         b=1e-30 * NOISE,
@@ -61,12 +65,18 @@ def scales() -> Iterator[Case]:
 def given_pool(
     family: str, name: str, more: dict[str, Any] | None = None, **fields: Any
 ) -> Iterator[Case]:
-    """Yield a pool with these fields for both methods; `more` as of SolveCase."""
+    """Yield a pool with these fields for both methods.
+
+    `more` holds arguments of SolveCase.
+    """
     return given(family, name, partial(pool, SHAPE, **fields), **(more or {}))
 
 
 def degenerate() -> Iterator[Case]:
-    """Yield solutions with x_i = l_i and y_i = 0 on many cells, and sets that hold all or nothing."""
+    """Yield degenerate solutions, and active sets of all or no unknowns.
+
+    A degenerate solution has x_i = l_i and y_i = 0 on many cells.
+    """
     family = "active sets"
     case = partial(given_pool, family)
     for share in (0.1, 0.5, 0.9):
@@ -108,7 +118,10 @@ def planted(share: float) -> GridProblem:
 
 
 def ceiling() -> GridProblem:
-    """Return liquid at rest up to a ceiling that separates: y = 0 there, x = 0 to rounding."""
+    """Return liquid at rest up to a separating ceiling.
+
+    At the ceiling y = 0, and x = 0 to rounding.
+    """
     cells = np.full(SHAPE, FLUID)
     cells[-1, -6:] = AIR
     b = np.zeros(SHAPE)
@@ -117,7 +130,10 @@ def ceiling() -> GridProblem:
 
 
 def tolerances() -> Iterator[Case]:
-    """Yield tolerances that no arithmetic reaches: FLOOR, not CONVERGED and not an endless loop."""
+    """Yield tolerances below rounding.
+
+    The solve must end as FLOOR, not as CONVERGED, and must not loop for ever.
+    """
     case = partial(given, "tolerances")
     for rtol in (1e-15, 1e-17, 0.0):
         expected, stopping = (

@@ -1,4 +1,4 @@
-"""Solvers that are wrong on purpose. If the checks let one of them pass, the checks are worth nothing."""
+"""Solvers that are wrong on purpose; the checks must catch each of them."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from warp_lcp.benchmarks.extremes.case import Case, Expected, Promise, SolveCase
 from warp_lcp.benchmarks.extremes.shapes import grounded, pool
 
 CAUGHT = Promise(Expected.CAUGHT)
-RIGHT = (  # problems that the right methods solve
+RIGHT = (  # problems that the correct methods solve
     ("2-D", lambda: pool((24, 25)), "projected-multigrid"),
     ("1-D", lambda: grounded((1, 40)), "minimum-map-newton"),
 )
 
 
 class SignFlipped:
-    """A method whose step goes the wrong way: x - dx in the place of x + dx."""
+    """Method with the wrong sign of its step: x - dx in place of x + dx."""
 
     def __init__(self, right: Any) -> None:
         self._right = right
 
     def init(self, problem: wl.LCP) -> Any:
-        """Return the workspace of the right method."""
+        """Return the workspace of the correct method."""
         return self._right.init(problem)
 
     def step(self, problem: wl.LCP, work: Any, x: wp.array[Any]) -> wl.Step:
-        """Take the right step, backwards."""
+        """Take the negative of the correct step."""
         before = x.numpy().copy()
         done = self._right.step(problem, work, x)
         x.assign(2 * before - x.numpy())
@@ -41,12 +41,18 @@ class SignFlipped:
 
 
 def backwards(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
-    """Solve by steps that go the wrong way; the loop recomputes the residual and does not call it a solution."""
+    """Solve by steps of the wrong sign.
+
+    The solve loop recomputes the residual and does not report convergence.
+    """
     return wl.solve(problem, SignFlipped(solver), **options)
 
 
 def flipped_and_sure(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
-    """Return -x of the right result x with its status and its residual: the result itself shows nothing."""
+    """Return -x with the status and residual of the correct result x.
+
+    The result itself shows no fault.
+    """
     result = wl.solve(problem, solver, **options)
     return replace(
         result, x=wp.array(-result.x.numpy(), dtype=result.x.dtype, device=result.x.device)
@@ -54,7 +60,10 @@ def flipped_and_sure(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveRe
 
 
 def equations(problem: wl.LCP, solver: Any, *, sign: float, **options: Any) -> wl.SolveResult:
-    """Return the solution of y = A x + sign b without bounds: right for what it solves."""
+    """Solve y = A x + sign b without bounds.
+
+    The result is correct for this problem, not for the given one.
+    """
     b = wp.array(sign * problem.b.numpy(), dtype=wp.float64, device=problem.device)
     return wl.solve(wl.LCP(problem.A, problem.layout.unload(b), -np.inf, np.inf), solver, **options)
 
@@ -62,7 +71,10 @@ def equations(problem: wl.LCP, solver: Any, *, sign: float, **options: Any) -> w
 def sooner(
     problem: wl.LCP, solver: Any, *, stopping: wl.StoppingCriteria, start: bool, **options: Any
 ) -> wl.SolveResult:
-    """Return the start without a step, or what a tenth of the tolerance's digits gives, and call it converged."""
+    """Return an unconverged iterate and call it converged.
+
+    The iterate is the start without a step, or the result for a tenth of the tolerance's digits.
+    """
     weak = (
         replace(stopping, max_iterations=0) if start else replace(stopping, rtol=stopping.rtol**0.1)
     )

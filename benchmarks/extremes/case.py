@@ -1,4 +1,4 @@
-"""A hostile case, what it must come to, what it came to, and whether that is as it must be."""
+"""Hostile cases: expected outcome, attempt and verdict."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from warp_lcp.benchmarks.extremes.problem import Problem
 
 PRECISIONS = ("single", "mixed", "double")
 RTOL = {"single": 1e-3, "mixed": 1e-8, "double": 1e-8}
-BUDGET = 10.0  # seconds of a case; usual ones take milliseconds
+BUDGET = 10.0  # CPU seconds of a case; usual cases take milliseconds
 LAST_CALL = 6.0  # multiples of the budget after which a case is interrupted
 MAX_ITERATIONS = 200
 EPS = float(np.finfo(np.float32).eps)
-# of a residual: how far what a result says may be from what is found, besides rounding
+# Largest relative difference of the reported and the recomputed residual, besides rounding.
 AGREES = 1e-3
 REFUSED, OUT_OF_TIME = "refused", "out of time"
-# what no method may end with
+# Errors that no method may raise.
 BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)
-# the precision does not go further, or not in this time
+# The precision is exhausted, or the limits are reached.
 HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})
 
 
 class Expected(Enum):
-    """What a case must come to."""
+    """Kinds of expected outcome."""
 
     SOLVED = "solved to tolerance"
     REFUSED = "refused before the start"
     STOPPED = "stopped with an honest status"
-    EITHER = "solved, or stopped with an honest status"  # where the precision decides
+    EITHER = "solved, or stopped with an honest status"  # if the precision decides
     DONE = "all steps taken"
-    CAUGHT = "caught by the checks"  # of a solver that is wrong on purpose
+    CAUGHT = "caught by the checks"  # for solvers that are wrong on purpose
 
 
 @dataclass(frozen=True)
 class Promise:
-    """What a case must come to: a kind, and what belongs to it."""
+    """Expected outcome of a case: its kind, statuses and message."""
 
     expected: Expected
-    statuses: frozenset[str] = frozenset()  # the statuses it may stop with
-    names: str = ""  # what the message of a refusal must contain
+    statuses: frozenset[str] = frozenset()  # statuses that the case may stop with
+    names: str = ""  # text that the message of a refusal must contain
 
     def __str__(self) -> str:
         detail = "" if self.statuses == HONEST else "/".join(sorted(self.statuses)) or self.names
@@ -64,7 +64,7 @@ EITHER = Promise(Expected.EITHER, HONEST)
 
 
 def stopped(status: str, names: str = "") -> Promise:
-    """Return the promise of an end with a status."""
+    """Return the promise of a stop with a status."""
     return Promise(Expected.STOPPED, frozenset({status}), names)
 
 
@@ -78,73 +78,84 @@ def refusal(names: str) -> Promise:
 
 @dataclass
 class Attempt:
-    """What a case came to."""
+    """Actual outcome of a case."""
 
-    status: str  # of the result, or `refused`, or what a simulation says
-    residual: float | None = None  # independent and relative; None where there is none
+    status: str  # status of the result, `refused`, or the message of a simulation
+    residual: float | None = None  # independent and relative; None if there is none
     seconds: float = 0.0  # wall time [s]
-    message: str = ""  # of a refusal or a failed step
-    faults: list[str] = field(default_factory=list)  # what is wrong whatever was expected
+    message: str = ""  # message of a refusal or a failed step
+    # Faults that do not depend on the expected outcome.
+    faults: list[str] = field(default_factory=list)
     met: bool = False  # whether the independent residual meets the tolerance
-    facts: dict[str, Any] = field(default_factory=dict)  # what else a record keeps
-    # processor time [s] with what is judged; unknown where a GPU does the work
+    facts: dict[str, Any] = field(default_factory=dict)  # further entries of the record
+    # CPU time [s] including the judgement; infinite on a GPU.
     processor: float = math.inf
 
     @property
     def spent(self) -> float:
-        """Seconds that count against a budget: other programs on the machine lengthen the wall time alone."""
+        """Seconds that count against a budget.
+
+        The CPU time counts where it is known, since other programs on the machine lengthen the wall
+        time alone.
+        """
         return min(self.seconds, self.processor)
 
     @property
     def at(self) -> str:
-        """The residual in words."""
+        """Residual as text."""
         return "" if self.residual is None else f" at {self.residual:.1e}"
 
 
 @dataclass(frozen=True)
 class Case(ABC):
-    """What can be attempted; subclasses try."""
+    """Base class of cases; subclasses implement `tried`."""
 
     family: str  # the cases that share an expectation
     name: str  # unique in its family
     _: KW_ONLY
-    expected: Promise = SOLVED  # what it must come to,
-    # in these precisions something else
+    expected: Promise = SOLVED  # expected outcome
+    # Other expected outcomes, by precision.
     promises: Mapping[str, Promise] = field(default_factory=dict)
-    budget: float = BUDGET  # seconds that a precision may take
-    precisions: tuple[str, ...] = PRECISIONS  # those in which it is tried
+    budget: float = BUDGET  # CPU seconds that a precision may take
+    precisions: tuple[str, ...] = PRECISIONS  # precisions in which the case runs
 
     def promise(self, precision: str) -> Promise:
-        """Return what it must come to."""
+        """Return the expected outcome in a precision."""
         return self.promises.get(precision, self.expected)
 
     def attempt(self, precision: str, device: str) -> Attempt:
-        """Try; a ValueError is a refusal, other errors are the status by their names."""
-        begun = time.perf_counter()
+        """Run the case and turn exceptions into outcomes.
+
+        A ValueError is a refusal. Other errors give a status with their names.
+        """
+        start_time = time.perf_counter()
         try:
             attempt = self.tried(precision, device)
-            attempt.seconds = attempt.seconds or time.perf_counter() - begun
+            attempt.seconds = attempt.seconds or time.perf_counter() - start_time
             return attempt
         except (ValueError, *BROKEN) as error:
             broken = isinstance(error, BROKEN)
             return Attempt(
                 type(error).__name__ if broken else REFUSED,
-                seconds=time.perf_counter() - begun,
+                seconds=time.perf_counter() - start_time,
                 message=str(error),
             )
 
     @abstractmethod
     def tried(self, precision: str, device: str) -> Attempt:
-        """Return what comes of it."""
+        """Run the case and return its outcome."""
 
 
 class OverBudgetError(Exception):
-    """A case takes longer than it may."""
+    """Error of a case that exceeds its budget."""
 
 
 @contextmanager
 def interrupted_after(seconds: float) -> Iterator[None]:
-    """Interrupt what takes longer, at the next instruction of Python."""
+    """Raise OverBudgetError in the enclosed code after some seconds.
+
+    The error is raised at the next instruction of Python.
+    """
 
     def ring(number: int, frame: FrameType | None) -> None:
         raise OverBudgetError
@@ -160,39 +171,42 @@ def interrupted_after(seconds: float) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SolveCase(Case):
-    """A problem given to a method and those that take over, in the precisions it has; "double" if it has no choice."""
+    """Problem solved by a method and its fallbacks.
+
+    It runs in all precisions of the method, or in "double" if the method has no such setting.
+    """
 
     problem: Callable[[], Problem]  # makes the problem
-    method: str = "projected-multigrid"  # of `wl.METHODS`
+    method: str = "projected-multigrid"  # a name of `wl.METHODS`
     _: KW_ONLY
     precisions: tuple[str, ...] = ()
-    # criteria besides rtol and max_iterations, or instead of them
+    # Criteria in addition to rtol and max_iterations, or in their place.
     stopping: Mapping[str, Any] = field(default_factory=dict)
-    x0: np.ndarray | None = None  # a guess
-    # stands in for `wl.solve`, where something wrong is to be caught
+    x0: np.ndarray | None = None  # initial guess
+    # Replaces `wl.solve` in tests of the checks.
     solve: Callable[..., wl.SolveResult] = wl.solve
-    alone: bool = False  # whether the method's default chain is left out
+    alone: bool = False  # whether the method runs without its fallbacks
 
     def __post_init__(self) -> None:
-        """Fill in the precisions."""
+        """Set the precisions."""
         fields = {field.name for field in dataclasses.fields(wl.METHODS[self.method])}
         object.__setattr__(self, "precisions", PRECISIONS if "precision" in fields else ("double",))
 
     def tried(self, precision: str, device: str) -> Attempt:
-        """Solve, and compare what the result says with the independent residual."""
+        """Solve and compare the reported with the independent residual."""
         criteria: dict[str, Any] = {
             "rtol": RTOL[precision],
             "max_iterations": MAX_ITERATIONS,
             **self.stopping,
         }
         problem, method = self.problem(), wl.METHODS[self.method]
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         solver = method(precision=precision) if self.precisions == PRECISIONS else method()
         lcp = problem.lcp(device, wp.float32 if precision == "single" else wp.float64)
         solver = solver if self.alone else wl.default_chain(solver, lcp)
         result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
         wp.synchronize_device(device)
-        return checked(problem, result, criteria, time.perf_counter() - begun, precision)
+        return checked(problem, result, criteria, time.perf_counter() - start_time, precision)
 
 
 def checked(
@@ -202,7 +216,7 @@ def checked(
     seconds: float,
     precision: str,
 ) -> Attempt:
-    """Return the attempt that a result is, with all that NumPy finds wrong about it."""
+    """Return the attempt of a result, with all faults that NumPy finds."""
     exact, x = problem.exact(), problem.unknowns(result.x.numpy())
     if not np.isfinite(x).all():
         return Attempt(result.status.name, None, seconds, faults=["x is not finite"])
@@ -215,29 +229,29 @@ def checked(
     rounding = 32 * np.finfo(np.float64).eps * sizes
     if problem.rounded(wp.float32 if single else wp.float64):
         rounding += 4 * EPS * sizes
-    wanted = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
-    met = own <= wanted * (1 + 1e-6) + rounding
+    required = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
+    met = own <= required * (1 + 1e-6) + rounding
     faults = []
     if result and not met:
-        faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {wanted:.1e}")
-    # a result in single precision is rounded once more where it sits at a bound that is no float32
-    # number
+        faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {required:.1e}")
+    # A result in single precision is rounded once more where it sits at a bound that is no float32
+    # number.
     returned = 0.5 * EPS * sizes if single else 0.0
-    # its norm may overflow where the scaled one does not
+    # The norm of the residual may overflow where the scaled one does not.
     known = np.isfinite(own) and result.status is not wl.SolveStatus.NON_FINITE
-    # projected multigrid scales by the diagonal without the bodies' term: any d > 0 has the same
-    # zeros
+    # Projected multigrid scales by the diagonal without the term of the bodies. The natural
+    # residual has the same zeros for any d > 0.
     says = [
         abs(result.residual - of) <= AGREES * of + rounding + returned
         for of in (own, exact.residual(x, bodies=False))
     ]
     if known and not any(says):
         faults.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
-    # bounds are rounded as x is
+    # Bounds are rounded as x is.
     beyond = np.maximum(exact.lower - x, x - exact.upper) - (EPS * np.abs(x) if single else 0.0)
     if result and (beyond > 0).any():
         faults.append(f"x is {beyond.max():.1e} outside its bounds")
-    if not result and own < 0.99 * wanted - rounding:
+    if not result and own < 0.99 * required - rounding:
         faults.append(f"{result.status.name} at a solution")
     return Attempt(
         result.status.name,
@@ -250,24 +264,24 @@ def checked(
 
 @dataclass(frozen=True)
 class RefusalCase(Case):
-    """A call that must raise ValueError before anything is solved."""
+    """Call that must raise ValueError before any solve."""
 
     call: Callable[[str, str], object]  # takes device and precision
-    names: str  # what the message must contain: the argument
+    names: str  # name of the argument, which the message must contain
 
     def promise(self, precision: str) -> Promise:
-        """Return the refusal."""
+        """Return the promise of a refusal."""
         return refusal(self.names)
 
     def tried(self, precision: str, device: str) -> Attempt:
-        """Call."""
+        """Make the call."""
         made = self.call(device, precision)
         return Attempt(made.status.name if isinstance(made, wl.SolveResult) else "accepted")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A case in one precision: what was expected, what came, and what is wrong with that."""
+    """One case in one precision: expected and actual outcome, and faults."""
 
     case: Case
     precision: str
@@ -277,17 +291,20 @@ class Verdict:
 
     @property
     def name(self) -> str:
-        """Unique among the verdicts."""
+        """Name, unique among the verdicts."""
         return f"{self.case.family}: {self.case.name}, {self.precision}"
 
     @property
     def outcome(self) -> str:
-        """What it came to, in words."""
+        """Actual outcome as text."""
         return "as expected" if not self.wrong else "; ".join(self.wrong)
 
 
 def judge(case: Case, precision: str, device: str) -> Verdict:
-    """Attempt a case and say what is wrong with what it comes to; one over its budget is tried again, kernels compile in the first."""
+    """Run a case and return its verdict.
+
+    A case over its budget runs again, since the first run may compile kernels.
+    """
     promise, attempt = case.promise(precision), in_time(case, precision, device)
     if attempt.spent > case.budget and attempt.status != OUT_OF_TIME:
         attempt = in_time(case, precision, device)
@@ -298,20 +315,20 @@ def judge(case: Case, precision: str, device: str) -> Verdict:
 
 
 def in_time(case: Case, precision: str, device: str) -> Attempt:
-    """Attempt a case; what takes far longer than its budget is interrupted."""
-    begun, processor = time.perf_counter(), time.process_time()
+    """Run a case; interrupt it far beyond its budget."""
+    start_time, processor = time.perf_counter(), time.process_time()
     try:
-        with interrupted_after(LAST_CALL * case.budget + 60.0):  # a minute for compilers
+        with interrupted_after(LAST_CALL * case.budget + 60.0):  # one minute more for compilers
             attempt = case.attempt(precision, device)
         if not wp.get_device(device).is_cuda:
             attempt.processor = time.process_time() - processor
         return attempt
     except OverBudgetError:
-        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - begun)
+        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - start_time)
 
 
 def violations(promise: Promise, attempt: Attempt) -> list[str]:
-    """Return what is wrong with an attempt for a promise."""
+    """Return the faults of an attempt for a promise."""
     wrong, status, expected = list(attempt.faults), attempt.status, promise.expected
     if expected is Expected.CAUGHT:
         return [] if wrong or status != "CONVERGED" else ["a wrong solver passes"]

@@ -1,4 +1,4 @@
-"""Families of coefficients: slivers, contrasts over many decades, flat cells, and rigid bodies of any mass."""
+"""Hostile coefficients: slivers, contrasts, flat cells, bodies of any mass."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full,
 
 SHAPES = ((48, 53), (17, 18, 19))
 Y, X = np.indices((48, 50))
-ROUGH = {"rtol": 1e-6}  # where the matrix's own rounding is felt: 12 decades beside each other
+# Limited by the matrix's own rounding: neighboring entries differ by 12 decades.
+ROUGH = {"rtol": 1e-6}
 SINGLE_MAY_STOP = {"single": EITHER}
 MIXED_MAY_STOP = {"single": EITHER, "mixed": EITHER}
-# Documented limits: corrections of float32 know a cell's diagonal to 6e-8 of it, and what holds a
-# light region to less than the contrast
+# Documented limit: float32 corrections resolve a cell's diagonal to 6e-8 of it, and the coupling of
+# a light region only up to this contrast.
 LARGEST_CONTRAST = 1e4
-# 1/mass beyond which float32 does not tell the force on a body from the pressures that it is the
-# difference of
+# Largest 1/mass: beyond it float32 cannot resolve the force on a body as a difference of pressures.
 LIGHTEST = 1e6
 
 
 def may_stop(value: float, largest: float) -> dict[str, Any]:
-    """Return what is promised of a ratio whose documented limit is `largest`."""
+    """Return the promise for a ratio whose documented limit is `largest`."""
     return {"promises": SINGLE_MAY_STOP if value <= largest else MIXED_MAY_STOP, "stopping": ROUGH}
 
 
@@ -49,7 +49,7 @@ def slivers() -> Iterator[Case]:
 
 
 def sprinkled(shape: tuple[int, ...], smallest: float) -> GridProblem:
-    """Return a pool with a few faces all but closed."""
+    """Return a pool with a few nearly closed faces."""
     draw = chance(5)
     return pool(
         shape,
@@ -58,7 +58,10 @@ def sprinkled(shape: tuple[int, ...], smallest: float) -> GridProblem:
 
 
 def uniform_fractions(shape: tuple[int, ...]) -> GridProblem:
-    """Return a pool with random fractions, a tenth of them 0; p >= 0 everywhere, so that enclosed cells with outflow have a solution."""
+    """Return a pool with random open fractions, a tenth of them 0.
+
+    p >= 0 everywhere, so that enclosed cells with outflow have a solution.
+    """
     draw = chance(6)
     return pool(
         shape,
@@ -69,7 +72,10 @@ def uniform_fractions(shape: tuple[int, ...]) -> GridProblem:
 
 
 def behind_a_gap(fraction: float) -> GridProblem:
-    """Return two halves, one with air, joined by one face open by `fraction`; b that asks the gap for a flow in proportion to it."""
+    """Return two halves, one with air, joined by one face open by `fraction`.
+
+    b requires a flow through the gap in proportion to its fraction.
+    """
     shape = (32, 64)
     cells, faces, b = np.full(shape, FLUID), faces_of(shape, np.ones), noise(shape)
     cells[-1, 32:] = AIR
@@ -80,7 +86,10 @@ def behind_a_gap(fraction: float) -> GridProblem:
 
 
 def lone_cells(fraction: float) -> GridProblem:
-    """Return a pool with cells all of whose faces are open by `fraction` only, and b in proportion."""
+    """Return a pool with cells whose faces are all open by `fraction` only.
+
+    b is in proportion to it in these cells.
+    """
     shape = (40, 40)
     faces, b = faces_of(shape, np.ones), noise(shape)
     for j in range(3, 36, 4):
@@ -90,23 +99,29 @@ def lone_cells(fraction: float) -> GridProblem:
 
 
 def ghost_fluid(theta: float) -> GridProblem:
-    """Return a pool whose surface lies at random distances from cell centers, down to `theta` of a cell."""
+    """Return a pool whose surface lies at random distances from cell centers.
+
+    The smallest distance is `theta` of a cell.
+    """
     faces = faces_of((40, 44), np.ones)
     faces["face_y"][-2] = 1 / np.maximum(theta, 10 ** chance(8).uniform(np.log10(theta), 0, 44))
     return pool((40, 44), faces=faces)
 
 
 def contrasts() -> Iterator[Case]:
-    """Yield coefficients over 12 decades, densities to 10^8 to 1, and cells a thousand times flatter than wide."""
+    """Yield coefficients of 12 decades, density ratios of 10^8 and very flat cells.
+
+    The cells are up to a thousand times flatter than wide.
+    """
     case = partial(given, "contrasts")
     for ratio in (1e2, 1e4, 1e6, 1e8):
         for name, light in (
             ("layers", (Y // 6) % 2 == 1),
             ("bubbles", np.hypot(Y % 16 - 7.5, X % 16 - 7.5) < 5),
         ):
-            made = partial(pool, Y.shape, faces=harmonic(np.where(light, 1.0, 1 / ratio)))
+            make_problem = partial(pool, Y.shape, faces=harmonic(np.where(light, 1.0, 1 / ratio)))
             yield from case(
-                f"{name} of density 1:{ratio:g}", made, **may_stop(ratio, LARGEST_CONTRAST)
+                f"{name} of density 1:{ratio:g}", make_problem, **may_stop(ratio, LARGEST_CONTRAST)
             )
     for shape in SHAPES:
         for decades, expected in ((4, SOLVED), (12, EITHER)):
@@ -122,9 +137,12 @@ def contrasts() -> Iterator[Case]:
                     partial(pool, shape, faces={f"face_{axis}": ratio}),
                 )
     for low, high in ((-6, 6), (0, 12), (-12, 0)):
-        made = partial(full, (40, 44), shift=10 ** chance(10).uniform(low, high, (40, 44)))
+        make_problem = partial(full, (40, 44), shift=10 ** chance(10).uniform(low, high, (40, 44)))
         yield from case(
-            f"shift from 1e{low} to 1e{high}", made, promises=SINGLE_MAY_STOP, stopping=ROUGH
+            f"shift from 1e{low} to 1e{high}",
+            make_problem,
+            promises=SINGLE_MAY_STOP,
+            stopping=ROUGH,
         )
     for scale in (1e-12, 1e12, 1e-30, 1e30):
         yield from case(
@@ -134,7 +152,7 @@ def contrasts() -> Iterator[Case]:
 
 
 def harmonic(cell: np.ndarray) -> dict[str, np.ndarray]:
-    """Return faces with the harmonic mean of the cells beside them."""
+    """Return face coefficients: harmonic means of the adjacent cells."""
     across = [
         np.concatenate([c[:1], 2 * c[1:] * c[:-1] / (c[1:] + c[:-1]), c[-1:]])
         for c in (cell.T, cell)
@@ -143,7 +161,7 @@ def harmonic(cell: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def decades_of(shape: tuple[int, ...], decades: int) -> GridProblem:
-    """Return a pool of coefficients that are random over so many decades, face by face."""
+    """Return a pool of random face coefficients over so many decades."""
     draw = chance(9)
     return pool(
         shape,
@@ -152,7 +170,10 @@ def decades_of(shape: tuple[int, ...], decades: int) -> GridProblem:
 
 
 def bodies() -> Iterator[Case]:
-    """Yield rigid bodies in the liquid, as a term U W U' of masses from 10^-8 to 10^8 of the liquid's."""
+    """Yield rigid bodies in the liquid, as a term U W U'.
+
+    Their masses are 10^-8 to 10^8 of the liquid's.
+    """
     case = partial(given, "rigid bodies")
     for inverse in (1e-8, 1e-4, 1.0, 1e4, 1e8):
         yield from case(
@@ -176,15 +197,18 @@ def bodies() -> Iterator[Case]:
             **may_stop(inverse, LIGHTEST),
         )
     yield from case("heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
-    # of a body in air
+    # The term of a body in air.
     yield from case("a column that touches nothing", lambda: with_column(swimming([1.0]), 0.0, 1e8))
-    # of a body counted twice
+    # The term of a body counted twice.
     yield from case("two equal columns", lambda: with_column(swimming([10.0]), 1.0, 3.0))
     yield from case("a piston closes a chamber", piston)
 
 
 def swimming(inverse_masses: Sequence[float]) -> GridProblem:
-    """Return a pool around square bodies: solid cells, whose pressure force along x and y is a column each."""
+    """Return a pool around square bodies.
+
+    Bodies are solid cells; each has a column for its pressure force along x and one along y.
+    """
     problem, n = pool((48, 50)), 8
     cells, U = problem.cells.copy(), np.zeros((*problem.cells.shape, len(inverse_masses), 2))
     for number in range(len(inverse_masses)):
@@ -201,7 +225,7 @@ def swimming(inverse_masses: Sequence[float]) -> GridProblem:
 
 
 def swimming_3d(inverse_masses: Sequence[float]) -> GridProblem:
-    """Return bodies of three cells a side in a 3-D pool, each moving along y."""
+    """Return cubic bodies, three cells a side, in a 3-D pool, each moving along y."""
     problem = pool((14, 15, 24))
     cells, U = problem.cells.copy(), np.zeros((*problem.cells.shape, len(inverse_masses)))
     for number in range(len(inverse_masses)):
@@ -212,7 +236,10 @@ def swimming_3d(inverse_masses: Sequence[float]) -> GridProblem:
 
 
 def with_column(made: GridProblem, factor: float, weight: float) -> GridProblem:
-    """Return the problem with its first column once more, times a factor: the columns are linearly dependent."""
+    """Return the problem with its first column repeated, times a factor.
+
+    The columns are then linearly dependent.
+    """
     assert made.columns is not None
     assert made.weights is not None
     weights = np.diag([*made.weights.diagonal(), weight])
@@ -224,7 +251,10 @@ def with_column(made: GridProblem, factor: float, weight: float) -> GridProblem:
 
 
 def piston() -> GridProblem:
-    """Return a chamber without air whose one wall is a body: its constants are no null space."""
+    """Return a chamber without air, one of whose walls is a body.
+
+    Its constants are not in the null space.
+    """
     cells = np.full((20, 40), FLUID)
     cells[:, 19] = SOLID
     cells[-1, 20:] = AIR

@@ -1,9 +1,12 @@
-"""A x + b of hostile problems and its natural residual, assembled anew in float64: no code of the library takes part.
+"""Independent A x + b and natural residual of hostile problems, in float64.
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i), diag(r) A diag(c)
-equilibrated: |A_ii| where no transversal of A has a larger product than the diagonal, else that of
-columns scaled to 1, then rows; 1 for empty rows and columns. Norms are scaled by their largest
-entry, so that squares neither overflow nor vanish.
+Everything is assembled without code of the library. The natural residual is
+
+    r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)),   d_i = 1 / (s_i c_i),
+
+where diag(s) A diag(c) is equilibrated. d_i is |A_ii| if no transversal of A has a larger product
+than the diagonal; otherwise it is that of columns scaled to 1, then rows. d_i is 1 for empty rows
+and columns. Norms are scaled by their largest entry, so that squares neither overflow nor vanish.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Exact:
-    """The equations of the unknowns alone, in float64."""
+    """Equations of the unknowns alone, in float64."""
 
     matrix: Any  # sparse, shape (n, n)
     b: np.ndarray  # shape (n,), units of y
@@ -34,16 +37,16 @@ class Exact:
 
     @property
     def start(self) -> np.ndarray:
-        """clip(0, l, u)."""
+        """Clipped zero: clip(0, l, u)."""
         return np.clip(np.zeros(len(self.b)), self.lower, self.upper)
 
     @cached_property
     def scale(self) -> np.ndarray:
-        """The matrix's d."""
+        """Scale d of the natural residual, from the matrix."""
         return equilibrated_scale(self.matrix)
 
     def diagonal(self, *, bodies: bool = True) -> np.ndarray:
-        """Return d; without the term of bodies, which is semi-definite, if so asked."""
+        """Return d, without the semi-definite term of the bodies if `bodies` is False."""
         if self.columns is None or self.weights is None:
             return self.scale
         d = np.asarray(self.matrix.diagonal(), dtype=np.float64)
@@ -52,7 +55,10 @@ class Exact:
         return np.where(d == 0.0, 1.0, np.abs(d))
 
     def residual(self, x: np.ndarray, *, bodies: bool = True) -> float:
-        """Return the norm of the natural residual at x, shape (n,); `bodies` as of `diagonal`, which scales it alone."""
+        """Return the norm of the natural residual at x, shape (n,).
+
+        `bodies` is that of `diagonal` and affects the scale alone.
+        """
         d = self.diagonal(bodies=bodies)
         y = self.matrix @ x + self.b
         if self.columns is not None:
@@ -60,7 +66,10 @@ class Exact:
         return norm(d * (x - np.clip(x - y / d, self.lower, self.upper)))
 
     def sizes(self, x: np.ndarray) -> float:
-        """Return || (d + |A|) |x| + |b| ||: what rounding errors of a residual are in proportion to."""
+        """Return || (d + |A|) |x| + |b| ||.
+
+        Rounding errors of a residual are proportional to it.
+        """
         size = abs(self.matrix) @ np.abs(x) + self.diagonal() * np.abs(x) + np.abs(self.b)
         if self.columns is not None and self.weights is not None:
             size = size + np.abs(self.columns) @ (
@@ -70,7 +79,14 @@ class Exact:
 
 
 def equilibrated_scale(matrix: Any) -> np.ndarray:
-    """Return the d of a matrix's natural residual, by SciPy's matching where entries are larger than their rows' and columns' diagonals."""
+    """Return the scale d of a matrix's natural residual.
+
+    The cost of an entry is log(sqrt(|a_ii a_jj|) / |a_ij|). The cost of the diagonal is 0, and a
+    transversal has a negative cost if its product is larger than that of the diagonal. A matching
+    is computed only if some cost is negative. Without a larger transversal d_i = |a_ii|. Otherwise
+    q_j is the largest entry of a column, t_i the largest of a row after the division by q, and d =
+    q t.
+    """
     A = scipy.sparse.csr_array(matrix, dtype=np.float64)
     A.eliminate_zeros()
     entries, d = A.tocoo(), np.abs(A.diagonal())
@@ -78,7 +94,6 @@ def equilibrated_scale(matrix: Any) -> np.ndarray:
     empty = (np.diff(A.indptr) == 0) & (np.bincount(column, minlength=len(d)) == 0)
     if (d[~empty] > 0).all():
         one = np.where(empty, 1.0, d)
-        # 0 on the diagonal
         cost = np.log(np.sqrt(one[row])) + np.log(np.sqrt(one[column])) - np.log(size)
         if (cost >= -1e-6).all() or _least_cost(
             cost, row, column, np.flatnonzero(empty), len(d)
@@ -95,8 +110,12 @@ def equilibrated_scale(matrix: Any) -> np.ndarray:
 def _least_cost(
     cost: np.ndarray, row: np.ndarray, column: np.ndarray, alone: np.ndarray, n: int
 ) -> float:
-    """Return the cost of the cheapest matching of rows and columns, `alone` with themselves at no cost; dense, O(n^3)."""
-    table = np.full((n, n), 4.0 * n * (float(np.abs(cost).max()) + 1.0))  # as good as forbidden
+    """Return the least cost of matching rows and columns, dense in O(n^3).
+
+    `alone`: rows and columns that are matched with themselves at no cost.
+    """
+    # The other entries are practically forbidden.
+    table = np.full((n, n), 4.0 * n * (float(np.abs(cost).max()) + 1.0))
     table[row, column], table[alone, alone] = cost, 0.0
     return float(table[linear_sum_assignment(table)].sum())
 
@@ -115,15 +134,16 @@ def stencil(
     shift: Any = None,
     periodic: tuple[bool, ...] = (False, False, False),
 ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
-    """Return the matrix of the FLUID cells and which cells those are, flat, from the definition face by face.
+    """Return the matrix of the FLUID cells, and which cells these are, flat.
 
-    A face has the coefficient c, adds c to the diagonal of each FLUID cell beside it and -c between
-    two; SOLID on a side closes it, and so does the array's end unless the axis is periodic.
+    It is assembled face by face from the definition. A face with the coefficient c adds c to the
+    diagonal of each FLUID cell beside it, and -c between two of them. A SOLID cell on one side
+    closes the face. The end of the array closes it too, unless the axis is periodic.
 
     Args:
         cells: AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx).
         faces: `face_x`, `face_y`, `face_z`: numbers or arrays with one face more along their axis;
-            1 where there is none.
+            1 by default.
         shift: added to the diagonal, a number or shape of `cells`.
         periodic: whether x, y, z wrap around.
     """

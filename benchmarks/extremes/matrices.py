@@ -1,4 +1,8 @@
-"""Families of matrices: zero eigenvalues, empty rows, cycling P-matrices, and those on which pivoting methods take 2^n steps."""
+"""Hostile matrices.
+
+The families are zero eigenvalues, empty rows, P-matrices on which Newton's method cycles, and
+matrices on which pivoting methods take 2^n steps.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +24,17 @@ MAY_STOP = {"single": EITHER}
 
 
 def singular() -> Iterator[Case]:
-    """Yield symmetric positive semi-definite matrices with a null space, and matrices of a few numbers."""
+    """Yield singular symmetric positive semi-definite matrices, and tiny matrices."""
     case = partial(given, "zero eigenvalues")
     for rank in (1, N // 2, N - 1):
-        made = partial(MatrixProblem.of, semidefinite(N, zeros=1 - rank / N))
+        make_problem = partial(MatrixProblem.of, semidefinite(N, zeros=1 - rank / N))
         methods, expected = (
             (*NEWTON, "mprgp", "interior-point", *PIVOTING, *LEMKE),
             EITHER if rank == 1 else SOLVED,
         )
         yield from case(
             f"dense of rank {rank}, b in its range",
-            made,
+            make_problem,
             methods,
             expected=expected,
             promises=MAY_STOP,
@@ -72,7 +76,7 @@ def singular() -> Iterator[Case]:
 
 
 def ring() -> MatrixProblem:
-    """Return the Laplacian of a ring with b that adds up to more than 0."""
+    """Return the Laplacian of a ring with b of positive sum."""
     n, one = 50, np.eye(50)
     b = chance(21).standard_normal(n)
     return MatrixProblem(
@@ -82,14 +86,17 @@ def ring() -> MatrixProblem:
 
 
 def empty_row(b: float) -> MatrixProblem:
-    """Return a regular matrix with a row and column of zeros in it."""
+    """Return a regular matrix with one row and column of zeros added."""
     A = np.diag([2.0, 3.0, 0.0, 4.0])
     A[0, 1] = A[1, 0] = -1.0
     return MatrixProblem(matrix=scipy.sparse.csr_array(A), b=np.array([-1.0, -2.0, b, 1.0]))
 
 
 def nearly(small: float) -> MatrixProblem:
-    """Return a matrix with eigenvalues from `small` to 1 and a solution that its small ones take part in."""
+    """Return a matrix with eigenvalues from `small` to 1.
+
+    The eigenvectors of the small eigenvalues contribute to the solution.
+    """
     draw = chance(22)
     A = spectrum_matrix(np.geomspace(small, 1.0, N), draw)
     x = np.where(draw.random(N) < 0.4, 0.0, draw.uniform(0.1, 1.0, N))
@@ -97,7 +104,10 @@ def nearly(small: float) -> MatrixProblem:
 
 
 def cycling() -> Iterator[Case]:
-    """Yield P-matrices on which Newton's method with the minimum map goes round in circles, and those that take pivots 2^n steps."""
+    """Yield P-matrices on which Newton's method cycles or pivoting takes 2^n steps.
+
+    The Newton method is that of the minimum map.
+    """
     case = partial(given, "P-matrices")
     robust: Any = (*NEWTON, "fischer-newton", *LEMKE)
     for n in (3, 4, 5, 6, 7, 9, 12, 30):
@@ -125,18 +135,24 @@ def cycling() -> Iterator[Case]:
 
 
 def circulant(n: int) -> MatrixProblem:
-    """Return I plus a cyclic shift by 2 where n is odd, 0.9 where it is even: P-matrices [Ben Gharbia & Gilbert 2012], b < 0."""
+    """Return I plus a cyclic shift by 2 if n is odd, by 0.9 if n is even; b < 0.
+
+    They are P-matrices [Ben Gharbia & Gilbert 2012].
+    """
     return MatrixProblem(
         matrix=np.eye(n) + (2.0 if n % 2 else 0.9) * np.roll(np.eye(n), 1, axis=1), b=-np.ones(n)
     )
 
 
 def murty(n: int, *, times_transposed: bool = False) -> MatrixProblem:
-    """Return Murty's P-matrix M, 1 on the diagonal and 2 below, on which principal pivoting visits 2^n bases; or Fathi's M M'."""
+    """Return Murty's P-matrix M, or Fathi's M M'.
+
+    M has 1 on the diagonal and 2 below. Principal pivoting visits 2^n bases on it.
+    """
     M = np.eye(n) + 2 * np.tril(np.ones((n, n)), -1)
     return MatrixProblem(matrix=M @ M.T if times_transposed else M, b=-np.ones(n))
 
 
 def unsymmetric(seed: int) -> MatrixProblem:
-    """Return a P-matrix with a positive definite symmetric part and a large skew one."""
+    """Return a P-matrix with a definite symmetric part and a large skew part."""
     return MatrixProblem.of(skewed(N, skew=2.0, seed=seed))

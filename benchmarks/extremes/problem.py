@@ -1,4 +1,7 @@
-"""Problems as NumPy arrays: what the library is given, what the independent residual is computed from, and when there is a solution."""
+"""Hostile problems as NumPy arrays, and their solvability.
+
+Both the library's problem and the independent residual are made from the same arrays.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +18,18 @@ import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.exact import Exact, stencil
 
-BALANCED = 1e-10  # of sum |b|: sums of b that are 0 but for rounding
-# of the mean |b|: what a pool's b is raised by where its sum has the sign that no bound takes up
+BALANCED = 1e-10  # share of sum |b|: a sum of b below it is 0 up to rounding
+# Share of the mean |b| that is added to a pool's b if its sum has the sign that no bound can
+# balance.
 GENTLY = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridProblem:
-    """Cells with face coefficients, bounds, and perhaps rigid bodies as a term U W U'."""
+    """Grid problem: cells, face coefficients, bounds, optional rigid bodies U W U'."""
 
     cells: np.ndarray  # AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx)
-    b: np.ndarray  # field
+    b: np.ndarray  # field of the shape of `cells`
     lower: Any = 0.0  # number or field
     upper: Any = np.inf  # number or field
     faces: Mapping[str, Any] = field(default_factory=dict)  # `face_x` and so on, numbers or arrays
@@ -35,7 +39,10 @@ class GridProblem:
     weights: np.ndarray | None = None  # W, shape (k, k)
 
     def lcp(self, device: str, storage: Any) -> wl.LCP:
-        """Return it for the library; `storage` is the type of coefficients, wp.float32 or wp.float64."""
+        """Return the problem for the library.
+
+        `storage` is the type of coefficients, wp.float32 or wp.float64.
+        """
         A: Any = wl.GridPoisson(
             self.cells,
             shift=self.shift,
@@ -49,7 +56,7 @@ class GridProblem:
         return wl.LCP(A, self.b, self.lower, self.upper)
 
     def exact(self) -> Exact:
-        """Return it for the independent residual."""
+        """Return the problem for the independent residual."""
         matrix, fluid = stencil(self.cells, self.faces, self.shift, self.periodic)
         b, lower, upper = (
             np.broadcast_to(f, self.cells.shape).ravel()[fluid].astype(np.float64)
@@ -79,7 +86,7 @@ class GridProblem:
 
 @dataclass(frozen=True, kw_only=True)
 class MatrixProblem:
-    """A dense or sparse matrix with bounds."""
+    """Dense or sparse matrix problem with bounds."""
 
     matrix: Any
     b: np.ndarray
@@ -88,19 +95,19 @@ class MatrixProblem:
 
     @staticmethod
     def of(problem: gallery.Problem | Exact) -> MatrixProblem:
-        """Return a problem of the gallery, or that of a grid."""
+        """Return a problem of the gallery; one on a grid as GridProblem."""
         matrix = problem.matrix if isinstance(problem, Exact) else problem.A
         return MatrixProblem(matrix=matrix, b=problem.b, lower=problem.lower, upper=problem.upper)
 
     def lcp(self, device: str, storage: Any) -> wl.LCP:
-        """Return it for the library."""
+        """Return the problem for the library."""
         kind = wl.SparseOperator if scipy.sparse.issparse(self.matrix) else wl.DenseOperator
         return wl.LCP(
             kind(self.matrix, device=device, dtype=storage), self.b, self.lower, self.upper
         )
 
     def exact(self) -> Exact:
-        """Return it for the independent residual."""
+        """Return the problem for the independent residual."""
         lower, upper = (
             np.broadcast_to(f, self.b.shape).astype(np.float64) for f in (self.lower, self.upper)
         )
@@ -124,7 +131,7 @@ Problem = GridProblem | MatrixProblem
 
 
 def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Any]) -> dict[str, Any]:
-    """Return arrays of coefficients; `value` takes an array's shape."""
+    """Return arrays of face coefficients; `value` maps an array's shape to its values."""
     axes = list(zip("xyz", range(len(shape))[::-1], strict=False))
     return {
         f"face_{name}": value(tuple(n + (q == axis) for q, n in enumerate(shape)))
@@ -133,7 +140,7 @@ def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Any]) ->
 
 
 def with_solution(cells: np.ndarray, x: np.ndarray, y: np.ndarray) -> GridProblem:
-    """Return a problem with p >= 0 whose solution is x on the FLUID cells, with A x + b = y."""
+    """Return a problem with p >= 0 and solution x on FLUID cells, A x + b = y."""
     made, inside = GridProblem(cells=cells, b=np.zeros(cells.shape)), cells == wl.FLUID
     made.b[inside] = y[inside] - made.exact().matrix @ x[inside]
     return made
@@ -141,11 +148,14 @@ def with_solution(cells: np.ndarray, x: np.ndarray, y: np.ndarray) -> GridProble
 
 @dataclass(frozen=True)
 class Pools:
-    """Connected unknowns, and which of them no AIR, shift or bound holds."""
+    """Connected components of the unknowns, and their solvability.
+
+    A pool is loose if no AIR, shift or bound holds it.
+    """
 
     label: np.ndarray  # pool of each unknown
     loose: np.ndarray  # whether a pool's constants are in the null space, by pool
-    net: np.ndarray  # sum of b, by pool; 0 where that is rounding
+    net: np.ndarray  # sum of b, by pool; 0 if within rounding
     size: np.ndarray  # sum of |b|, by pool
     cells: np.ndarray  # unknowns, by pool
     below: np.ndarray  # whether one of a pool's lower bounds is finite
@@ -166,15 +176,18 @@ class Pools:
 
     @property
     def lost(self) -> np.ndarray:
-        """Pools without a solution: constants lower the energy for ever."""
+        """Pools without a solution: constants lower the energy without bound."""
         return self.loose & (((self.net > 0) & ~self.below) | ((self.net < 0) & ~self.above))
 
 
 def solvable(problem: GridProblem) -> GridProblem:
-    """Return the problem with b moved, on the pools that have no solution, by the least that gives them one and a little more."""
+    """Return the problem with b changed so that every pool has a solution.
+
+    On pools without a solution, b moves by the least amount that gives them one, and a little more.
+    """
     pools = Pools.of(problem.exact())
-    # a sum of 0 is on the verge of having none: where one bound can take up a sign, b gets some of
-    # that sign
+    # If the sum is 0, a solution barely exists. Where only one bound exists, b moves towards the
+    # sign that the bound can balance.
     moved = pools.lost | (pools.loose & (pools.net == 0) & (pools.below ^ pools.above))
     taken_up = pools.below.astype(float) - pools.above
     shift = np.where(
@@ -186,7 +199,10 @@ def solvable(problem: GridProblem) -> GridProblem:
 
 
 def equality(problem: GridProblem) -> GridProblem | None:
-    """Return the problem without bounds, None if it has no solution; where b = 0 solves it at once, that of a constant b."""
+    """Return the problem without bounds; None if it has no solution.
+
+    If b = 0 on all FLUID cells, which makes it trivial, b is replaced by a constant.
+    """
     b = problem.b if np.any(problem.b[problem.cells == wl.FLUID]) else -np.ones(problem.cells.shape)
     free = replace(problem, b=b, lower=-np.inf, upper=np.inf)
     return None if Pools.of(free.exact()).lost.any() else free

@@ -1,4 +1,7 @@
-"""The family of wrong arguments: NaN and infinity anywhere, shapes and signs that cannot be. Each message names its argument."""
+"""Hostile arguments: NaN and infinity, wrong shapes and signs.
+
+Each must be refused with a message that names the argument.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ CELLS = np.array([[1] * 5] * 3 + [[0] * 5])
 
 
 def wrong_arguments() -> Iterator[Case]:
-    """Yield every argument with a value that no method could use."""
+    """Yield every argument with a value that no method can use."""
     for bad in (np.nan, np.inf, -np.inf):
         for name, call in NOT_FINITE.items():
             if not (name == "lower" and bad == -np.inf) and not (name == "upper" and bad == np.inf):
@@ -52,7 +55,7 @@ def run(device: str, p: str, **options: Any) -> wl.SolveResult:
 
 
 def low_rank(device: str, columns: Any, weights: Any) -> wl.SumOperator:
-    """Return a grid with a term of low rank."""
+    """Return a grid with a low-rank term."""
     return wl.SumOperator(grid(device), wl.LowRankOperator(columns, weights, device=device))
 
 

@@ -1,4 +1,4 @@
-"""Families of grids: sizes and masks that leave little or nothing to multigrid."""
+"""Hostile grids: sizes and masks that leave little or nothing to coarsen."""
 
 from __future__ import annotations
 
@@ -21,14 +21,17 @@ from warp_lcp.benchmarks.extremes.problem import GridProblem, solvable
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SEED = 7919
-METHODS = ("projected-multigrid", "minimum-map-newton")  # which must take everything
-LARGE_BUDGET = 60.0  # of 10^6 unknowns
+METHODS = ("projected-multigrid", "minimum-map-newton")  # methods that must solve every grid
+LARGE_BUDGET = 60.0  # seconds for 10^6 unknowns
 
 
 def given(
     family: str, name: str, make: Callable[[], Any], methods: tuple[str, ...] = METHODS, **more: Any
 ) -> Iterator[Case]:
-    """Yield the case for each method; `more` as of SolveCase, `but` holds what single methods come to instead."""
+    """Yield the case for each method.
+
+    `more` holds arguments of SolveCase. Its entry `but` maps a method to another expected outcome.
+    """
     but = more.pop("but", {})
     for method in methods:
         own = {"expected": but[method]} if method in but else {}
@@ -36,7 +39,7 @@ def given(
 
 
 def chance(number: int) -> np.random.Generator:
-    """Return the random numbers of a problem."""
+    """Return the random generator of a problem."""
     return np.random.default_rng(SEED + number)
 
 
@@ -52,7 +55,10 @@ def full(shape: tuple[int, ...], **more: Any) -> GridProblem:
 
 
 def pool(shape: tuple[int, ...], **more: Any) -> GridProblem:
-    """Return liquid with AIR as its topmost layer along y, walls that hold and pull nothing: half of the cells p >= 0."""
+    """Return a pool with AIR as its topmost layer along y.
+
+    On a random half of the cells p >= 0; the others have no bound.
+    """
     cells = np.full(shape, FLUID)
     cells[(..., -1, slice(None))] = AIR
     lower = np.where(chance(1).random(shape) < 0.5, 0.0, -np.inf)
@@ -60,7 +66,7 @@ def pool(shape: tuple[int, ...], **more: Any) -> GridProblem:
 
 
 def grounded(shape: tuple[int, ...]) -> GridProblem:
-    """Return a grid without room for AIR, held by a shift in its first cell."""
+    """Return a grid without AIR, made regular by a shift in its first cell."""
     shift = np.zeros(shape)
     shift.flat[0] = 1.0
     return full(shape, b=noise(shape) if np.prod(shape) > 1 else np.full(shape, -1.5), shift=shift)
@@ -101,7 +107,10 @@ def sizes() -> Iterator[Case]:
 
 
 def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
-    """Return cells of random type, and b that every component without AIR or bound can meet."""
+    """Return cells of random type, and b solvable in every component.
+
+    Components without AIR or bound get a compatible b.
+    """
     draw = chance(2)
     cells = draw.choice([AIR, FLUID, SOLID], shape, p=[(1 - liquid) / 2, liquid, (1 - liquid) / 2])
     return solvable(GridProblem(cells=cells, b=draw.standard_normal(shape)))
@@ -129,7 +138,7 @@ def masks() -> Iterator[Case]:
                 f"checkerboard of liquid and {name}, {len(shape)}-D",
                 partial(checkerboard, shape, other),
             )
-    # LIMITS
+    # Limits of multigrid.
     yield from case("labyrinth 65x65", lambda: labyrinth(65), but={"projected-multigrid": EITHER})
     yield from case("labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
     yield from case("two pools joined by a needle", lambda: needle(64))
@@ -142,7 +151,7 @@ def masks() -> Iterator[Case]:
 
 
 def without_unknowns(kind: int, device: str, precision: str) -> wl.LCP:
-    """Return a problem of cells none of which is liquid."""
+    """Return a problem with no liquid cell."""
     return wl.LCP(wl.GridPoisson(np.full((4, 5), kind), device=device), np.zeros((4, 5)))
 
 
@@ -154,13 +163,16 @@ def single(shape: tuple[int, ...], around: int, b: float) -> GridProblem:
 
 
 def checkerboard(shape: tuple[int, ...], other: int) -> GridProblem:
-    """Return liquid in every second cell; among solid ones each is closed off, so that b >= 0 there."""
+    """Return liquid in every second cell.
+
+    Among SOLID cells each is isolated, so that b >= 0 there.
+    """
     odd, b = np.indices(shape).sum(axis=0) % 2 == 1, noise(shape)
     return GridProblem(cells=np.where(odd, FLUID, other), b=np.abs(b) if other == SOLID else b)
 
 
 def labyrinth(n: int, **more: Any) -> GridProblem:
-    """Return one channel of liquid a cell wide, in bends from the bottom to the top, where it meets air."""
+    """Return one winding channel of liquid, a cell wide, open to air at its end."""
     cells = np.full((n, n), FLUID)
     cells[1::2] = SOLID
     cells[1::4, -1] = cells[3::4, 0] = FLUID
@@ -169,7 +181,10 @@ def labyrinth(n: int, **more: Any) -> GridProblem:
 
 
 def needle(n: int) -> GridProblem:
-    """Return a pool without air, joined to one with air by a channel that is a cell wide and half the grid long."""
+    """Return a pool without air, joined to one with air by a channel.
+
+    The channel is a cell wide and half the grid long.
+    """
     cells = np.full((n, 2 * n), FLUID)
     cells[:, n // 2 : n + n // 2] = SOLID
     cells[n // 3, n // 2 : n + n // 2] = FLUID
@@ -182,7 +197,7 @@ def needle(n: int) -> GridProblem:
 
 
 def chambers(n: int) -> GridProblem:
-    """Return chambers of five cells with walls of one, a hole of one cell in each wall, and air in one of them."""
+    """Return chambers of five cells, joined by single-cell holes, air in one of them."""
     cells = np.full((n, n), FLUID)
     cells[5::6], cells[:, 5::6] = SOLID, SOLID
     cells[5::6, 2::6], cells[2::6, 5::6] = FLUID, FLUID
@@ -193,14 +208,17 @@ def chambers(n: int) -> GridProblem:
 
 
 def punctured(shape: tuple[int, ...]) -> GridProblem:
-    """Return liquid all over but for one cell of air, which alone makes the matrix regular."""
+    """Return liquid with one cell of air, which alone makes the matrix regular."""
     cells = np.full(shape, FLUID)
     cells[tuple(n // 3 for n in shape)] = AIR
     return GridProblem(cells=cells, b=noise(shape), lower=-np.inf)
 
 
 def closed_pools() -> Iterator[Case]:
-    """Yield liquid without air: b that adds up to 0 can be met, others only where a bound lets go."""
+    """Yield closed pools of liquid.
+
+    b of sum 0 is solvable; other b only if a bound separates.
+    """
     case = partial(given, "closed pools")
     for shape in ((48, 53), (17, 18, 19)):
         yield from case(f"compatible, {len(shape)}-D", partial(full, shape, lower=-np.inf))
@@ -230,7 +248,10 @@ def closed_pools() -> Iterator[Case]:
 
 
 def many_pools(net: float) -> GridProblem:
-    """Return 40 pools in a row behind solid walls, b of zero mean in each but for `net` in the last."""
+    """Return 40 pools in a row behind solid walls, b of zero mean in each.
+
+    In the last pool the mean is shifted by `net`.
+    """
     cells = np.full((8, 40 * 7), FLUID)
     cells[:, 6::7] = SOLID
     b = np.where(cells == FLUID, noise(cells.shape), 0.0)

@@ -1,4 +1,7 @@
-"""Families of simulations: time steps, gravity, speeds and particles that no sensible scene has. Nothing may be lost or become NaN."""
+"""Hostile simulations: extreme time steps, gravity, speeds and particles.
+
+No particle may be lost and no value may become NaN.
+"""
 
 from __future__ import annotations
 
@@ -25,41 +28,42 @@ from warp_lcp.simulation import SimulationFailed, StepFailed
 ParticleSimulation = LiquidSimulation | SandSimulation
 DONE = Promise(Expected.DONE)
 STEPS = 5
-BUDGET = 20.0  # seconds of a precision
-CROWD = 1_000_000  # particles in one cell; CROWDED once, with the memory that takes
+BUDGET = 20.0  # seconds of a case in one precision
+CROWD = 1_000_000  # particles in one cell; tested once, since it needs much memory
 CROWDED = 10_000_000
 
 
 def ended_with(names: str) -> Promise:
-    """Return the promise of a simulation that ends with a message that contains `names`."""
+    """Return the promise of a simulation that ends with a message containing `names`."""
     return stopped(f"failed: {names}", names)
 
 
 @dataclass(frozen=True)
 class RunCase(Case):
-    """A simulation that takes a few steps."""
+    """Simulation of a few steps."""
 
-    make: Callable[[str, str], ParticleSimulation]  # returns it, for a precision and a device
+    # Makes the simulation for a precision and a device.
+    make: Callable[[str, str], ParticleSimulation]
     _: KW_ONLY
-    dt: float | None = None  # of every step [s]; what the CFL number allows if None
-    steps: int = STEPS  # how many
-    # changes it before the first step
+    dt: float | None = None  # length of every step [s]; by the CFL number if None
+    steps: int = STEPS  # number of steps
+    # Changes the simulation before the first step.
     prepare: Callable[[ParticleSimulation], object] = lambda simulation: None
-    # what is wrong with it, besides what is checked of all
+    # Returns further faults, besides those that every case checks.
     check: Callable[[ParticleSimulation], list[str]] = lambda simulation: []
-    leaves: bool = False  # whether particles may leave
+    leaves: bool = False  # whether particles may leave the domain
     expected: Promise = DONE
     budget: float = BUDGET
 
     def tried(self, precision: str, device: str) -> Attempt:
-        """Make it and step."""
+        """Make the simulation and take its steps."""
         simulation = self.make(precision, device)
         self.prepare(simulation)
         before, recorded = simulation.particles.count, list[Mapping[str, np.ndarray]]()
-        # a record has no place for the bodies' term
+        # A record cannot hold the term of the bodies.
         if isinstance(simulation, LiquidSimulation) and simulation.bodies is None:
             simulation.record = recorded.append
-        status, message, begun = "done", "", time.perf_counter()
+        status, message, start_time = "done", "", time.perf_counter()
         try:
             for _ in range(self.steps):
                 simulation.step(usual_dt(simulation) if self.dt is None else self.dt)
@@ -70,7 +74,7 @@ class RunCase(Case):
                 str(error),
             )
         wp.synchronize_device(device)
-        attempt = Attempt(status, None, time.perf_counter() - begun, message)
+        attempt = Attempt(status, None, time.perf_counter() - start_time, message)
         if status == "done":
             attempt.faults += [
                 *lost(simulation, before, leaves=self.leaves),
@@ -83,13 +87,13 @@ class RunCase(Case):
 
 
 def usual_dt(simulation: ParticleSimulation) -> float:
-    """Return the time step [s] that a run would take."""
+    """Return the time step [s] of an ordinary run."""
     limits = simulation.scene.time
     return min(max(simulation.stable_dt(), limits.dt_min), limits.dt_max)
 
 
 def lost(simulation: ParticleSimulation, before: int, *, leaves: bool) -> list[str]:
-    """Return what is wrong with the particles after a run."""
+    """Return faults of the particles after a run."""
     wrong, position, velocity = (
         [],
         simulation.particles.position.numpy(),
@@ -108,7 +112,10 @@ def lost(simulation: ParticleSimulation, before: int, *, leaves: bool) -> list[s
 def independent(
     kept: Mapping[str, np.ndarray], simulation: LiquidSimulation
 ) -> tuple[float | None, list[str]]:
-    """Return the relative residual of the last pressure, from the recorded arrays alone, and what is wrong with it."""
+    """Return the relative residual of the last pressure, and its faults.
+
+    They are computed from the recorded arrays alone.
+    """
     faces = {name: kept[name] for name in ("face_x", "face_y", "face_z") if name in kept}
     problem = GridProblem(
         cells=kept["cells"].astype(int),
@@ -133,7 +140,7 @@ def independent(
 
 @dataclass(frozen=True)
 class Material:
-    """A small column of it is what all scenes start from; sand's solver has one precision."""
+    """Column of material that all scenes start from; sand's solver has one precision."""
 
     name: str
     simulator: Simulator
@@ -144,12 +151,15 @@ liquid, sand = Material("liquid", FLUIDS, PRECISIONS), Material("sand", GRANULAR
 
 
 def box(low: Sequence[float], high: Sequence[float], **more: Any) -> dict[str, Any]:
-    """Return the table of a box."""
+    """Return the scene table of a box."""
     return {"shape": "box", "min": low, "max": high, **more}
 
 
 def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulation]:
-    """Return what makes a small column, whose tables may be overwritten; `velocity` is the column's."""
+    """Return a function that makes a small column.
+
+    The scene's tables may be overridden. `velocity` is that of the column.
+    """
 
     def make(precision: str, device: str) -> ParticleSimulation:
         usual: dict[str, Any] = {
@@ -177,7 +187,11 @@ def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulati
 
 
 def steps_and_forces() -> Iterator[Case]:
-    """Yield time steps from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from none to 1e6 m/s^2, speeds to 1e6 m/s."""
+    """Yield extreme time steps, CFL numbers, gravity and speeds.
+
+    Time steps are from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from 0 to 1e6 m/s^2,
+    speeds up to 1e6 m/s.
+    """
     for kind in (liquid, sand):
 
         def case(
@@ -202,8 +216,8 @@ def steps_and_forces() -> Iterator[Case]:
         yield case("gravity sideways and up", tables=gravity(300.0, 400.0))
         for speed in ([1e6, 0.0], [-1e6, 1e6], [1e-6, 0.0]):
             yield case(f"speed of {speed} m/s", tables={"velocity": speed})
-        # liquid must be incompressible alone; sand's stresses, which miss their tolerance, would
-        # raise its energy by a fifth
+        # Liquid must be incompressible alone. Sand's stresses miss their tolerance and would raise
+        # its energy by a fifth.
         far = ended_with("would add energy to the sand") if kind is sand else DONE
         yield case("1e6 m/s for 1 s a step", tables={"velocity": [1e6, 0.0]}, dt=1.0, expected=far)
         for bad in (0.0, -1.0, np.nan, np.inf):
@@ -234,12 +248,15 @@ def steps_and_forces() -> Iterator[Case]:
 
 
 def gravity(*components: float) -> dict[str, Any]:
-    """Return the tables of a gravity [m/s^2]."""
+    """Return the scene tables of a gravity [m/s^2]."""
     return {"physics": {"gravity": list(components)}}
 
 
 def solids_and_depth() -> Iterator[Case]:
-    """Yield 3-D liquid, and rigid bodies of 10^-8 to 10^8 of its density, solids that move too fast, and liquid between them."""
+    """Yield 3-D liquid, rigid bodies of extreme density, and fast solids.
+
+    Density ratios are 10^-8 to 10^8. Some solids move too fast, and some press liquid between them.
+    """
     case, pond = partial(RunCase, "liquid, 3-D and with bodies"), [box([0.0, 0.0], [1.0, 0.25])]
     column, size = (
         box([0.0, 0.0, 0.0], [0.25, 0.3, 0.25]),
@@ -269,7 +286,7 @@ def solids_and_depth() -> Iterator[Case]:
 
 
 def bodies_inside(simulation: ParticleSimulation) -> list[str]:
-    """Return which bodies have left the domain or are nowhere."""
+    """Return a fault for each body that has left the domain or has a position of NaN."""
     bodies = simulation.bodies.bodies if simulation.bodies is not None else []
     size = np.array([*simulation.scene.domain.size, 0.0][:3])
     return [
@@ -280,18 +297,21 @@ def bodies_inside(simulation: ParticleSimulation) -> list[str]:
 
 
 def at_rest(simulation: ParticleSimulation, most: float = 1e-6) -> list[str]:
-    """Return that something moves, if it does."""
+    """Return a fault if something moves."""
     speed = float(np.abs(simulation.particles.velocity.numpy()).max())
     return [] if speed <= most else [f"moves at {speed:.1e} m/s"]
 
 
 def all_but_at_rest(simulation: ParticleSimulation) -> list[str]:
-    """Return that something moves by more than 1 % of a cell in 0.1 s, if it does: sand evens out how it is packed."""
+    """Return a fault if something moves by more than 1 % of a cell in 0.1 s.
+
+    Sand rearranges its packing and so moves slightly.
+    """
     return at_rest(simulation, 0.1 * simulation.grid.spacing)
 
 
 def particles_anywhere() -> Iterator[Case]:
-    """Yield particles on nodes, on walls, outside, all in one cell, and with values that are no numbers."""
+    """Yield particles on nodes, on walls, outside, in one cell, and with NaN."""
     for kind in (liquid, sand):
         name, case = (
             kind.name,
@@ -341,7 +361,7 @@ def particles_anywhere() -> Iterator[Case]:
 
 
 def put(field: str, at: Any, value: Any) -> Callable[[ParticleSimulation], None]:
-    """Return what overwrites some of the particles' positions or velocities."""
+    """Return a function that overwrites some positions or velocities of particles."""
 
     def change(simulation: ParticleSimulation) -> None:
         array = getattr(simulation.particles, field)
@@ -359,7 +379,10 @@ def on_nodes(simulation: ParticleSimulation) -> None:
 
 
 def on_walls(simulation: ParticleSimulation) -> None:
-    """Put a third of the particles on the floor, a third on a wall, the first four into corners, as near to the far ends as any comes."""
+    """Put a third of the particles on the floor and a third on a wall.
+
+    The first four are in the corners, as near to the far sides as any particle may be.
+    """
     right, top = np.array(simulation.scene.domain.size) - MARGIN * simulation.grid.spacing
     put("position", (slice(0, None, 3), 1), 0.0)(simulation)
     put("position", (slice(1, None, 3), 0), 0.0)(simulation)
@@ -369,7 +392,10 @@ def on_walls(simulation: ParticleSimulation) -> None:
 
 
 def crowd(count: int, speed: float = 0.0) -> Callable[[ParticleSimulation], None]:
-    """Return what adds particles in one cell of the air, with a speed [m/s] along x."""
+    """Return a function that adds particles to one cell of air.
+
+    They have a speed [m/s] along x.
+    """
 
     def add(simulation: ParticleSimulation) -> None:
         chance, position, velocity = (
@@ -386,7 +412,10 @@ def crowd(count: int, speed: float = 0.0) -> Callable[[ParticleSimulation], None
 
 
 def flies(simulation: ParticleSimulation) -> list[str]:
-    """Return that the crowd is not as fast as it was, if it is not: sums of a million terms in float32."""
+    """Return a fault if the crowd has changed its speed.
+
+    Its momentum is a sum of a million terms in float32.
+    """
     speeds = simulation.particles.velocity.numpy()[:, 0]
     fast = speeds[speeds > 0.5]
     wrong = abs(float(fast.mean(dtype=np.float64)) - 1.0) if len(fast) else 1.0

@@ -1,1 +1,1 @@
-"""What all suites share: clocks and paired comparisons, the machine, records, reports with plots, and comparisons of results."""
+"""Shared parts of all suites: timing, machine, records, reports, comparisons."""

@@ -1,4 +1,7 @@
-"""New figures over old ones, with bounds of noise from the repeated samples of both."""
+"""Comparison of new results with old ones, within their noise.
+
+Bounds of the noise come from the repeated samples of both.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
 from warp_lcp.benchmarks.harness.timing import Figure
 
 ALLOWED = 0.25  # share of a ratio to a peer that may be lost
-# ratios of a peer's time to ours, of the same rounds: what is compared across states of the code
-# and across machines
+# Ratios of a peer's time to ours, in the same rounds. They are comparable across versions of the
+# code and across machines.
 TO_PEERS = (
     "pyamg_over_this",
     "over_engine",
@@ -29,21 +32,24 @@ def bounds(old: Figure, new: Figure) -> tuple[float, float]:
 def losses(
     old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED
 ) -> list[str]:
-    """Return the ratios to peers that fell by more than `allowed`, whatever samples of the two are taken; a line each."""
-    found = []
+    """Return a line for each ratio to a peer that fell by more than `allowed`.
+
+    It has fallen whichever samples of the two are compared.
+    """
+    lines = []
     for name in (n for n in old if n in new):
         for label in (f for f in TO_PEERS if f in old[name].figures and f in new[name].figures):
             before, after = old[name].figures[label], new[name].figures[label]
             low, high = bounds(before, after)
             if high < 1 - allowed:
-                found.append(
+                lines.append(
                     f"{name}: {label} {before} fell to {after}, to [{low:.2f}, {high:.2f}] of it"
                 )
-    return found
+    return lines
 
 
 def comparison(old: Path, new: Path) -> str:
-    """Return a table of the figures that both files have.
+    """Return a table of the figures common to both files.
 
     Raises:
         ValueError: a file is no result of a suite, or they have no figure in common.
@@ -85,6 +91,6 @@ def comparison(old: Path, new: Path) -> str:
 
 
 def _hardware(records: Mapping[str, Record]) -> str:
-    """Return processor and device that a result was measured on."""
+    """Return processor and device of a result."""
     hardware = records[MACHINE].facts.get("hardware", {}) if MACHINE in records else {}
     return ", ".join(str(hardware[part]) for part in ("cpu", "device") if part in hardware)

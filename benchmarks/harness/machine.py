@@ -1,4 +1,4 @@
-"""Where and when something was measured: hardware, versions, peers; and the bytes that arrays and the process hold."""
+"""Machine of a measurement: hardware, versions, peers, memory in use."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ COPIED = 1 << 26  # float32 elements of the arrays that are copied: 256 MiB, bey
 
 
 def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
-    """Return the record of the machine, with its measured copy bandwidth (bytes read and bytes written)."""
+    """Return the record of the machine, with its measured copy bandwidth.
+
+    Bytes read and bytes written both count.
+    """
     chosen = wp.get_device(device)
     facts = {
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -49,7 +52,7 @@ def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
 def copy_bandwidth(device: str, elements: int, repeat: int) -> dict[str, Figure]:
     """Return GB/s of `wp.copy` and of NumPy's copy."""
     a, b = (wp.full(elements, 1.0, dtype=wp.float32, device=device) for _ in range(2))
-    # zeros nobody wrote are one page, read from the cache
+    # Pages of zeros that were never written all map to one page, which is read from the cache.
     x, y = (np.ones(elements, np.float32) for _ in range(2))
 
     def warp_copy() -> None:
@@ -64,7 +67,7 @@ def copy_bandwidth(device: str, elements: int, repeat: int) -> dict[str, Figure]
 
 
 def source_digest() -> str:
-    """Return a digest of the measured code, so that results of different states are told apart."""
+    """Return a digest of the measured code, to distinguish results of its versions."""
     digest = hashlib.sha256()
     for package in (warp_lcp, fluids, granular):
         root = Path(package.__path__[0])
@@ -97,7 +100,10 @@ def _version(name: str) -> str:
 
 
 def array_bytes() -> int:
-    """Return the bytes of all Warp arrays alive, views and shared memory counted once; a slow search."""
+    """Return the bytes of all live Warp arrays; a slow search.
+
+    Views and shared memory count once.
+    """
     spans = sorted(
         (a.ptr, a.ptr + a.capacity)
         for a in gc.get_objects()
@@ -111,7 +117,10 @@ def array_bytes() -> int:
 
 
 def resident_bytes(*, peak: bool = False) -> int:
-    """Return the process's resident memory now, or the most since `forget_peak`; 0 where the system does not tell."""
+    """Return the resident memory of the process, or its peak since `forget_peak`.
+
+    The result is 0 if the system does not report it.
+    """
     if not STATUS.exists():
         return 0
     found = re.search(
@@ -121,10 +130,10 @@ def resident_bytes(*, peak: bool = False) -> int:
 
 
 def forget_peak() -> None:
-    """Give freed memory back and let the peak begin again, where the system can."""
+    """Return freed memory to the system and reset the peak, where possible."""
     gc.collect()
     if sys.platform == "linux":
-        # glibc keeps freed fields for the next ones
+        # glibc keeps freed memory for later allocations
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)

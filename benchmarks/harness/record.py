@@ -1,4 +1,4 @@
-"""What a suite finds: records of figures, tables and charts of them, figures to reach, and the file that keeps the records."""
+"""Results of a suite: records of figures, tables, charts, targets, their file."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from typing import Any
 
 from warp_lcp.benchmarks.harness.timing import Figure
 
-SOURCE = "source digest"  # fact of that record: which state of the code was measured
-MACHINE = "machine"  # name of the record that says where and when the others were measured
+SOURCE = "source digest"  # fact of the machine's record: the version of the measured code
+MACHINE = "machine"  # name of the record of the machine and the date
 
 
 @dataclass(frozen=True)
 class Record:
-    """Figures of one thing that was measured."""
+    """Figures of one measured thing."""
 
-    name: str  # unique in its file, the same in later ones, so that they can be compared
+    name: str  # unique in its file and stable across versions, so that results can be compared
     figures: dict[str, Figure] = field(default_factory=dict)  # by name
-    facts: dict[str, Any] = field(default_factory=dict)  # what is no number
+    facts: dict[str, Any] = field(default_factory=dict)  # entries that are no numbers
 
     def value(self, figure: str) -> float | None:
-        """Return a figure's value, None if there is no such figure."""
+        """Return a figure's value; None if there is no such figure."""
         found = self.figures.get(figure)
         return None if found is None else found.value
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report: `rows` of cells under `columns`."""
+    """Table of a report: `rows` of cells under `columns`."""
 
     title: str
     columns: Sequence[str]
@@ -40,7 +40,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Bars:
-    """A bar chart: one value a label; `limit` is drawn as a line."""
+    """Bar chart: one value for each label; `limit` is drawn as a line."""
 
     name: str
     title: str
@@ -52,7 +52,10 @@ class Bars:
 
 @dataclass(frozen=True)
 class Lines:
-    """Curves over x and y, logarithmic along the axes in `log`; those in `marked` are drawn as points."""
+    """Curves over x and y.
+
+    Axes in `log` are logarithmic; curves in `marked` are drawn as points.
+    """
 
     name: str
     title: str
@@ -65,7 +68,10 @@ class Lines:
 
 @dataclass(frozen=True)
 class Panels:
-    """Several `Lines` in one picture, `columns` side by side; curves of one name have one color and one entry in the legend."""
+    """Several `Lines` in one picture, `columns` side by side.
+
+    Curves of one name have one color and one entry in the legend.
+    """
 
     name: str
     title: str
@@ -78,18 +84,18 @@ Chart = Bars | Lines | Panels
 
 @dataclass(frozen=True)
 class Results:
-    """All that a suite found."""
+    """All results of a suite."""
 
-    records: list[Record]  # for the file
-    tables: list[Table]  # for the report
-    charts: list[Chart] = field(default_factory=list)  # to draw
-    # what is not as it must be, a line each; the suite then ends with an error
+    records: list[Record]  # records of the file
+    tables: list[Table]  # tables of the report
+    charts: list[Chart] = field(default_factory=list)  # charts to draw
+    # Failed checks, a line each; the suite then ends with an error.
     failures: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A figure to reach: `figure` is at most the limit, or at least; None was not measured here."""
+    """Target: `figure` must be at most or at least the limit; None if not measured."""
 
     what: str
     limit: float
@@ -99,7 +105,7 @@ class Target:
 
     @property
     def met(self) -> bool | None:
-        """Whether the median meets it."""
+        """Whether the median meets the target; None if not measured."""
         if self.figure is None:
             return None
         return self.figure.value >= self.limit if self.at_least else self.figure.value <= self.limit
@@ -116,7 +122,7 @@ class Target:
 
 
 def table_of_targets(what: str, targets: Sequence[Target], remark: str = "") -> Table:
-    """Return the table of figures to reach."""
+    """Return the table of targets."""
     return Table(
         "Figures to reach", [what, "target", "measured", "met?"], [t.row() for t in targets], remark
     )
@@ -125,7 +131,7 @@ def table_of_targets(what: str, targets: Sequence[Target], remark: str = "") -> 
 def shown(
     record: Record, figures: Sequence[str], digits: str = ".3g", factor: float = 1.0
 ) -> list[str]:
-    """Return figures' values as a table shows them, empty where there is none."""
+    """Return the values of figures as a table shows them; empty if missing."""
     return [
         "" if (v := record.value(name)) is None else f"{factor * v:{digits}}" for name in figures
     ]
@@ -137,7 +143,7 @@ def spread(figure: Figure, factor: float = 1.0, digits: str = ".1f") -> str:
 
 
 def write_json(path: Path, records: Sequence[Record]) -> None:
-    """Write records as a JSON list, one a line."""
+    """Write records as a JSON list, one per line."""
     kept = [
         {"name": r.name, "figures": {k: f.as_dict() for k, f in r.figures.items()}, **r.facts}
         for r in records

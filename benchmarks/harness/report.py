@@ -1,4 +1,7 @@
-"""Write what a suite found: SUITE.json, SUITE.md and, where Matplotlib is there, SUITE-*.png."""
+"""Write the report of a suite: SUITE.json, SUITE.md and SUITE-*.png.
+
+The pictures need Matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,10 @@ if TYPE_CHECKING:
 
 COLOR, LIMIT = "#3a6ea5", "#b3432b"
 SHADES = 64  # colors of a picture
-MARKERS = 100  # points of a curve from which on they are not marked
-STYLES = ("-", "--", ":")  # of ten curves each, which have a color of their own
+MARKERS = 100  # number of points from which on they are not marked
+STYLES = ("-", "--", ":")  # for ten curves each, which differ in color
 PANEL = (3.5, 2.4)  # [inch]
-CROWDED = 10  # curves from which on their names are beside the axes
+CROWDED = 10  # number of curves from which on their names are beside the axes
 NO_PLOTS = "no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"
 
 
@@ -79,7 +82,7 @@ def _text(value: Any) -> str:
 
 
 def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
-    """Write a PNG file for each chart, none where Matplotlib is missing; return them."""
+    """Write a PNG file for each chart and return the paths; none without Matplotlib."""
     if not present("matplotlib"):
         return []
     from matplotlib.figure import Figure as Canvas
@@ -140,7 +143,7 @@ def _panels(canvas: Any, chart: Panels) -> None:
         axes.yaxis.label.set_size(7)
         shown |= {line.get_label(): line for line in axes.lines}
     if any(names):
-        # names of this many letters of 7 points, and lines
+        # Room for names of this many letters of 7 points, and lines.
         beside = int(PANEL[0] * chart.columns / (0.055 * max(map(len, names)) + 0.55))
         canvas.legend(
             shown.values(),
@@ -152,7 +155,7 @@ def _panels(canvas: Any, chart: Panels) -> None:
 
 
 def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
-    """Draw the curves, in the colors of their places among `names` if there are any."""
+    """Draw the curves, in the colors of their places among `names`."""
     for number, (label, (x, y)) in enumerate(chart.curves.items()):
         place = names.index(label) if names else number
         if label in chart.marked:
@@ -167,7 +170,7 @@ def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
                 label=label,
             )
             continue
-        # wider the earlier, so that curves that coincide are all seen
+        # Earlier curves are wider, so that coinciding curves are all visible.
         color: Any = (
             {"color": f"C{place % 10}", "linewidth": 3 - 2 * place / len(names)} if names else {}
         )

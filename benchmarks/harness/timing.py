@@ -1,4 +1,7 @@
-"""Seconds of things that are compared: measured in turns, so that a slow moment of a shared machine hits all of them."""
+"""Interleaved timing of things that are compared.
+
+Each is timed once in a round, so that a slow moment of a shared machine affects all of them.
+"""
 
 from __future__ import annotations
 
@@ -14,35 +17,35 @@ from unittest.mock import patch
 
 import warp as wp
 
-# [s]: a sample repeats shorter work up to this, clock and launch would show otherwise
+# [s] Shorter work is repeated up to this time, to hide the cost of clock and launch.
 SHORTEST_SAMPLE = 2e-3
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a suite is asked for."""
+    """Options of a suite."""
 
     device: str  # Warp device
-    sizes: tuple[int, ...]  # cells along a side; empty for the suite's own
+    sizes: tuple[int, ...]  # cells along a side; empty for the default sizes
     repeat: int  # samples of each timing
-    say: Callable[[str], object]  # takes a line about progress
-    scene: str = ""  # the one to measure, its name or file; empty for the suite's own
-    seed: int | None = None  # first one of random problems; None for one that was never drawn
+    say: Callable[[str], object]  # prints a line of progress
+    scene: str = ""  # name or file of the scene; empty for the default scenes
+    seed: int | None = None  # first seed of random problems; None for one never drawn before
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured or counted number."""
+    """Measured or counted number."""
 
     value: float  # the median
-    unit: str = ""  # of value, low and high; empty for counts and ratios
+    unit: str = ""  # unit of value, low and high; empty for counts and ratios
     low: float | None = None  # smallest sample
     high: float | None = None  # largest sample
-    samples: int = 1  # how many there were
+    samples: int = 1  # number of samples
 
     @staticmethod
     def of(samples: Sequence[float], unit: str = "") -> Figure:
-        """Return the median with its range, which one sample has not."""
+        """Return the median with its range; one sample has no range."""
         if len(samples) == 1:
             return Figure(samples[0], unit)
         return Figure(statistics.median(samples), unit, min(samples), max(samples), len(samples))
@@ -54,7 +57,7 @@ class Figure:
 
     @property
     def range(self) -> tuple[float, float]:
-        """The smallest and the largest sample."""
+        """Smallest and largest sample."""
         return (
             (self.value, self.value)
             if self.low is None or self.high is None
@@ -62,7 +65,7 @@ class Figure:
         )
 
     def as_dict(self) -> dict[str, float | int | str]:
-        """Return what a file keeps."""
+        """Return the entries of a file."""
         more = (
             {}
             if self.low is None or self.high is None
@@ -72,7 +75,7 @@ class Figure:
 
     @staticmethod
     def from_dict(kept: Mapping[str, float | int | str]) -> Figure:
-        """Return what a file keeps as a figure."""
+        """Return a figure from the entries of a file."""
         low, high = (float(kept[name]) if name in kept else None for name in ("min", "max"))
         return Figure(
             float(kept["value"]), str(kept.get("unit", "")), low, high, int(kept.get("samples", 1))
@@ -89,10 +92,10 @@ class Figure:
 
 
 def in_turns(work: Mapping[str, Callable[[], object]], repeat: int) -> dict[str, list[float]]:
-    """Return the seconds of each piece of work, `repeat` samples each, one of each in every round.
+    """Return the seconds of each piece of work, interleaved in `repeat` rounds.
 
-    An unmeasured run comes before each sample, so that what fits into the caches is there for all,
-    whatever ran before.
+    An unmeasured run comes before each sample, so that the caches hold the same data whatever ran
+    before.
     """
     times: dict[str, list[float]] = {name: [] for name in work}
     runs = {}
@@ -117,12 +120,15 @@ def seconds(run: Callable[[], object]) -> float:
 
 
 def ratios(a: Sequence[float], b: Sequence[float]) -> Figure:
-    """Return a / b of samples that were taken in the same rounds."""
+    """Return a / b of samples of the same rounds."""
     return Figure.of([x / y for x, y in zip(a, b, strict=True)])
 
 
 def clock(device: str) -> Callable[[], float]:
-    """Return a clock [s]: the processor's own on a CPU, which other programs take no part of."""
+    """Return a clock [s]; on a CPU that of the process.
+
+    Other programs do not affect CPU time.
+    """
     return time.perf_counter if wp.get_device(device).is_cuda else time.process_time
 
 
@@ -133,8 +139,8 @@ def timed(
     """Time every call of functions that callers look up in a module or a class.
 
     Args:
-        device: synchronized around each call.
-        functions: where each is looked up, by label.
+        device: device to synchronize around each call.
+        functions: module or class and name of each function, by label.
 
     Yields:
         Seconds of the calls so far, by label.

@@ -1,4 +1,4 @@
-"""Hostile inputs of plain users, drawn by seed and judged by independent oracles.
+"""Hostile inputs of ordinary users, drawn by seed and judged independently.
 
 `python -m warp_lcp.benchmarks.hostile --seed 1 --count 78` solves 78 cases of each kind.
 """
@@ -36,7 +36,10 @@ def draw_case(kind: str, seed: int, index: int) -> Case:
 
 
 def attempt(case: Case) -> Answer:
-    """Solve a case; exceptions become answers. A ValueError is a refusal, but for LinAlgError, which derives from it."""
+    """Solve a case and turn exceptions into answers.
+
+    A ValueError is a refusal. LinAlgError, which derives from it, is not.
+    """
     try:
         return case.solve()
     except Exception as error:

@@ -1,6 +1,7 @@
-"""Solve and judge hostile inputs: `python -m warp_lcp.benchmarks.hostile --seed N --count N [--kinds ...] [--out DIR]`.
+"""Command that solves and judges hostile inputs.
 
-Each kind has a worker process, whose death or CPU time beyond the limit costs one case only.
+Run `python -m warp_lcp.benchmarks.hostile --seed N --count N [--kinds ...] [--out DIR]`. Each kind
+has a worker process. If it dies or exceeds the CPU time limit, only one case is lost.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-LIMIT = 60.0  # [s] of CPU time that a solve without max_seconds may take
-GRACE = 15.0  # [s] until the worker is ended
-WALL = 600.0  # [s] of wall time, on a machine that is busy
+LIMIT = 60.0  # [s] limit of CPU time for a solve without max_seconds
+GRACE = 15.0  # [s] from the limit until the worker is ended
+WALL = 600.0  # [s] limit of wall time, for a busy machine
 FAULTS = ("FALSE CONVERGED", "FALSE INFEASIBLE", "CRASH", "TIMEOUT", "EXCEPTION")
 REMARKS = ("row hidden", "suspicious", "infeasible unproved", "not solved", "refused")
 COLUMNS = ("solves", "converged", "infeasible right", "honest", "other method", *FAULTS, *REMARKS)
@@ -29,7 +30,7 @@ COLUMNS = ("solves", "converged", "infeasible right", "honest", "other method", 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one case: pairs of category and reason, CPU seconds of its solve."""
+    """Outcome of one case: pairs of category and reason, CPU seconds of its solve."""
 
     kind: str
     index: int
@@ -39,7 +40,7 @@ class Outcome:
 
 
 def main() -> None:
-    """Run the kinds asked for, print a table and the faults."""
+    """Run the requested kinds; print a table and the faults."""
     parser = argparse.ArgumentParser(
         prog="python -m warp_lcp.benchmarks.hostile", description=__doc__
     )
@@ -51,28 +52,30 @@ def main() -> None:
     parser.add_argument("--index", type=int, help="solve only this case, in this process")
     parser.add_argument("--out", type=Path, help="folder for hostile.json and hostile.md")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)  # index of the first case
-    given = parser.parse_args()
-    if given.worker is not None:
-        return _work(given.kinds[0], given.seed, range(given.worker, given.count))
+    arguments = parser.parse_args()
+    if arguments.worker is not None:
+        return _work(arguments.kinds[0], arguments.seed, range(arguments.worker, arguments.count))
     from warp_lcp.benchmarks.hostile import KINDS
 
-    unknown = sorted(set(given.kinds) - set(KINDS))
+    unknown = sorted(set(arguments.kinds) - set(KINDS))
     if unknown:
         parser.error(f"--kinds {' '.join(unknown)}: known are {', '.join(KINDS)}")
-    if given.index is not None:
-        return _work(given.kinds[0], given.seed, range(given.index, given.index + 1))
+    if arguments.index is not None:
+        return _work(
+            arguments.kinds[0], arguments.seed, range(arguments.index, arguments.index + 1)
+        )
     outcomes: list[Outcome] = []
-    for kind in given.kinds or KINDS:
+    for kind in arguments.kinds or KINDS:
         start = time.perf_counter()
-        outcomes += supervise(kind, given.seed, given.count)
+        outcomes += supervise(kind, arguments.seed, arguments.count)
         _say(f"{kind}: {time.perf_counter() - start:.0f} s")
-        if given.out:  # after each kind, as a run may be interrupted
-            given.out.mkdir(parents=True, exist_ok=True)
-            (given.out / "hostile.md").write_text(report(outcomes, given.seed))
-            (given.out / "hostile.json").write_text(
+        if arguments.out:  # written after each kind, since a run may be interrupted
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            (arguments.out / "hostile.md").write_text(report(outcomes, arguments.seed))
+            (arguments.out / "hostile.json").write_text(
                 json.dumps([asdict(o) for o in outcomes], indent=1)
             )
-    sys.stdout.write(report(outcomes, given.seed))
+    sys.stdout.write(report(outcomes, arguments.seed))
     sys.exit(1 if any(c in FAULTS for o in outcomes for c, _ in o.verdicts) else 0)
 
 
@@ -82,20 +85,20 @@ def _say(text: str) -> None:
 
 
 def _work(kind: str, seed: int, indices: range) -> None:
-    """Solve cases in this process, a line of JSON before and after each."""
+    """Solve cases in this process; print a line of JSON before and after each."""
     warnings.simplefilter("ignore")
     import warp
 
     warp.config.quiet = True
     from warp_lcp.benchmarks.hostile import attempt, draw_case, judge
 
-    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process, in whatever library it is
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process in any library
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     for index in indices:
         case = draw_case(kind, seed, index)
         _write({"begin": index, "name": case.name})
         signal.setitimer(signal.ITIMER_PROF, LIMIT + GRACE)
-        signal.setitimer(signal.ITIMER_REAL, WALL)  # a solve that waits takes no CPU time
+        signal.setitimer(signal.ITIMER_REAL, WALL)  # a solve that waits uses no CPU time
         start = time.process_time()
         answer = attempt(case)
         seconds = time.process_time() - start
@@ -140,7 +143,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
             "--count",
             str(count),
         ]
-        begun = ""
+        running_case = ""
         with (
             tempfile.TemporaryFile("w+") as messages,
             subprocess.Popen(
@@ -157,14 +160,14 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                     continue
                 record = json.loads(line[1:])
                 if "begin" in record:
-                    begun = record["name"]
+                    running_case = record["name"]
                     continue
                 outcomes.append(
                     Outcome(kind, record["end"], record["name"], _late(record), record["seconds"])
                 )
                 _tell(outcomes[-1], seed)
             messages.seek(0)
-            told = messages.read()
+            error_output = messages.read()
         if len(outcomes) < count:  # the worker has died
             category = (
                 "TIMEOUT" if -worker.returncode in (signal.SIGPROF, signal.SIGALRM) else "CRASH"
@@ -172,13 +175,13 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
             why = (
                 f"more than {LIMIT + GRACE:g} s"
                 if category == "TIMEOUT"
-                else f"exit {worker.returncode}: {told.strip()[-150:]}"
+                else f"exit {worker.returncode}: {error_output.strip()[-150:]}"
             )
             outcomes.append(
                 Outcome(
                     kind,
                     len(outcomes),
-                    begun,
+                    running_case,
                     [[category, why]],
                     LIMIT + GRACE if category == "TIMEOUT" else 0.0,
                 )
@@ -202,7 +205,7 @@ def _tell(outcome: Outcome, seed: int) -> None:
 
 
 def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...]) -> list[str]:
-    """Return a line for each verdict of the categories, with what repeats it."""
+    """Return a line for each verdict of the categories, with the command to repeat it."""
     return [
         f"{category}: --kinds {o.kind} --seed {seed} --index {o.index}: {o.name} ({o.seconds:.1f} "
         f"s): {' '.join(why.split())}"
@@ -213,7 +216,7 @@ def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...])
 
 
 def report(outcomes: list[Outcome], seed: int) -> str:
-    """Return a page: a row a kind, then the faults and remarks."""
+    """Return a page: a row for each kind, then the faults and remarks."""
     kinds = list(dict.fromkeys(o.kind for o in outcomes))
     lines = [
         f"# Hostile inputs, seed {seed}",

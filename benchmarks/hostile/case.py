@@ -1,4 +1,4 @@
-"""Cases of the hostile benchmark: an input, how it is solved, and what is known of its answer."""
+"""Cases of the hostile benchmark: input, solve, and known facts of the answer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warp_lcp.problem.protocol import families
 
 Bounds = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 CONVERGED, INFEASIBLE, REFUSED, EXCEPTION = "CONVERGED", "INFEASIBLE", "REFUSED", "EXCEPTION"
-# Methods that take any matrix, or refuse it in a ValueError, which is no fault.
+# Methods that take any matrix or refuse it with a ValueError, which is no fault.
 NAMED = tuple(
     sorted(
         name
@@ -32,13 +32,13 @@ GRID_METHODS = ("projected-multigrid", "minimum-map-newton", "mprgp", "psor", "i
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solve returned, on the host.
+    """Result of a solve, on the host.
 
     Args:
         status: name of a `wl.SolveStatus`, or REFUSED (a ValueError) or EXCEPTION (any other).
         x: the solution, shape (n,).
         note: message of an exception, or further facts.
-        values: other arrays by name, as gradients.
+        values: other arrays by name, for example gradients.
     """
 
     status: str
@@ -49,7 +49,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """The problem y = A x + b, l <= x <= u as plain arrays, and what is known of its answer.
+    """Problem y = A x + b, l <= x <= u as plain arrays, with its known facts.
 
     Args:
         A: matrix (n, n), dense or scipy.sparse, float64.
@@ -58,13 +58,13 @@ class Box:
         upper: u, shape (n,).
         rtol: relative tolerance of the solve.
         solution: a solution known by construction.
-        unique: whether it is the only one.
-        solvable: whether a solution exists, by construction; None: an oracle is asked.
-        definite: A is symmetric positive semi-definite, by construction.
-        monotone: x'Ax >= 0 for all x, by construction; implied by `definite`.
-        grid: the problem was posed on a grid, where d_i = A_ii.
+        unique: whether that solution is the only one.
+        solvable: whether a solution exists, by construction; None if an oracle decides.
+        definite: whether A is symmetric positive semi-definite, by construction.
+        monotone: whether x'Ax >= 0 for all x, by construction; implied by `definite`.
+        grid: whether the problem was posed on a grid, where d_i = A_ii.
         storage: relative rounding of coefficients that the operator documents (float32 storage).
-        affine: bounds at x, where they are affine in x.
+        affine: function of x that returns the bounds, if they are affine in x.
         largest: a bound on |x| beyond which an answer is suspicious.
     """
 
@@ -90,7 +90,7 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Program:
-    """A quadratic program as given to qpsolvers, and a well-scaled form of it with the same x.
+    """Quadratic program for qpsolvers, and a well-scaled form with the same x.
 
     Args:
         scaled: qpsolvers.Problem as given to the solver.
@@ -107,7 +107,7 @@ class Program:
 
 @dataclass(frozen=True)
 class Values:
-    """Arrays that the answer must have, to a tolerance relative to the largest entry of each."""
+    """Expected arrays, to a tolerance relative to the largest entry of each."""
 
     expected: dict[str, np.ndarray]
     tolerance: float
@@ -115,20 +115,23 @@ class Values:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Malformed input: a ValueError, or a solve that ends in a status other than CONVERGED."""
+    """Malformed input, which must be refused.
+
+    Expected is a ValueError, or a solve that ends in a status other than CONVERGED.
+    """
 
     why: str
 
 
 @dataclass(frozen=True)
 class Case:
-    """One solve.
+    """One solve, with the truth about its answer.
 
     Args:
-        name: what was drawn, in a line.
-        solve: makes the solve; what it raises is recorded.
-        truth: what is known of the answer.
-        method: the method named; None: the default.
+        name: description of the drawn case, in one line.
+        solve: function that solves; its exceptions are recorded.
+        truth: known facts of the answer.
+        method: name of the method; None for the default.
     """
 
     name: str
@@ -151,18 +154,20 @@ def box_case(
     entries: bool = True,
     x0: np.ndarray | None = None,
 ) -> Case:
-    """Return a case that solves a box by the default, a named method or another entry point.
+    """Return a case that solves a box problem.
+
+    The case solves it by the default method, a named method or another entry point.
 
     Args:
         rng: random numbers.
-        name: what was drawn.
+        name: description of the drawn case.
         box: the problem.
-        operator: makes A as it is given to the library; None: `box.A` itself.
-        shape: of the fields of a grid; then `unknowns` are the flat indices of FLUID cells.
-        unknowns: see `shape`.
+        operator: makes A in the form for the library; None for `box.A` itself.
+        shape: shape of the fields of a grid; None for matrices.
+        unknowns: flat indices of the FLUID cells of a grid.
         named: methods to draw from.
         share: probability that a method is named.
-        bounds: bounds as they are given to the library; None: those of the box.
+        bounds: bounds in the form for the library; None for those of the box.
         entries: whether other entry points may be drawn.
         x0: start, shape (n,).
     """
@@ -247,23 +252,26 @@ def command_line(
             text=True,
             check=False,
         )
-        told = f"{run.stdout}\n{run.stderr}".strip()
+        output = f"{run.stdout}\n{run.stderr}".strip()
         if run.returncode == 0 and (folder / "x.mtx").exists():
             return Answer(
-                CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), told[-200:]
+                CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), output[-200:]
             )
         if run.returncode == 2:
-            return Answer(REFUSED, None, told[-200:])
-        if run.returncode != 1 or "Traceback" in told:
-            return Answer(EXCEPTION, None, f"exit code {run.returncode}: {told[-200:]}")
+            return Answer(REFUSED, None, output[-200:])
+        if run.returncode != 1 or "Traceback" in output:
+            return Answer(EXCEPTION, None, f"exit code {run.returncode}: {output[-200:]}")
         status = next(
-            (s.name for s in wl.SolveStatus if s.name in told and s.name != CONVERGED), "FAILED"
+            (s.name for s in wl.SolveStatus if s.name in output and s.name != CONVERGED), "FAILED"
         )
-        return Answer(status, None, told[-200:])
+        return Answer(status, None, output[-200:])
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment of a child process that imports this package, whatever its folder."""
+    """Return the environment of a child process that can import this package.
+
+    It works in any folder.
+    """
     import os
 
     root = str(Path(wl.__file__).parents[1])

@@ -13,7 +13,7 @@ AIR, FLUID, SOLID = 0, 1, 2
 
 
 def size(rng: np.random.Generator, low: int = 1, high: int = 200) -> int:
-    """Return a size, uniform in its logarithm."""
+    """Return a log-uniform size."""
     return int(round(10 ** rng.uniform(np.log10(low), np.log10(high))))
 
 
@@ -42,7 +42,10 @@ def graph_laplacian(n: int, tails: Array, heads: Array, weights: Array) -> sp.cs
 def plane_laplacian(
     shape: tuple[int, int], rng: np.random.Generator, periodic: bool = False, spread: float = 0.0
 ) -> sp.csr_array:
-    """Return the five-point graph Laplacian on a rectangle; weights 10^[-spread, spread]."""
+    """Return the five-point graph Laplacian on a rectangle.
+
+    Weights are 10^[-spread, spread].
+    """
     index = np.arange(shape[0] * shape[1]).reshape(shape)
     right, down = (index, np.roll(index, -1, 1)), (index, np.roll(index, -1, 0))
     if not periodic:
@@ -55,7 +58,7 @@ def plane_laplacian(
 
 
 def definite(rng: np.random.Generator, n: int) -> tuple[str, Any]:
-    """Return a symmetric positive definite matrix of condition up to 1e4, dense or sparse."""
+    """Return an SPD matrix of condition number up to 1e4, dense or sparse."""
     kind = str(rng.choice(["dense", "chain", "plane", "graph"]))
     if kind == "dense" or n < 4:
         Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
@@ -114,9 +117,10 @@ def bounds(rng: np.random.Generator, n: int, kind: str | None = None) -> tuple[s
 def plant(
     rng: np.random.Generator, A: Any, low: Array, high: Array, spread: float = 1.0
 ) -> tuple[Array, Array]:
-    """Return x and b of a problem that x solves: y is 10^[-spread, spread] on held unknowns, 0 on free ones.
+    """Return x and b of a problem that x solves.
 
-    A tenth of the held unknowns is degenerate (y = 0).
+    y is 10^[-spread, spread] on held unknowns, 0 on free ones. A tenth of the held unknowns is
+    degenerate (y = 0).
     """
     n = len(low)
     inside = np.where(np.isfinite(low) & np.isfinite(high), high - low, 2.0) * rng.uniform(
@@ -149,10 +153,10 @@ def stencil_matrix(
     periodic: tuple[bool, ...],
     outside: int,
 ) -> sp.csr_array:
-    """Return the matrix of `wl.Stencil` as documented, cell by cell; rows and columns of other cells are empty.
+    """Return the matrix of `wl.Stencil` as documented, assembled cell by cell.
 
     (A x)_i = sum_o a_o(i) x_(i + o) + shift_i x_i; x = 0 in AIR, x_(i + o) = x_i where i + o is
-    SOLID.
+    SOLID. Rows and columns of other cells are empty.
     """
     index = np.arange(cells.size).reshape(cells.shape)
     entries: list[tuple[int, int, float]] = []
@@ -161,13 +165,13 @@ def stencil_matrix(
         if shift is not None:
             entries.append((i, i, float(np.broadcast_to(shift, cells.shape)[cell])))
         for offset, a in coefficients.items():
-            value, there = (
+            value, neighbor_cell = (
                 float(a[cell] if np.ndim(a) else a),
                 neighbor(cell, offset, cells.shape, periodic),
             )
-            kind = outside if there is None else cells[there]
-            if kind == FLUID and there is not None:
-                entries.append((i, int(index[there]), value))
+            kind = outside if neighbor_cell is None else cells[neighbor_cell]
+            if kind == FLUID and neighbor_cell is not None:
+                entries.append((i, int(index[neighbor_cell]), value))
             elif kind == SOLID:
                 entries.append((i, i, value))
     heads, tails, values = (np.array(column) for column in zip(*entries, strict=True))
@@ -182,9 +186,10 @@ def boundary_term(
     periodic: tuple[bool, ...],
     outside: int,
 ) -> Array:
-    """Return the sums of a_o(i) value_(i + o) over AIR neighbors; `values` is padded by one cell.
+    """Return the sums of a_o(i) value_(i + o) over AIR neighbors.
 
-    Along a periodic axis the padding stands for the other side, outside another axis too.
+    `values` is padded by one cell. Along a periodic axis the padding stands for the other side,
+    outside another axis too.
     """
     total = np.zeros(cells.shape)
     for cell in zip(*np.nonzero(cells == FLUID), strict=True):
@@ -205,18 +210,18 @@ def neighbor(
     cell: Any, offset: tuple[int, ...], shape: tuple[int, ...], periodic: tuple[bool, ...]
 ) -> tuple[int, ...] | None:
     """Return cell + offset, wrapped on periodic axes (given as x, y, z); None outside."""
-    there = []
+    indices = []
     for axis, (c, o, count) in enumerate(zip(cell, offset, shape, strict=True)):
         k = int(c) + o
         if not 0 <= k < count:
             if not periodic[len(shape) - 1 - axis]:
                 return None
             k %= count
-        there.append(k)
-    return tuple(there)
+        indices.append(k)
+    return tuple(indices)
 
 
 def offsets(dimensions: int, *, axes: bool) -> list[tuple[int, ...]]:
-    """Return the compact offsets but the center; only those along axes if `axes`."""
+    """Return the compact offsets except the center; only those along axes if `axes`."""
     every = product((-1, 0, 1), repeat=dimensions)
     return [o for o in every if any(o) and (not axes or sum(map(abs, o)) == 1)]

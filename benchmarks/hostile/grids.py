@@ -1,4 +1,7 @@
-"""Kinds 4, 5 and 12 of the hostile benchmark: stencils and grids beside SOLID, AIR and periodic sides, and gradients."""
+"""Kinds 4, 5 and 12 of the hostile benchmark: stencils, grids and gradients.
+
+Stencils and grids are beside SOLID, AIR and periodic sides.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ Rng = np.random.Generator
 
 
 def _cells(rng: Rng, most: int = 14, solid: float = 0.2) -> np.ndarray:
-    """Return cells in 2-D or 3-D with AIR and SOLID in random places, at least one FLUID."""
+    """Return 2-D or 3-D cells with random AIR and SOLID, at least one FLUID."""
     shape = tuple(
         int(k)
         for k in rng.integers(
@@ -35,10 +38,10 @@ def _cells(rng: Rng, most: int = 14, solid: float = 0.2) -> np.ndarray:
 def _coefficients(
     rng: Rng, cells: np.ndarray, *, symmetric: bool, spread: float, margin: float, periodic: Any
 ) -> dict[Any, Any]:
-    """Return a_o <= 0 by offset, arrays; the center makes every row dominant by `margin`, whatever its neighbors are.
+    """Return coefficients a_o <= 0 by offset, as arrays.
 
-    Symmetric: a_o(i) = a_-o(i + o) between cells, while a coefficient that belongs to a closed or
-    outer side is its own.
+    The center makes every row dominant by `margin`, whatever its neighbors are. If symmetric,
+    a_o(i) = a_-o(i + o) between cells; the coefficient of a closed or outer side is independent.
     """
     names = draw.offsets(cells.ndim, axes=bool(rng.random() < 0.4))
     a: dict[Any, Any] = {o: -(10 ** rng.uniform(-spread, 0, cells.shape)) for o in names}
@@ -50,19 +53,22 @@ def _coefficients(
                     if there is not None and cells[cell] == cells[there] == draw.FLUID:
                         a[tuple(-k for k in o)][there] = a[o][cell]
     center = sum(-values for values in a.values()) if a else np.ones(cells.shape)
-    # A closed side adds a_o < 0 to the diagonal, so the row's sum is that of the center and all
+    # A closed side adds a_o < 0 to the diagonal. So the row's sum is that of the center and all
     # sides.
     a[(0,) * cells.ndim] = center * (1 + margin)
     return a
 
 
 def solid(rng: Rng) -> Case:
-    """Draw a stencil with arrays beside SOLID, AIR and outer sides; compare its parts or solve with it."""
+    """Draw a stencil with arrays beside SOLID, AIR and outer sides.
+
+    The case compares its parts, or solves with it.
+    """
     cells, symmetric = _cells(rng), bool(rng.random() < 0.6)
     periodic = tuple(bool(p) for p in rng.random(3) < 0.15)
     periodic = (periodic[0], periodic[1], periodic[2] and cells.ndim == 3)
-    # Periodic axes of one or two cells couple a pair twice, which the symmetric drawing does not
-    # know.
+    # A periodic axis of one or two cells couples a pair of cells twice. The symmetric drawing does
+    # not handle that.
     symmetric &= not any(
         p and cells.shape[cells.ndim - 1 - axis] < 3 for axis, p in enumerate(periodic)
     )
@@ -109,17 +115,17 @@ def solid(rng: Rng) -> Case:
 
         def parts() -> Answer:
             A = operator()
-            found = {
+            fields = {
                 "A x": A.apply(wp.array(x * fluid, dtype=wp.float64, device="cpu")),
                 "diagonal": A.diagonal(),
             }
-            found["boundary term"] = A.boundary_term(border)
+            fields["boundary term"] = A.boundary_term(border)
             assert border[inside].shape == cells.shape
             return Answer(
                 "CONVERGED",
                 None,
                 "",
-                {k: v.numpy().ravel()[F].astype(float) for k, v in found.items()},
+                {k: v.numpy().ravel()[F].astype(float) for k, v in fields.items()},
             )
 
         return Case(f"{name}, its parts", parts, Values(expected, 1e-12))
@@ -150,7 +156,11 @@ def solid(rng: Rng) -> Case:
 
 
 def periodic(rng: Rng) -> Case:
-    """Draw singular periodic stencils, compatible or not, unsymmetric dominant M-matrices, and grids with face coefficients."""
+    """Draw periodic stencils and grids.
+
+    They are singular stencils, compatible or not, unsymmetric dominant M-matrices, and grids with
+    face coefficients.
+    """
     kind = str(rng.choice(["singular", "dominant", "faces"], p=[0.45, 0.35, 0.2]))
     if kind == "faces":
         return _faces(rng)
@@ -251,7 +261,10 @@ def _stencil(cells: Any, a: Any, sides: Any, outside: int) -> Any:
 
 
 def _faces(rng: Rng) -> Case:
-    """Draw a GridPoisson with face arrays, in float64 or in its default storage, AIR around it or periodic."""
+    """Draw a GridPoisson with face arrays, in float64 or in its default storage.
+
+    AIR surrounds it, or it is periodic.
+    """
     shape = (draw.size(rng, 3, 40), draw.size(rng, 3, 40))
     cells = rng.choice([draw.AIR, draw.FLUID, draw.SOLID], size=shape, p=[0.05, 0.9, 0.05])
     cells[0] = draw.AIR
@@ -307,7 +320,10 @@ def _faces(rng: Rng) -> Case:
 
 
 def gradients(rng: Rng) -> Case:
-    """Draw a well-conditioned problem and a cotangent; compare `wl.vjp` with dense implicit differentiation."""
+    """Draw a well-conditioned problem and a cotangent.
+
+    The case compares `wl.vjp` with dense implicit differentiation.
+    """
     kind = str(rng.choice(["dense", "sparse", "stencil", "stencil", "operator"]))
     if kind == "stencil":
         cells, sides = _cells(rng, 9, solid=0.25), (False, False, False)
@@ -334,7 +350,7 @@ def gradients(rng: Rng) -> Case:
     free = (x > low) & (x < high)
     y = A @ x + b
     held_low, held_high = (x == low) & (low < high), (x == high) & (low < high)
-    # no degenerate rows
+    # Remove degenerate rows.
     b += np.where(held_low & (np.abs(y) < 1e-9), 0.5, 0.0) - np.where(
         held_high & (np.abs(y) < 1e-9), 0.5, 0.0
     )
@@ -371,16 +387,18 @@ def gradients(rng: Rng) -> Case:
         if not result:
             return Answer(result.status.name, None, "the problem's own solve")
         try:
-            found = wl.vjp(result, field_of(g), stopping=wl.StoppingCriteria(rtol=1e-10))
+            gradient = wl.vjp(result, field_of(g), stopping=wl.StoppingCriteria(rtol=1e-10))
         except ArithmeticError as error:
             return Answer("NO GRADIENT", None, str(error)[:100])
-        values = {name: getattr(found, name).numpy().ravel()[F] for name in ("b", "lower", "upper")}
+        values = {
+            name: getattr(gradient, name).numpy().ravel()[F] for name in ("b", "lower", "upper")
+        }
         if kind == "dense":
-            values["matrix"] = found.coefficients["matrix"].numpy().ravel()
+            values["matrix"] = gradient.coefficients["matrix"].numpy().ravel()
         if kind == "stencil":
             values |= {
                 f"coefficient {o}": v.numpy().ravel()[F]
-                for o, v in found.coefficients["coefficients"].items()
+                for o, v in gradient.coefficients["coefficients"].items()
             }
         return Answer("CONVERGED", result.x.numpy().ravel()[F], "", values)
 
@@ -395,7 +413,7 @@ def _by_offset(
     fields = np.zeros((2, cells.size))
     fields[:, F] = mu, x
     m, v = fields.reshape(2, *cells.shape)
-    found = {}
+    by_offset = {}
     for o in a:
         part = np.zeros(cells.shape)
         for cell in zip(*np.nonzero(cells == draw.FLUID), strict=True):
@@ -404,5 +422,5 @@ def _by_offset(
             part[cell] = m[cell] * (
                 v[cell] if kind == draw.SOLID else v[there] if kind == draw.FLUID else 0.0
             )
-        found[f"coefficient {o}"] = part.ravel()[F]
-    return found
+        by_offset[f"coefficient {o}"] = part.ravel()[F]
+    return by_offset

@@ -1,4 +1,7 @@
-"""Independent judgement of answers by NumPy, SciPy's HiGHS and Clarabel, in the caller's units; no solver of the library is used."""
+"""Independent judgement of answers by NumPy, SciPy's HiGHS and Clarabel.
+
+The judgement is in the caller's units and uses no solver of the library.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +27,12 @@ from warp_lcp.benchmarks.hostile.case import (
 )
 
 EPS = np.finfo(np.float64).eps
-HIDDEN = 1e-3  # a row violated by more than this share of its own terms is hidden by others
+HIDDEN = 1e-3  # a row violated by more than this share of its terms counts as hidden
 Verdicts = list[tuple[str, str]]
 
 
 def judge(case: Case, answer: Answer) -> Verdicts:
-    """Return pairs of a category and why; the first says how the solve ended."""
+    """Return pairs of a category and a reason; the first is the end of the solve."""
     if answer.status == EXCEPTION:
         return [("EXCEPTION", answer.note)]
     if isinstance(case.truth, Refusal):
@@ -59,7 +62,7 @@ def _values(truth: Values, answer: Answer) -> Verdicts:
         if name not in answer.values:
             return [("FALSE CONVERGED", f"{name} is missing")]
         error = float(np.abs(answer.values[name] - expected).max(initial=0.0))
-        # some may be 0
+        # Some arrays may be 0.
         largest = max(float(np.abs(expected).max(initial=0.0)), 1e-3 * magnitude, 1e-9)
         if not error <= truth.tolerance * largest:
             return [
@@ -72,7 +75,11 @@ def _values(truth: Values, answer: Answer) -> Verdicts:
 
 
 def scales(box: Box) -> np.ndarray:
-    """Return d of the natural residual: A_ii for positive semi-definite A and grids, else by Ruiz's equilibration."""
+    """Return d of the natural residual.
+
+    It is A_ii for positive semi-definite A and grids, and otherwise follows from Ruiz's
+    equilibration.
+    """
     diagonal = np.asarray(box.A.diagonal(), dtype=float)
     if (box.grid or box.definite) and (diagonal > 0).all():
         return diagonal
@@ -87,7 +94,10 @@ def scales(box: Box) -> np.ndarray:
 
 
 def residual(box: Box, x: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)); where the clip is inactive r_i = y_i without cancellation."""
+    """Return r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)).
+
+    Where the clip is inactive, r_i = y_i without cancellation.
+    """
     low, high = box.bounds(x)
     y = box.A @ x + box.b
     target = x - y / d
@@ -118,7 +128,7 @@ def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
     start = np.clip(0.0, *box.bounds(np.clip(0.0, *box.bounds(np.zeros(len(x))))))
     r, first = residual(box, x, d), float(np.linalg.norm(residual(box, start, d)))
     size, (low, high) = terms(box, x), box.bounds(x)
-    # What rounding may leave: of y_i, or of d_i (x_i - l_i) where the bound holds x_i.
+    # Rounding error of y_i, or of d_i (x_i - l_i) where the bound holds x_i.
     at_bound = d * (
         np.abs(x)
         + np.where(np.isfinite(low), np.abs(low), 0)
@@ -128,7 +138,7 @@ def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
         8 * EPS * np.where(np.abs(r) == np.abs(box.A @ x + box.b), size, at_bound)
         + box.storage * size
     )
-    # A_ii is unique; Ruiz's limit depends on the order of its updates, by factors up to about 4.
+    # A_ii is unique. Ruiz's limit depends on the order of its updates, by factors up to about 4.
     slack = 1.05 if box.grid or box.definite else 10.0
     norm, allowed = (
         float(np.linalg.norm(r)),
@@ -162,7 +172,10 @@ def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
 
 
 def _far(box: Box, x: np.ndarray, d: np.ndarray) -> str:
-    """Return how far x is from the unique solution, beyond what tolerance and condition allow."""
+    """Return the distance of x from the unique solution.
+
+    Only the part beyond tolerance and condition counts.
+    """
     if np.abs(x).max() > box.largest:
         return f"|x| reaches {np.abs(x).max():.1e}, a solution has {box.largest:.1e} at most"
     if not box.unique or box.solution is None or len(x) > 400:
@@ -197,7 +210,7 @@ def _infeasible(box: Box) -> Verdicts:
 
 
 def exists(box: Box) -> bool | None:
-    """Return whether a solution exists; None where no oracle knows.
+    """Return whether a solution exists; None if no oracle can decide.
 
     A solution has l <= x <= u, y_i >= 0 where u_i is infinite and y_i <= 0 where l_i is. If A is
     monotone, an x that meets these inequalities is enough. Small problems are enumerated.
@@ -226,24 +239,24 @@ def _linear_program(box: Box) -> bool | None:
     limits = np.column_stack((box.lower, box.upper))
     rows_of = sp.vstack([-A[above], A[below]]) if above.any() or below.any() else None
     sides = np.r_[b[above], -b[below]]
-    found = linprog(
+    optimum = linprog(
         np.zeros(n),
         A_ub=rows_of,
         b_ub=sides if rows_of is not None else None,
         bounds=limits,
         options={"time_limit": 20.0},
     )
-    if found.status == 0 and rows_of is not None:
-        excess = (rows_of @ found.x - sides) / (
-            np.abs(sides) + abs(rows_of) @ np.abs(found.x) + 1e-300
+    if optimum.status == 0 and rows_of is not None:
+        excess = (rows_of @ optimum.x - sides) / (
+            np.abs(sides) + abs(rows_of) @ np.abs(optimum.x) + 1e-300
         )
         return True if excess.max(initial=0.0) < 1e-9 else None
-    return {0: True, 2: False}.get(found.status)
+    return {0: True, 2: False}.get(optimum.status)
 
 
 def _enumerate(box: Box) -> bool | None:
     A, n = (box.A.toarray() if sp.issparse(box.A) else box.A), len(box.b)
-    for state in product((0, -1, 1), repeat=n):  # free, at l, at u
+    for state in product((0, -1, 1), repeat=n):  # each unknown free, at l or at u
         s = np.array(state)
         x = np.where(s < 0, box.lower, np.where(s > 0, box.upper, 0.0))
         if not np.isfinite(x).all():
@@ -259,7 +272,7 @@ def _enumerate(box: Box) -> bool | None:
 
 
 def reference(program: Program) -> np.ndarray | None:
-    """Return x of the well-scaled program by Clarabel and PIQP; None where they do not agree."""
+    """Return x of the well-scaled program by Clarabel and PIQP; None if they disagree."""
     import qpsolvers
 
     values, first = [], None
@@ -268,7 +281,7 @@ def reference(program: Program) -> np.ndarray | None:
             warnings.simplefilter("ignore")
             try:
                 solution = qpsolvers.solve_problem(program.plain, solver=name)
-            except Exception:  # a peer's own
+            except Exception:  # any error of the peer
                 continue
         if solution.found and solution.x is not None:
             first = solution.x if first is None else first
@@ -287,7 +300,7 @@ def _cost(p: Any, x: np.ndarray) -> tuple[float, float]:
 
 
 def violation(p: Any, x: np.ndarray) -> float:
-    """Return the largest violation of a row or bound, relative to the row's own terms."""
+    """Return the largest violation of a row or bound, relative to the row's terms."""
     worst = 0.0
     for M, side, equal in ((p.G, p.h, False), (p.A, p.b, True)):
         if M is not None:

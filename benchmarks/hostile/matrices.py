@@ -1,4 +1,7 @@
-"""Kinds 1, 6, 7, 8, 10, 11 and 13 of the hostile benchmark: matrices, contacts and operators of a user's own."""
+"""Kinds 1, 6, 7, 8, 10, 11 and 13 of the hostile benchmark.
+
+These kinds are matrices, contacts and user-defined operators.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +20,19 @@ Rng = np.random.Generator
 
 
 def rows(rng: Rng) -> Case:
-    """Draw a problem in which one or a few rows are 1e8 to 1e16 times larger than the others."""
+    """Draw a problem in which one or a few rows are 1e8 to 1e16 times larger."""
     n = draw.size(rng, 2, 150)
     what, A = draw.definite(rng, n) if rng.random() < 0.6 else draw.positive(rng, n)
     n, definite = A.shape[0], what not in ("definite plus skew", "M-matrix")
     kind, low, high = draw.bounds(rng, n, str(rng.choice(["lower", "box", "mixed"])))
     x, b = draw.plant(rng, A, low, high)
-    # 1 / eps and beyond hides rows
+    # Factors of 1 / eps and beyond hide the other rows.
     large = 10 ** (rng.uniform(8, 16) if rng.random() < 0.5 else rng.uniform(15, 18))
     way = str(rng.choice(["inactive", "inactive", "units", "symmetric units", "start"]))
     some = np.flatnonzero((x == low) | (x == high))
     x0 = None
-    if way == "inactive" and len(some):  # y of held rows becomes large, with its sign: the same x
+    # y of held rows becomes large and keeps its sign; x stays the solution
+    if way == "inactive" and len(some):
         chosen = rng.choice(some, size=min(len(some), int(rng.integers(1, 3))), replace=False)
         b[chosen] += np.where(x[chosen] == low[chosen], large, -large)
         b[chosen[low[chosen] == high[chosen]]] = 1.0
@@ -64,7 +68,10 @@ def rows(rng: Rng) -> Case:
 
 
 def singular(rng: Rng) -> Case:
-    """Draw a singular system or LCP: compatible up to rounding, or incompatible by a margin."""
+    """Draw a singular system or LCP: compatible up to rounding, or incompatible.
+
+    An incompatible one is incompatible by a margin.
+    """
     n = draw.size(rng, 2, 800)
     kind = str(
         rng.choice(
@@ -93,7 +100,7 @@ def singular(rng: Rng) -> Case:
             spread=rng.choice([0.0, 1.0]),
         )
     elif kind == "graph":
-        # often of several components, or with empty rows
+        # The graph often has several components or empty rows.
         tails, heads = rng.integers(0, n, 2 * n), rng.integers(0, n, 2 * n)
         A = draw.graph_laplacian(
             n,
@@ -116,7 +123,7 @@ def singular(rng: Rng) -> Case:
     _, low, high = draw.bounds(rng, n, bound)
     x, b = draw.plant(rng, A, low, high)
     solvable: bool | None = True
-    # 1'y = 1'b: for equations 1'b = 0, for x >= 0 1'b >= 0
+    # 1'y = 1'b: equations need 1'b = 0, and x >= 0 needs 1'b >= 0.
     if kind not in ("low rank", "graph") and rng.random() < 0.4:
         b = b - b.mean() - 10 ** rng.uniform(-3, 1) * np.abs(b).mean() - 1e-3
         solvable = False if bound in ("none", "lower") else None
@@ -137,7 +144,10 @@ def singular(rng: Rng) -> Case:
 
 
 def _reynolds(rng: Rng) -> Case:
-    """Draw the periodic journal bearing: -(h^3 p')' + h' >= 0, p >= 0; b sums to 0 up to rounding."""
+    """Draw the periodic journal bearing: -(h^3 p')' + h' >= 0, p >= 0.
+
+    b sums to 0 up to rounding.
+    """
     n, e = draw.size(rng, 12, 1500), float(rng.choice([0.5, 0.9, 0.99, 0.999, 0.9999]))
     h = 1 + e * np.cos(2 * np.pi * (np.arange(n) + rng.random()) / n)
     i = np.arange(n)
@@ -160,7 +170,7 @@ def _reynolds(rng: Rng) -> Case:
 def narrow(rng: Rng) -> Case:
     """Draw a chain, beam or tridiagonal matrix with bounds in windows."""
     n, bandwidth = draw.size(rng, 50, 8000), int(rng.choice([1, 2, 3], p=[0.65, 0.3, 0.05]))
-    n = min(n, {1: n, 2: 2000, 3: 100}[bandwidth])  # conditions grow with n^2, n^4 and n^6
+    n = min(n, {1: n, 2: 2000, 3: 100}[bandwidth])  # condition numbers grow with n^2, n^4 and n^6
     if rng.random() < 0.08 and bandwidth < 3:
         n = draw.size(rng, 10_000, 50_000)
     t, foundation = np.arange(1, n + 1) / (n + 1), 10 ** rng.uniform(-8, -4)
@@ -199,7 +209,7 @@ def narrow(rng: Rng) -> Case:
 
 
 def sign(rng: Rng) -> Case:
-    """Draw a matrix with its sign flipped, wholly or in a few rows or entries."""
+    """Draw a matrix with its sign flipped, as a whole or in a few rows or entries."""
     n = draw.size(rng, 1, 600)
     what, A = draw.definite(rng, n) if rng.random() < 0.8 else draw.positive(rng, n)
     n, way = (
@@ -232,7 +242,10 @@ def sign(rng: Rng) -> Case:
 
 
 def friction(rng: Rng) -> Case:
-    """Draw contacts with friction: scenes of the gallery as boxes, random boxes, and pyramids as LCPs."""
+    """Draw contacts with friction.
+
+    They are scenes of the gallery as boxes, random boxes, and pyramids as LCPs.
+    """
     from warp_lcp.gallery.contact_models import BoxedModel, StewartTrinkleModel
     from warp_lcp.gallery.contact_scenes import SCENES
 
@@ -251,7 +264,7 @@ def friction(rng: Rng) -> Case:
         W, mu = J @ J.T, rng.uniform(0, 1.2)
         normal = np.repeat(3 * np.arange(k), 3)
         normal[::3] = -1
-        b = J @ rng.standard_normal(J.shape[1])  # velocities of bodies, so that there is a solution
+        b = J @ rng.standard_normal(J.shape[1])  # velocities of bodies, so that a solution exists
         name, system_A, system_b = f"random boxed friction, mu {mu:.1f}", W, b
         low, high = wl.AffineBounds.friction(normal, mu)
     else:
@@ -276,18 +289,18 @@ def friction(rng: Rng) -> Case:
         model = (
             BoxedModel() if rng.random() < 0.75 or len(system.q) > 300 else StewartTrinkleModel(4)
         )
-        given = model.problem(system)
+        boxed = model.problem(system)
         name, system_A, system_b, low, high = (
-            f"{given.name}",
-            given.A,
-            np.asarray(given.b),
-            given.lower,
-            given.upper,
+            f"{boxed.name}",
+            boxed.A,
+            np.asarray(boxed.b),
+            boxed.lower,
+            boxed.upper,
         )
     n = len(system_b)
     if not isinstance(low, wl.AffineBounds) and not isinstance(high, wl.AffineBounds):
         plain = [np.broadcast_to(np.asarray(side, dtype=float), n).copy() for side in (low, high)]
-        # (Anitescu, Potra)
+        # The LCP of Anitescu and Potra.
         box = Box(A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol, solvable=True)
         return box_case(
             rng,
@@ -326,7 +339,10 @@ def _side(side: Any, x: np.ndarray) -> np.ndarray:
 
 
 def malformed(rng: Rng) -> Case:
-    """Draw sparse matrices whose arrays contradict each other, singular blocks, or unusual but valid types."""
+    """Draw malformed sparse matrices, singular blocks, or unusual but valid types.
+
+    In a malformed matrix the arrays contradict each other.
+    """
     n = draw.size(rng, 3, 600)
     M = (sp.random_array((n, n), density=min(1.0, 5 / n), rng=rng) + 10 * sp.eye_array(n)).tocsr()
     way = str(
@@ -441,7 +457,10 @@ def _form(M: Any, form: str) -> Any:
 
 
 def _singular_block(rng: Rng, n: int) -> Case:
-    """Draw a matrix with exactly singular blocks: equal rows, empty rows or columns, zero diagonals; planted."""
+    """Draw a matrix with exactly singular blocks, and a planted solution.
+
+    The blocks have equal rows, empty rows or columns, or zero diagonals.
+    """
     symmetric = rng.random() < 0.5
     M = sp.random_array((n, n), density=min(1.0, 3 / n), rng=rng).tocsr()
     if symmetric:
@@ -466,7 +485,10 @@ def _singular_block(rng: Rng, n: int) -> Case:
 
 
 def odd(rng: Rng) -> Case:
-    """Draw what else users bring: buffers, functions, empty rows, stacks of masses, cycles, SciPy's lists of pairs."""
+    """Draw further inputs of users.
+
+    They are buffers, functions, empty rows, stacks of masses, cycles and SciPy's lists of pairs.
+    """
     way = str(
         rng.choice(["buffer", "operator", "empty row", "stack", "cycle", "pairs", "read-only"])
     )
@@ -531,7 +553,7 @@ def odd(rng: Rng) -> Case:
 
 
 def _operator(A: Any, buffer: bool) -> Any:
-    """Return a LinearOperator of a function that may hand out one buffer again and again."""
+    """Return a LinearOperator of a function that may return the same buffer each time."""
     out = np.empty(A.shape[0])
 
     def multiply(x: np.ndarray) -> np.ndarray:
@@ -546,7 +568,7 @@ def _operator(A: Any, buffer: bool) -> Any:
 
 
 def _frozen(A: Any) -> Any:
-    """Return A with read-only arrays, dense ones in Fortran's order."""
+    """Return A with read-only arrays; a dense A is in Fortran order."""
     B: Any = A.copy() if sp.issparse(A) else np.asfortranarray(A)
     (B.data if sp.issparse(A) else B).setflags(write=False)
     return B

@@ -1,4 +1,7 @@
-"""Kinds 2, 3 and 9 of the hostile benchmark: quadratic programs, infinity as a number, low rank."""
+"""Kinds 2, 3 and 9 of the hostile benchmark: quadratic programs, low rank.
+
+There are also bounds with infinity written as a number.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ INFINITIES = (1e20, 1e30, 1e100, 1e300, np.inf)
 
 
 def infinity(rng: Rng) -> Case:
-    """Draw bounds, or right sides of a program, with infinity written as 1e20 and more."""
+    """Draw bounds, or right sides of a program, with infinity written as 1e20 or more."""
     if rng.random() < 0.3:
         return program(rng, scale=0.0)
     n = draw.size(rng, 1, 120)
@@ -24,7 +27,7 @@ def infinity(rng: Rng) -> Case:
     kind, low, high = draw.bounds(rng, n)
     x, b = draw.plant(rng, A, low, high)
     written = rng.choice(INFINITIES, size=2, p=[0.35, 0.35, 0.1, 0.1, 0.1])
-    given = (
+    bound_arrays = (
         np.where(np.isfinite(low), low, -written[0]),
         np.where(np.isfinite(high), high, written[1]),
     )
@@ -53,7 +56,7 @@ def infinity(rng: Rng) -> Case:
         rng,
         f"{what}, {kind} bounds, infinity {written[0]:g}, {written[1]:g}",
         box,
-        bounds=given,
+        bounds=bound_arrays,
         named=named,
         share=0.5,
     )
@@ -65,7 +68,10 @@ def programs(rng: Rng) -> Case:
 
 
 def program(rng: Rng, scale: float) -> Case:
-    """Draw a convex program: costs and rows in units of 10^[-scale, scale], infinity as a number."""
+    """Draw a convex program with costs and rows in units of 10^[-scale, scale].
+
+    Infinity may be written as a number.
+    """
     import qpsolvers
 
     n = draw.size(rng, 1, 60)
@@ -80,7 +86,7 @@ def program(rng: Rng, scale: float) -> Case:
     )
     G, A = rng.standard_normal((rows, n)), rng.standard_normal((equations, n))
     h = G @ inside + rng.uniform(0, 1, rows) * (rng.random(rows) < 0.8)
-    # bounded below: q in range(P) - cone(G')
+    # Bounded below: q in range(P) - cone(G').
     q = P @ rng.standard_normal(n) + (rng.random(rows) < 0.2) @ -G
     lb, ub = (
         (inside - rng.uniform(0, 2, n), inside + rng.uniform(0, 2, n))
@@ -110,7 +116,7 @@ def program(rng: Rng, scale: float) -> Case:
     if expected == "infeasible":
         open_rows[0] = False
     elif rank < n:
-        open_rows[:] = False  # rows may be what bounds the cost from below
+        open_rows[:] = False  # keep all rows, which may bound the cost from below
     loose, big = rng.choice([1e20, 1e30, np.inf]), 10 ** rng.uniform(-scale, scale)
     by_row, by_equation = 10 ** rng.uniform(-scale, scale, (2, max(rows, equations, 1)))
     if rng.random() < 0.5:
@@ -178,7 +184,11 @@ def solve_program(problem: Any) -> Answer:
 
 
 def low_rank(rng: Rng) -> Case:
-    """Draw a box of low rank, a support vector machine, a ridge, a portfolio, a game or a linear program."""
+    """Draw a box problem of low rank.
+
+    It is a factored matrix, a support vector machine, a ridge, a portfolio, a game or a linear
+    program.
+    """
     kind = str(
         rng.choice(
             [
@@ -232,7 +242,7 @@ def low_rank(rng: Rng) -> Case:
             upper=np.r_[np.full(n, C), np.inf],
             **box,
         )
-    elif kind == "portfolio":  # least variance, sum x = 1, mean >= what half of the assets have
+    elif kind == "portfolio":  # least variance, sum x = 1, mean >= that of half of the assets
         mean = rng.uniform(0, 0.1, n)
         rows = np.vstack([np.ones(n), mean])
         A = np.block(

@@ -1,1 +1,4 @@
-"""Mutants: change one operator, number or statement of the code at a time and see whether a test notices (`make mutants`)."""
+"""Mutation tests: change one place of the code and see whether a test fails.
+
+The place is an operator, a number or a statement (`make mutants`).
+"""

@@ -1,4 +1,7 @@
-"""Draw mutants, run the tests of each and report who survives: `python -m warp_lcp.benchmarks.mutants --count 50 --seed 7`."""
+"""Draw mutants, run the tests of each and report the survivors.
+
+Run `python -m warp_lcp.benchmarks.mutants --count 50 --seed 7`.
+"""
 
 from __future__ import annotations
 
@@ -26,22 +29,25 @@ from warp_lcp.benchmarks.mutants.mutations import FORMULA, Mutant, draw, mutated
 from warp_lcp.benchmarks.mutants.tests_of import tests_of
 
 ROOT = Path(__file__).resolve().parents[2]
-HANGS = 40  # seconds of processor time that no single test takes
+HANGS = 40  # CPU seconds that no single test exceeds
 PYTEST = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=7"]
-# of tests: these first, with one of its parameters for each function, then these with all where a
-# mutant survives
+# Numbers of test files: the first run with one parameter of each function, then, for a survivor,
+# the second with all.
 FILES = (1, 4)
-# Warp not initialized: no threads, no device
+# Imported before the forks. Warp is not initialized: there are no threads and no device.
 PRELOADED = ("pyamg", "pydantic", "pytest", "rich", "scipy.sparse.linalg", "typer", "warp")
 TREE: Path
 SECONDS = 5.0
-SOUND: set[str] = set()  # tests that pass where nothing is changed, and those that do not
+SOUND: set[str] = set()  # tests that pass without a change, and those that fail
 BROKEN: set[str] = set()
 
 
 def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) -> None:
-    """Copy the tree for one worker and import what a mutant cannot change, so that forks start with it."""
-    global TREE, FILES, SECONDS  # a worker's own
+    """Copy the tree for one worker and import the modules that no mutant changes.
+
+    Forks then start with them.
+    """
+    global TREE, FILES, SECONDS  # each worker has its own
     TREE, FILES, SECONDS = Path(tempfile.mkdtemp(dir=folder)), files, seconds
     ignore = shutil.ignore_patterns(
         ".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis"
@@ -52,31 +58,35 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
 
 
 class Budget:
-    """A plug-in of pytest that leaves out the tests of a file which start after its time, and all but one parameter of each if asked to."""
+    """Plug-in of pytest with a time budget for each file.
+
+    Tests that start after its end are left out. On request, each function runs with one parameter
+    only.
+    """
 
     def __init__(self, seconds: float, *, brief: bool) -> None:
         self.seconds, self.brief, self.began = seconds, brief, 0.0
         self.spent: defaultdict[str, float] = defaultdict(float)
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        """Keep the first of each function's parameters."""
+        """Keep the first parameter of each function."""
         if self.brief:
             items[:] = {item.nodeid.split("[")[0]: item for item in reversed(items)}.values()
             items.reverse()
 
     def pytest_runtest_setup(self, item: Any) -> None:
-        """Leave out a test that starts too late."""
+        """Skip a test that starts too late."""
         import pytest
 
         if self.spent[str(item.path)] > self.seconds:
             pytest.skip("no time left for this file")
 
     def pytest_runtest_logstart(self) -> None:
-        """Note the time."""
+        """Record the time."""
         self.began = time.process_time()
 
     def pytest_runtest_logfinish(self, location: tuple[str, int, str]) -> None:
-        """Add the time of a test to its file's."""
+        """Add the time of a test to that of its file."""
         self.spent[str(TREE / location[0])] += time.process_time() - self.began
 
 
@@ -84,12 +94,11 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
     """Run pytest on this worker's tree in a process of its own.
 
     Args:
-        arguments: for pytest.
+        arguments: arguments of pytest.
         brief: whether to run each test with one of its parameters.
 
     Returns:
-        "passed", "failed", "crashed" or "timeout", the end of what it printed, and its processor
-        time [s].
+        "passed", "failed", "crashed" or "timeout", the end of its output, and its CPU time [s].
     """
     log, limit = TREE / "mutant.log", int(SECONDS * len(arguments) + HANGS)
     child = os.fork()
@@ -122,16 +131,16 @@ def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) 
     resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
     os.environ["PYTHONPATH"] = str(TREE)
     sys.path[:] = [str(TREE), *(p for p in sys.path if Path(p or ".").resolve() != ROOT)]
-    # which this program is a part of
+    # This program is part of the package, so its modules are removed too.
     for name in [name for name in sys.modules if name.split(".")[0] == "warp_lcp"]:
         del sys.modules[name]
-    gc.collect()  # their kernels, which Warp knows as long as they live
+    gc.collect()  # frees their kernels, which Warp otherwise keeps registered
     import pytest
 
     status: int = pytest.ExitCode.INTERNAL_ERROR
     try:
         status = pytest.main([*PYTEST, *arguments], plugins=[budget])
-    except BaseException:  # what a mutant raises
+    except BaseException:  # anything that a mutant raises
         traceback.print_exc(file=sys.stdout)
     finally:
         sys.stdout.flush()
@@ -139,7 +148,10 @@ def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) 
 
 
 def judge(mutant: Mutant) -> dict[str, object]:
-    """Apply a mutant, run its tests and take it back; tests that fail without it too are left out from then on."""
+    """Apply a mutant, run its tests and revert it.
+
+    Tests that fail without it too are left out from then on.
+    """
     path = TREE / mutant.module
     whole, stat = path.read_text(), path.stat()
     chosen = (
@@ -183,7 +195,7 @@ def judge(mutant: Mutant) -> dict[str, object]:
 
 
 def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
-    """Write mutants.json and mutants.md, which names each survivor, and print the latter."""
+    """Write mutants.json and mutants.md; print the latter, which names the survivors."""
     (out / "mutants.json").write_text(json.dumps(results, indent=1))
     counts = Counter(str(r["verdict"]) for r in results)
     seconds = sum(float(str(r["seconds"])) for r in results)
@@ -260,36 +272,42 @@ def _drawn(formulas: bool, count: int | None, seed: int) -> list[Mutant]:
 
 def main() -> None:
     """Run the command line."""
-    given = options()
-    given.out.mkdir(parents=True, exist_ok=True)
-    kernels, usual, kept = (
-        given.out.parent / "kernels-of-mutants",
+    arguments = options()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    kernels, usual, results_file = (
+        arguments.out.parent / "kernels-of-mutants",
         Path("~/.cache/warp").expanduser(),
-        given.out / "mutants.json",
+        arguments.out / "mutants.json",
     )
     if usual.exists() and not kernels.exists():
         shutil.copytree(usual, kernels)
     os.environ["WARP_CACHE_PATH"] = str(kernels)
-    if given.again:
+    if arguments.again:
         drawn = [
             Mutant(*(r[name] for name in Mutant._fields))
-            for r in json.loads(given.again.read_text())
+            for r in json.loads(arguments.again.read_text())
             if r["verdict"] != "killed"
         ]
     else:
-        drawn = _drawn(given.formulas, given.count, given.seed)
-    results = json.loads(kept.read_text()) if kept.exists() else []
+        drawn = _drawn(arguments.formulas, arguments.count, arguments.seed)
+    results = json.loads(results_file.read_text()) if results_file.exists() else []
     done = {tuple(r[name] for name in Mutant._fields[:4]) for r in results}
     todo = [mutant for mutant in drawn if mutant[:4] not in done]
-    random.Random(given.seed).shuffle(todo)  # a run that is stopped has seen all packages
-    started = (given.jobs, prepare, (folder := tempfile.mkdtemp(), given.files, given.seconds))
+    random.Random(arguments.seed).shuffle(
+        todo
+    )  # a run that is stopped has then covered all packages
+    started = (
+        arguments.jobs,
+        prepare,
+        (folder := tempfile.mkdtemp(), arguments.files, arguments.seconds),
+    )
     with multiprocessing.get_context("fork").Pool(*started) as pool:
         for result in pool.imap_unordered(judge, todo):
             results.append(result)
             print("{verdict:8}{seconds:6} s {module}:{line} {after}".format(**result), flush=True)
-            kept.write_text(json.dumps(results, indent=1))
+            results_file.write_text(json.dumps(results, indent=1))
     shutil.rmtree(folder)
-    report(results, given.out, given.seed)
+    report(results, arguments.out, arguments.seed)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Mutants of the formulas that make an algorithm: signs, constants, index sets, conditions; each with the test file that must notice it."""
+"""Mutants of the formulas of the algorithms.
+
+They change signs, constants, index sets and conditions. Each has the test file that must fail.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ class Formula(NamedTuple):
     """One change of a formula.
 
     Attributes:
-        module: file, from the root.
-        before: text that stands there once.
-        after: what it becomes.
-        tests: the test file that fails with it.
+        module: file, relative to the root.
+        before: text that occurs once in the file.
+        after: its replacement.
+        tests: test file that fails with the change.
     """
 
     module: str

@@ -1,4 +1,8 @@
-"""What is changed: cosmic-ray's operators that leave code plausible, calls left out, operators in headers of C++, and formulas."""
+"""Mutation operators.
+
+They are operators of cosmic-ray that leave plausible code, omitted calls, changed operators in C++
+headers, and changed formulas.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +21,9 @@ from cosmic_ray.plugins import get_operator
 from warp_lcp.benchmarks.mutants.formulas import FORMULAS
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
-# lines that only a type checker, the time of a compiler or an eye can tell
+# Lines whose changes show only to a type checker, a clock or a reader.
 UNSEEN = re.compile(r"TYPE_CHECKING|enable_backward|\(\d+, \d+, \d+\)|\[\d+, \d+, \d+\]")
-# needs ranks of MPI; names; tables of numbers
+# Needs MPI ranks; package names; tables of numbers.
 APART = re.compile(r"/distributed|/__init__\.py$|/rank_|_table\.py$")
 
 BINARY = (
@@ -55,7 +59,7 @@ SWAPS = {
     "||": "&&",
 }
 SWAPS |= {"&": "|", "|": "&"}
-NATIVE_SWAP = "NativeSwap"  # one of them for its neighbor
+NATIVE_SWAP = "NativeSwap"  # replaces one of them by its neighbor
 FORMULA = "Formula"  # one of FORMULAS
 NATIVE = re.compile(
     r"(?<=[\w\])] )(?:[<>=!]=|&&|\|\||[-+*/<>&|])(?= [\w(!-])|(?<=[\w\])])[*/](?=[\w(])"
@@ -63,10 +67,10 @@ NATIVE = re.compile(
 
 
 class LeaveOut(Operator):
-    """Replace a statement that is a call, or that changes a variable in place, by `pass`."""
+    """Replace a call statement or an in-place change of a variable by `pass`."""
 
     def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
-        """Yield where such a statement starts and ends."""
+        """Yield the start and the end of such a statement."""
         statement = node.parent is not None and node.parent.type == "simple_stmt"
         call = node.type == "atom_expr" and getattr(node.children[-1], "children", [""])[0] == "("
         inplace = node.type == "expr_stmt" and getattr(
@@ -81,12 +85,15 @@ class LeaveOut(Operator):
 
     @classmethod
     def examples(cls) -> tuple[()]:
-        """Return none."""
+        """Return no examples."""
         return ()
 
 
 class Mutant(NamedTuple):
-    """One change: file, line, operator's name, which of the operator's places in the file, and the lines before and after."""
+    """One change: file, line, operator, occurrence, and the lines before and after.
+
+    The occurrence counts the operator's places in the file.
+    """
 
     module: str
     line: int
@@ -102,7 +109,7 @@ def operator(name: str) -> Operator:
 
 
 def native_places(source: str) -> list[re.Match[str]]:
-    """Return the operators of a header outside of comments and of the preprocessor's lines."""
+    """Return the operators of a header, outside comments and preprocessor lines."""
     return [
         m
         for m in NATIVE.finditer(source)
@@ -122,10 +129,10 @@ def mutated(source: str, name: str, occurrence: int) -> str:
 
 def of_formulas(root: Path) -> list[Mutant]:
     """Return the mutants of FORMULAS."""
-    found = []
+    mutants = []
     for number, (module, before, after, _) in enumerate(FORMULAS):
         source = (root / module).read_text()
-        found.append(
+        mutants.append(
             Mutant(
                 module,
                 source.count("\n", 0, source.index(before)) + 1,
@@ -135,16 +142,18 @@ def of_formulas(root: Path) -> list[Mutant]:
                 after.strip(),
             )
         )
-    return found
+    return mutants
 
 
 def draw(root: Path, count: int, seed: int) -> list[Mutant]:
-    """Return mutants at lines equally spaced over all modules, each with an operator that has a place there or next to there.
+    """Return mutants at equally spaced lines of all modules.
+
+    Each has an operator that applies at its line or near it.
 
     Args:
-        root: folder of the packages.
-        count: how many.
-        seed: of the first line and of the operators.
+        root: folder that contains the packages.
+        count: number of mutants.
+        seed: seed of the first line and of the operators.
     """
     rng = random.Random(seed)
     files = sorted(
@@ -164,7 +173,7 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     wanted = [lines[int((start + i) * len(lines) / count)] for i in range(count)]
     sources = {module: (root / module).read_text() for module in {module for module, _ in wanted}}
     places = {module: _places(module, source) for module, source in sources.items()}
-    found = []
+    mutants = []
     for module, line in wanted:
         if places[module]:
             nearest = min(abs(at - line) for at, *_ in places[module])
@@ -175,14 +184,17 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
                 text.splitlines()
                 for text in (sources[module], mutated(sources[module], name, occurrence))
             )
-            found.append(
+            mutants.append(
                 Mutant(module, at, name, occurrence, old[at - 1].strip(), new[at - 1].strip())
             )
-    return found
+    return mutants
 
 
 def _places(module: str, source: str) -> list[tuple[int, str, int]]:
-    """Return line, operator's name and occurrence of a file's changes but those in annotations, in what is raised and on UNSEEN lines."""
+    """Return line, operator name and occurrence of a file's possible changes.
+
+    Annotations, raised expressions and UNSEEN lines are left out.
+    """
     if module.endswith(".h"):
         return [
             (source.count("\n", 0, match.start()) + 1, NATIVE_SWAP, n)
@@ -201,7 +213,10 @@ def _places(module: str, source: str) -> list[tuple[int, str, int]]:
 
 
 def _inert(node: Any) -> bool:
-    """Return whether a node lies in an annotation, a decorator or what is raised, or is a bare `*` between parameters."""
+    """Return whether a node is in an annotation, a decorator or a raise statement.
+
+    Also whether it is a bare `*` between parameters.
+    """
     if node.parent is not None and node.parent.type == "parameters":
         return True
     while node.parent is not None:

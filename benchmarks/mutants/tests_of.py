@@ -1,4 +1,8 @@
-"""Which tests are run for a change of a module: those that bear its name, then those that name what it defines, then those of its users."""
+"""Choice of the tests for a change of a module.
+
+First come the tests that bear its name, then those that name its definitions, then those of its
+users.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,11 @@ from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
-# minutes each, or about other things: compilation for CUDA, pages and notebooks, ranks, runs that
-# are killed
+# Tests of minutes, or of other subjects: compilation for CUDA, pages and notebooks, ranks, killed
+# runs.
 NEVER = re.compile(
-    r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
+    r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|"
+    r"tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
 )
 WORD = re.compile(r"\w+")
 
@@ -24,20 +29,23 @@ def _tests(root: Path) -> dict[str, set[str]]:
 
 @cache
 def _users(root: Path) -> dict[str, set[str]]:
-    """Return the modules that import each module, by its last name and its package's, and who names each header."""
+    """Return the modules that import each module, and the users of each header.
+
+    Modules are keyed by their last name and that of their package.
+    """
     users = defaultdict(set)
     for package in ("warp_lcp", "fluids", "granular"):
         for file in (root / package).rglob("*"):
             if file.suffix in (".py", ".h"):
                 places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
                 for header in re.findall(r"[\"/](\w+)\.h(?::[\w.]+)?\"", file.read_text()):
-                    found = [
+                    included = [
                         place / f"{header}.h"
                         for place in places
                         if (place / f"{header}.h").exists()
                     ]
-                    if found and found[0] != file:
-                        users[str(found[0].relative_to(root))].add(str(file.relative_to(root)))
+                    if included and included[0] != file:
+                        users[str(included[0].relative_to(root))].add(str(file.relative_to(root)))
         for file in (root / package).rglob("*.py"):
             for whole, names in re.findall(
                 r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE
@@ -51,14 +59,14 @@ def _users(root: Path) -> dict[str, set[str]]:
 def tests_of(root: Path, module: str) -> list[str]:
     """Return test files, the likeliest to notice a change of a module first."""
     score: dict[str, float] = defaultdict(float)
-    front, weight, seen = {module}, 1.0, set[str]()
-    for _ in range(3):  # headers in headers
+    front, weight, visited = {module}, 1.0, set[str]()
+    for _ in range(3):  # headers may include headers
         front = {
             user
             for file in front
             for user in (_users(root).get(file, ()) if file.endswith(".h") else (file,))
         }
-    if not front:  # its name is put together
+    if not front:  # its name is composed at run time
         front = {
             str(file.relative_to(root)) for file in (root / module).parents[1].glob("*_kernels.py")
         }
@@ -83,7 +91,7 @@ def tests_of(root: Path, module: str) -> list[str]:
                     * (8 * same + len(words & there) ** 0.5 * (2 if place else 1))
                     / len(front) ** 0.5
                 )
-        seen |= front
-        front = {user for file in front for user in _users(root).get(file, ())} - seen
+        visited |= front
+        front = {user for file in front for user in _users(root).get(file, ())} - visited
         weight /= 4
     return [test for test in sorted(score, key=lambda t: (-score[t], t)) if score[test] > 0]

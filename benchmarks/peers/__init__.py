@@ -1,4 +1,7 @@
-"""The engine and its peers on the same problems to the same residual, in turns, in one run."""
+"""Suite `peers`: this library and other solvers on the same problems.
+
+All solve to the same residual, interleaved in one run.
+"""
 
 from __future__ import annotations
 
@@ -29,28 +32,32 @@ from warp_lcp.benchmarks.problems import BOUNDS, splash
 TITLE = "Pressure solves against peers"
 SIZES = (32, 64, 128)
 ENGINE = "ProjectedMultigrid"
-BUDGET = 60.0  # [s] after which a peer is not asked again at a size
-LONGEST = 300.0  # [s] that a solve may be expected to take, from that at the size before
-# of the tolerance, until the residual is that asked for
+BUDGET = 60.0  # [s] after which a peer gets no more rounds at a size
+LONGEST = 300.0  # [s] limit of the expected time of a solve, extrapolated from the size before
+# Factors of the tolerance, tried until the residual is the required one.
 TIGHTER = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6)
-SLACK = 1.01  # of the residual: sums are in another order
-GROWTH = 4 / 3  # least exponent of the time of solves whose iterations grow, for what is expected
+SLACK = 1.01  # factor of the residual, since sums have another order
+GROWTH = 4 / 3  # least exponent of the expected time, for solves whose iterations grow
 
 
 @dataclass
 class Contest:
-    """A peer on a problem."""
+    """Peer on one problem, with its answers."""
 
-    peer: Peer  # who
-    question: Question  # what
-    tolerance: float = RTOL  # what it is asked for, so that the residual is that of the contest
-    answers: list[Answer] = field(default_factory=list)  # of the rounds
-    residual: float = float("nan")  # of the last one
-    remark: str = ""  # why there are none
+    peer: Peer  # the solver
+    question: Question  # the problem
+    # Tolerance given to the peer, such that its residual is the required one.
+    tolerance: float = RTOL
+    answers: list[Answer] = field(default_factory=list)  # one for each round
+    residual: float = float("nan")  # residual of the last answer
+    remark: str = ""  # why there are no answers
 
     def calibrate(self) -> None:
-        """Find the loosest tolerance whose answer has the residual asked for; the answer before it counts as a warm-up."""
-        begun = time.perf_counter()
+        """Find the loosest tolerance that gives the required residual.
+
+        The answer before it counts as a warm-up.
+        """
+        start_time = time.perf_counter()
         for factor in TIGHTER:
             self.tolerance = factor * RTOL
             try:
@@ -60,15 +67,15 @@ class Contest:
                 return
             self.residual = self.question.residual(answer.x)
             if self.residual <= SLACK * RTOL:
-                if answer.total > BUDGET / 3:  # too slow to be asked again
+                if answer.total > BUDGET / 3:  # too slow for another round
                     self.answers.append(answer)
                 return
-            if time.perf_counter() - begun > BUDGET:
+            if time.perf_counter() - start_time > BUDGET:
                 break
         self.remark = f"residual {self.residual:.1e} at the least"
 
     def again(self) -> None:
-        """Take a sample, unless the peer failed or has had its time."""
+        """Take a sample, unless the peer has failed or used its time."""
         if not self.remark and sum(a.total for a in self.answers) < BUDGET:
             try:
                 self.answers.append(self.peer.solve(self.question, self.tolerance))
@@ -76,7 +83,7 @@ class Contest:
                 self.remark = str(error)
 
     def record(self, ours: Case) -> Record:
-        """Return what was measured, with the ratio to ours in the same rounds."""
+        """Return the measured figures, with the ratio to ours in the same rounds."""
         peer, scene = self.peer, self.question.scene
         facts = {
             "n": scene.n,
@@ -106,19 +113,19 @@ class Contest:
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Ask everybody at the sizes asked for."""
+    """Measure all solvers at the requested sizes."""
     sizes = sorted(options.sizes or SIZES)
     where = machine(
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
     )
     records, seconds = [where], dict[tuple[str, str], tuple[int, float]]()
-    with roster(options.device) as there:
-        where.facts["peers"] = there.versions
-        for name, text in there.versions.items():
+    with roster(options.device) as available:
+        where.facts["peers"] = available.versions
+        for name, text in available.versions.items():
             if not text[:1].isdigit():
                 options.say(f"{name}: {text}")
         for n in sizes:
-            found = _measure_size(n, there, seconds, options)
+            found = _measure_size(n, available, seconds, options)
             records += found
             seconds |= {
                 (r.facts["method"], r.facts["bounds"]): (n, t)
@@ -129,7 +136,7 @@ def measure(options: Options, out: Path) -> Results:
     asked = Table(
         "Who was asked",
         ["library", "version"],
-        [[name, text] for name, text in there.versions.items()],
+        [[name, text] for name, text in available.versions.items()],
     )
     tables = [_targets(records, n), asked, *(_table(m, records) for m in sizes)]
     return Results(records, tables, [_bars(bounds, records) for bounds in BOUNDS])
@@ -138,7 +145,7 @@ def measure(options: Options, out: Path) -> Results:
 def _measure_size(
     n: int, there: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
 ) -> list[Record]:
-    """Measure one sample of everybody in each round."""
+    """Measure one sample of each solver in every round."""
     scene = splash(n)
     cases = {
         bounds: Case("unit", scene, bounds, wl.ProjectedMultigrid(), options.device)
@@ -157,7 +164,7 @@ def _measure_size(
         else:
             options.say(f"peers at {n}^3: {contest.question.bounds} {peer.name}")
             contest.calibrate()
-    for turn in range(options.repeat + 1):  # the first one loads kernels
+    for turn in range(options.repeat + 1):  # the first turn loads kernels
         options.say(f"peers at {n}^3, round {turn} of {options.repeat}")
         for case in cases.values():
             case.cold(keep=turn > 0)
@@ -183,7 +190,7 @@ def _engine(case: Case) -> Record:
 
 
 def _targets(records: Sequence[Record], n: int) -> Table:
-    """Return the figures to reach at the largest size."""
+    """Return the targets at the largest size."""
 
     def least(bounds: str, *names: str) -> Figure | None:
         here = [
@@ -254,7 +261,7 @@ def _table(n: int, records: Sequence[Record]) -> Table:
 
 
 def _bars(bounds: str, records: Sequence[Record]) -> Bars:
-    """Return seconds by solver at the largest size where there are any."""
+    """Return the seconds of each solver at the largest size that has any."""
     here = [
         r
         for r in records

@@ -1,4 +1,7 @@
-"""The dam by PETSc's SNESVI: nested iteration on doubled grids, Newton's steps on the free set, geometric multigrid. Run by `dam.py`."""
+"""The dam by PETSc's SNESVI; `dam.py` runs this program.
+
+It uses grid sequencing on doubled grids, Newton steps on the free set, and geometric multigrid.
+"""
 
 import gc
 import json
@@ -14,7 +17,10 @@ from petsc4py import PETSc  # noqa: E402
 
 
 def problem(nx, ny, width, high, low):
-    """Return matrix and right-hand side of A w = c by rows, border nodes included, for -Laplace w + 1 >= 0 times hx hy."""
+    """Return matrix and right-hand side of the dam, A w = c.
+
+    Rows include border nodes. The problem is -Laplace w + 1 >= 0 times hx hy.
+    """
     x, y = np.linspace(0, width, nx), np.linspace(0, high, ny)
     w = np.zeros((ny, nx))
     w[0] = (high**2 * (width - x) + low**2 * x) / (2 * width)
@@ -36,10 +42,10 @@ def problem(nx, ny, width, high, low):
 
 
 def solve(dm, nx, ny, guess, rtol, sizes):
-    """Solve on one grid; return the solver, and its solution."""
+    """Solve on one grid; return the solver and its solution."""
     (starts, columns, values), right = problem(nx, ny, **sizes)
     A = PETSc.Mat().createAIJ((nx * ny,) * 2, csr=(starts, columns, values))
-    del starts, columns, values  # memory is short on the finest grid
+    del starts, columns, values  # memory is scarce on the finest grid
     c = PETSc.Vec().createWithArray(right)
     snes = PETSc.SNES().create()
     snes.setDM(dm)
@@ -66,7 +72,7 @@ def main():
     """Print seconds, iterations and the answer at a node as JSON."""
     request = json.loads(sys.argv[1])
     sizes, rtol = request["sizes"], request["rtol"]
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     nx, ny, levels = request["coarsest"][0], request["coarsest"][1], request["levels"]
     dm = PETSc.DMDA().create([nx, ny], dof=1, stencil_width=1)
     snes: Any = None
@@ -95,7 +101,7 @@ def main():
         )
     w = x.getArray().reshape(ny, nx)
     answer = {
-        "seconds": time.perf_counter() - begun,
+        "seconds": time.perf_counter() - start_time,
         "steps": steps,
         "wet": int((w > 0).sum()),
         "norm": float(np.linalg.norm(w[1:-1, 1:-1])),

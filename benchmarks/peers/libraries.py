@@ -1,4 +1,7 @@
-"""Peers in this process, on the assembled matrix: solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower."""
+"""Peers in this process, on the assembled matrix.
+
+They are solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +20,21 @@ CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
 def pyamg(
     question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver"
 ) -> Answer:
-    """One of PyAMG's hierarchies before CG, all defaults."""
+    """Solve by CG with one of PyAMG's hierarchies, all defaults."""
     import pyamg as library
 
     A, residuals = sp.csr_matrix(question.matrix), list[float]()
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its own, of its use of SciPy
+        warnings.simplefilter("ignore")  # PyAMG warns about its own use of SciPy
         hierarchy = getattr(library, build)(A)
         middle = time.perf_counter()
         x = hierarchy.solve(-question.b, tol=tolerance, accel="cg", residuals=residuals)
-    return Answer(x, middle - begun, time.perf_counter() - middle, len(residuals) - 1)
+    return Answer(x, middle - start_time, time.perf_counter() - middle, len(residuals) - 1)
 
 
 def scipy_cg(question: Question, tolerance: float) -> Answer:
-    """Plain conjugate gradients."""
+    """Solve by plain conjugate gradients."""
     A, b, count = question.matrix, -question.b, list[int]()
     begun = time.perf_counter()
     x, _ = scipy.sparse.linalg.cg(
@@ -41,22 +44,28 @@ def scipy_cg(question: Question, tolerance: float) -> Answer:
 
 
 def amgcl(question: Question, tolerance: float) -> Answer:
-    """AMGCL's smoothed aggregation with one sweep of its ILU(0) before CG, the fastest of its smoothers here."""
+    """Solve by CG with AMGCL's smoothed aggregation.
+
+    One sweep of its ILU(0) smooths; it is the fastest of its smoothers here.
+    """
     import pyamgcl
 
     A, b = sp.csr_matrix(question.matrix), -question.b
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     preconditioner = pyamgcl.amg(
         A, {"coarsening.type": "smoothed_aggregation", "relax.type": "ilu0"}
     )
     solver = pyamgcl.solver(preconditioner, {"type": "cg", "tol": tolerance, "maxiter": 1000})
     middle = time.perf_counter()
     x = solver(b)
-    return Answer(x, middle - begun, time.perf_counter() - middle, int(solver.iters))
+    return Answer(x, middle - start_time, time.perf_counter() - middle, int(solver.iters))
 
 
 def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
-    """Warp's own conjugate gradients with a diagonal preconditioner on a Warp BSR matrix, float64."""
+    """Solve by Warp's conjugate gradients with a diagonal preconditioner.
+
+    The matrix is a Warp BSR matrix in float64.
+    """
     import warp as wp
     import warp.optim.linear
     import warp.sparse
@@ -80,7 +89,7 @@ def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
 
 
 def cupy_cg(question: Question, tolerance: float) -> Answer:
-    """Plain conjugate gradients of CuPy, on its current CUDA device."""
+    """Solve by CuPy's plain conjugate gradients on its current CUDA device."""
     import cupy
     import cupyx.scipy.sparse
     import cupyx.scipy.sparse.linalg
@@ -100,12 +109,15 @@ def cupy_cg(question: Question, tolerance: float) -> Answer:
 
 
 def osqp(question: Question, tolerance: float) -> Answer:
-    """Operator splitting with one factorization; tolerances are absolute, in units of b."""
+    """Solve by OSQP: operator splitting with one factorization.
+
+    Its tolerances are absolute, in units of b.
+    """
     import osqp as library
 
     P, A = sp.triu(question.matrix, format="csc"), sp.eye_array(len(question.b), format="csc")
     scale = tolerance * float(np.abs(question.b).max())
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     solver = library.OSQP()
     solver.setup(
         sp.csc_matrix(P),
@@ -122,16 +134,16 @@ def osqp(question: Question, tolerance: float) -> Answer:
     middle = time.perf_counter()
     result = solver.solve(raise_error=False)
     return Answer(
-        np.array(result.x), middle - begun, time.perf_counter() - middle, int(result.info.iter)
+        np.array(result.x), middle - start_time, time.perf_counter() - middle, int(result.info.iter)
     )
 
 
 def piqp(question: Question, tolerance: float) -> Answer:
-    """Proximal interior point with sparse factorizations."""
+    """Solve by PIQP: a proximal interior-point method, sparse factorizations."""
     import piqp as library
 
     P = sp.csc_matrix(question.matrix)
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     solver = library.SparseSolver()
     solver.settings.eps_abs = tolerance * float(np.abs(question.b).max())
     solver.settings.eps_rel = 0.0
@@ -141,14 +153,17 @@ def piqp(question: Question, tolerance: float) -> Answer:
     solver.solve()
     return Answer(
         np.array(solver.result.x),
-        middle - begun,
+        middle - start_time,
         time.perf_counter() - middle,
         int(solver.result.info.iter),
     )
 
 
 def clarabel(question: Question, tolerance: float) -> Answer:
-    """Interior point on a homogeneous embedding, with sparse factorizations."""
+    """Solve by Clarabel: an interior-point method on a homogeneous embedding.
+
+    Its factorizations are sparse.
+    """
     import clarabel as library
 
     P = sp.csc_matrix(sp.triu(question.matrix, format="csc"))
@@ -160,7 +175,7 @@ def clarabel(question: Question, tolerance: float) -> Answer:
     settings = library.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     solver = library.DefaultSolver(
         P,
         question.b,
@@ -172,5 +187,8 @@ def clarabel(question: Question, tolerance: float) -> Answer:
     middle = time.perf_counter()
     solution = solver.solve()
     return Answer(
-        np.array(solution.x), middle - begun, time.perf_counter() - middle, int(solution.iterations)
+        np.array(solution.x),
+        middle - start_time,
+        time.perf_counter() - middle,
+        int(solution.iterations),
     )

@@ -1,4 +1,4 @@
-"""What a peer is asked: the same problem, the same residual, the same tolerance."""
+"""Problem, answer and interface of a peer."""
 
 from __future__ import annotations
 
@@ -17,19 +17,22 @@ INEQUALITIES = BOUNDS[1:]
 
 
 class PeerFailed(RuntimeError):
-    """A peer gave no answer; the message says why."""
+    """Error of a peer that gives no answer; the message says why."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """The problem y = A x + b, x >= lower, on the FLUID cells of a scene, assembled."""
+    """Assembled problem y = A x + b, x >= lower, on the FLUID cells of a scene."""
 
     scene: Splash  # the scene
     bounds: str  # `linear`, `walls`, `everywhere`
 
     @cached_property
     def matrix(self) -> sp.csr_array:
-        """A, float64, with 32-bit indices: peers convert others at their own expense."""
+        """Matrix A, float64, with 32-bit indices.
+
+        Peers convert other formats at their own expense.
+        """
         A = self.scene.matrix()
         A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
         return A
@@ -41,39 +44,42 @@ class Question:
 
     @cached_property
     def b(self) -> np.ndarray:
-        """Shape (unknowns,)."""
+        """Vector b, shape (unknowns,)."""
         return self.scene.b.ravel()[self.where]
 
     @cached_property
     def lower(self) -> np.ndarray:
-        """Shape (unknowns,); -inf where there is no bound."""
+        """Lower bounds, shape (unknowns,); -inf if there is no bound."""
         return np.broadcast_to(self.scene.lower(self.bounds), self.scene.b.shape).ravel()[
             self.where
         ]
 
     @cached_property
     def exact(self) -> Exact:
-        """The equations of the natural residual."""
+        """Equations of the natural residual."""
         return Exact(self.matrix, self.b, self.lower, np.full_like(self.b, np.inf))
 
     def residual(self, x: np.ndarray) -> float:
-        """Return the relative natural residual of x, in float64: that of every result of this project, by other code."""
+        """Return the relative natural residual of x, in float64.
+
+        It is the residual that results of this project report, computed by other code.
+        """
         return self.exact.residual(x) / self.exact.residual(self.exact.start)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a peer found."""
+    """Answer of a peer."""
 
     x: np.ndarray  # shape (unknowns,)
-    setup: float  # of what could be reused for another b [s]
-    solve: float  # of the rest [s]
-    iterations: int  # of the method
-    linear_iterations: int | None = None  # within them
+    setup: float  # time of the part that can be reused for another b [s]
+    solve: float  # remaining time [s]
+    iterations: int  # iterations of the method
+    linear_iterations: int | None = None  # iterations of linear solves within them
 
     @property
     def total(self) -> float:
-        """Set-up and solve [s]."""
+        """Time of set-up and solve [s]."""
         return self.setup + self.solve
 
 
@@ -82,14 +88,14 @@ class Peer:
     """Another solver of the same problem.
 
     Args:
-        name: what tables call it.
-        library: distribution it is of.
-        solve: solves to its own idea of a tolerance; the harness tightens that until
-            `Question.residual` agrees.
-        bounds: which problems it solves.
-        most: cells a side beyond which it is not asked.
-        settings: what was set.
-        precision: of its vectors.
+        name: name in tables.
+        library: name of its distribution.
+        solve: solves to the peer's own tolerance; the harness tightens it until
+            `Question.residual` is small enough.
+        bounds: kinds of bounds that it solves.
+        most: most cells along a side that are measured.
+        settings: non-default settings.
+        precision: precision of its vectors.
     """
 
     name: str

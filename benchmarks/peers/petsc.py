@@ -1,4 +1,4 @@
-"""PETSc, in an interpreter of its own: how it is found, and our side of the exchange."""
+"""PETSc as a peer: its interpreter, and our side of the exchange."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from warp_lcp.benchmarks.problems import BOUNDS
 
 VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interpreter
 PROBE_SECONDS = 120.0
-# where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
+# Debian keeps here the builds from which petsc4py chooses by PETSC_DIR.
 DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"
 CYCLE = "V-cycle, Galerkin, SSOR"
 ICC, HYPRE = {"pc_type": "icc"}, {"pc_type": "hypre", "pc_hypre_type": "boomeramg"}
-# options, problems, cells a side beyond which it is not asked
+# Options, problems, and cells along a side beyond which the method is not measured.
 METHODS: dict[str, tuple[dict[str, str], tuple[str, ...], int, str]] = {
     "PETSc CG+MG": ({}, BOUNDS[:1], 256, f"geometric 2x2x2 aggregates, {CYCLE}"),
     "PETSc CG+GAMG": ({"pc_type": "gamg"}, BOUNDS[:1], 256, "-pc_type gamg"),
@@ -47,7 +47,10 @@ METHODS: dict[str, tuple[dict[str, str], tuple[str, ...], int, str]] = {
 
 
 def interpreter(module: str = "petsc4py", variable: str = VARIABLE) -> str | None:
-    """Return the first interpreter that imports a module: the one the variable names, this one, the system's; None if none does."""
+    """Return the first interpreter that can import a module; None if none can.
+
+    It tries the one that the variable names, this one, and that of the system.
+    """
     named = os.environ.get(variable)
     for python in [named] if named else [sys.executable, "/usr/bin/python3"]:
         command = [python, "-c", f"import {module}"]
@@ -63,7 +66,7 @@ def interpreter(module: str = "petsc4py", variable: str = VARIABLE) -> str | Non
 
 
 def missing() -> str:
-    """Return what to tell where there is none."""
+    """Return the message for a missing PETSc."""
     named = os.environ.get(VARIABLE)
     where = (
         f"{named}, which {VARIABLE} names, does not import petsc4py"
@@ -74,7 +77,10 @@ def missing() -> str:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of its interpreter: one thread, and Debian's PETSc where none is named."""
+    """Return the environment of PETSc's interpreter.
+
+    It sets one thread, and Debian's PETSc if PETSC_DIR names none.
+    """
     found = sorted(glob.glob(DEBIAN_PETSC))
     return {
         **({"PETSC_DIR": found[-1]} if found else {}),
@@ -86,10 +92,10 @@ def environment() -> dict[str, str]:
 
 @contextmanager
 def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
-    """Start PETSc where it is found; yield its peers and its version.
+    """Start PETSc if it is installed; yield its peers and its version.
 
     Args:
-        folder: of the files of the exchange.
+        folder: folder for the exchanged files.
     """
     python = interpreter()
     if python is None:
@@ -111,17 +117,17 @@ def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
 
 
 class Worker:
-    """A running peer.
+    """Running process of a peer.
 
     Args:
-        name: of the peer.
-        command: that starts it: an interpreter and a script that serves, see `petsc_worker`.
+        name: name of the peer.
+        command: interpreter and script of the peer, see `petsc_worker`.
 
     Attributes:
-        version: of the peer.
+        version: version of the peer.
 
     Raises:
-        PeerFailed: it does not start.
+        PeerFailed: the peer does not start.
     """
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
@@ -139,7 +145,7 @@ class Worker:
         """Return the answer to a request.
 
         Raises:
-            PeerFailed: it says that it failed, or it has ended.
+            PeerFailed: the peer reports a failure, or has ended.
         """
         assert self.process.stdin is not None
         try:
@@ -155,7 +161,7 @@ class Worker:
         return reply
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.process.communicate()
 
     def _read(self) -> dict[str, Any]:
@@ -175,10 +181,12 @@ def asked(
     folder: Path,
     options: Mapping[str, str],
 ) -> Answer:
-    """Ask a worker through files: one for each scene, written when it is first asked about.
+    """Solve a question by a worker, through files.
+
+    The problem's file of a scene is written at its first question.
 
     Raises:
-        PeerFailed: it gave no answer.
+        PeerFailed: the peer gives no answer.
     """
     path, answer, A = folder / f"{question.scene.n}.npz", folder / "x.npy", question.matrix
     if not path.exists():

@@ -1,8 +1,8 @@
-"""PETSc's conjugate gradients with its multigrids, and its active-set solver of inequalities: a program for an interpreter that has it.
+"""PETSc's multigrid CG and its active-set solver, for PETSc's own interpreter.
 
 The matrix is converted and the transfers of the geometric hierarchy are built before the clock
-starts: neither is PETSc's work. A line of JSON asks, a line of JSON answers; arrays travel in .npz
-files. It imports nothing of this project.
+starts, since neither is PETSc's work. A request is a line of JSON, and so is an answer; arrays are
+exchanged in .npz files. The program imports nothing of this project.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from petsc4py import PETSc
 
 Request = dict[str, Any]
 Reply = dict[str, Any]
-COARSEST = 500  # unknowns that are left to a direct solver
+COARSEST = 500  # largest number of unknowns for a direct solver
 NEWTON_STEPS = 200
 LINEAR_ITERATIONS = 10_000
-# two sweeps of symmetric SOR per level or PETSc's own choices; of what was tried these take the
-# least time on the splash
+# Two sweeps of symmetric SOR per level, or PETSc's own choices. These took the least time of all
+# variants tried on the splash.
 MULTIGRID = {
     "pc_mg_galerkin": "both",
     "mg_levels_ksp_type": "richardson",
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
-LOOSE = {"ksp_rtol": 1e-2}  # of a Newton step; tighter ones take fewer steps and more time
+# Tolerance of a Newton step; tighter ones take fewer steps and more time.
+LOOSE = {"ksp_rtol": 1e-2}
 
 
 class Problem:
-    """A x + b on the unknowns of a grid, as PETSc wants it.
+    """Problem A x + b on the unknowns of a grid, as PETSc objects.
 
     Attributes:
         A: the matrix.
@@ -46,28 +47,30 @@ class Problem:
     """
 
     def __init__(self, path: str) -> None:
-        with np.load(path) as kept:
+        with np.load(path) as archive:
             self.b, self.where, self.shape = (
-                kept["b"],
-                kept["where"],
-                tuple(int(s) for s in kept["shape"]),
+                archive["b"],
+                archive["where"],
+                tuple(int(s) for s in archive["shape"]),
             )
             rows, columns, values = (
-                kept["indptr"].astype(np.int32),
-                kept["indices"].astype(np.int32),
-                kept["data"],
+                archive["indptr"].astype(np.int32),
+                archive["indices"].astype(np.int32),
+                archive["data"],
             )
-            self.lower = {name[6:]: kept[name] for name in kept.files if name.startswith("lower_")}
+            self.lower = {
+                name[6:]: archive[name] for name in archive.files if name.startswith("lower_")
+            }
         self.A = PETSc.Mat().createAIJWithArrays((len(self.b),) * 2, (rows, columns, values))
         self.A.setOption(PETSc.Mat.Option.SPD, True)
 
 
-problem_of = lru_cache(maxsize=1)(Problem)  # the one that was asked for last
+problem_of = lru_cache(maxsize=1)(Problem)  # keeps the last problem
 
 
 @contextmanager
 def options(values: dict[str, Any]) -> Iterator[None]:
-    """Set PETSc options that hold while a solver reads them."""
+    """Set PETSc options for the time in which a solver reads them."""
     for name, value in values.items():
         PETSc.Options()[name] = value
     try:
@@ -78,12 +81,12 @@ def options(values: dict[str, Any]) -> Iterator[None]:
 
 
 def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
-    """Return prolongations by 2 x 2 x 2 aggregates of cells, finest first, constant on each.
+    """Return prolongations by 2 x 2 x 2 aggregates of cells, finest first.
 
-    Trilinear ones take fewer iterations and three times as long, for their Galerkin products are of
-    27 points.
+    They are constant on each aggregate. Trilinear ones need fewer iterations and three times the
+    time, since their Galerkin products have 27 points.
     """
-    found = []
+    prolongations = []
     while len(where) > COARSEST and min(shape) > 2:
         coarse = tuple((s + 1) // 2 for s in shape)
         parents = np.ravel_multi_index(
@@ -94,16 +97,19 @@ def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
         columns = (np.cumsum(kept) - 1)[parents].astype(np.int32)
         rows = np.arange(len(where) + 1, dtype=np.int32)
         where, shape = np.flatnonzero(kept), coarse
-        found.append(
+        prolongations.append(
             PETSc.Mat().createAIJWithArrays(
                 (len(rows) - 1, len(where)), (rows, columns, np.ones(len(columns)))
             )
         )
-    return found
+    return prolongations
 
 
 def give(pc: Any, prolongations: list[Any]) -> None:
-    """Make a preconditioner PETSc's multigrid with these prolongations and Galerkin products."""
+    """Make a preconditioner PETSc's multigrid, with these prolongations.
+
+    Coarse matrices are Galerkin products.
+    """
     pc.setType("mg")
     pc.setMGLevels(len(prolongations) + 1)
     for number, P in enumerate(reversed(prolongations), start=1):
@@ -111,13 +117,13 @@ def give(pc: Any, prolongations: list[Any]) -> None:
 
 
 def linear(request: Request) -> Reply:
-    """Solve A x = -b by CG; without options with geometric multigrid."""
+    """Solve A x = -b by CG; with geometric multigrid if no options are given."""
     problem, own = problem_of(request["problem"]), request["options"]
     right = PETSc.Vec().createWithArray(-problem.b)
     x = right.duplicate()
     transfers = [] if own else aggregates(problem.where, problem.shape)
     with options(own or MULTIGRID):
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         ksp = PETSc.KSP().create()
         ksp.setOperators(problem.A)
         ksp.setType("cg")
@@ -133,7 +139,7 @@ def linear(request: Request) -> Reply:
     return _answer(
         request,
         x,
-        middle - begun,
+        middle - start_time,
         end - middle,
         ksp.getIterationNumber(),
         ksp.getConvergedReason(),
@@ -142,14 +148,20 @@ def linear(request: Request) -> Reply:
 
 
 class ReducedMultigrid:
-    """Multigrid of the principal systems of an active-set method: aggregates of the free unknowns, made anew when these change."""
+    """Multigrid of the principal submatrices of an active-set method.
+
+    It aggregates the free unknowns and is rebuilt when they change.
+    """
 
     def __init__(self, problem: Problem, snes: Any) -> None:
         self.problem, self.snes, self.building = problem, snes, 0.0
         self.ksp: Any = None
 
     def setUp(self, pc: Any) -> None:
-        """Build the hierarchy of the current free set; the time that its transfers take in NumPy is not PETSc's."""
+        """Build the hierarchy of the current free set.
+
+        Its transfers are computed in NumPy; this time is not PETSc's.
+        """
         free = self.snes.getVIInactiveSet().getIndices()
         begun = time.perf_counter()
         transfers = aggregates(self.problem.where[free], self.problem.shape)
@@ -166,12 +178,15 @@ class ReducedMultigrid:
             self.ksp.setUp()
 
     def apply(self, pc: Any, r: Any, z: Any) -> None:
-        """Set z to a V-cycle's answer to r."""
+        """Set z to the result of a V-cycle applied to r."""
         self.ksp.solve(r, z)
 
 
 def inequality(request: Request) -> Reply:
-    """Solve the LCP by SNESVI's reduced-space active-set Newton method with CG; without options with geometric multigrid."""
+    """Solve the LCP by SNESVI's reduced-space active-set Newton method with CG.
+
+    It uses geometric multigrid if no options are given.
+    """
     problem = problem_of(request["problem"])
     lower = problem.lower[request["bounds"]]
     b = PETSc.Vec().createWithArray(problem.b)
@@ -184,7 +199,7 @@ def inequality(request: Request) -> Reply:
         y.axpy(1.0, b)
 
     with options(LOOSE | request["options"]):
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         snes = PETSc.SNES().create()
         snes.setType("vinewtonrsls")
         snes.setFunction(function, residual)
@@ -205,7 +220,7 @@ def inequality(request: Request) -> Reply:
     return _answer(
         request,
         x,
-        middle - begun,
+        middle - start_time,
         seconds,
         snes.getIterationNumber(),
         snes.getConvergedReason(),
@@ -216,7 +231,7 @@ def inequality(request: Request) -> Reply:
 def _answer(
     request: Request, x: Any, setup: float, solve: float, iterations: int, reason: int, solver: Any
 ) -> Reply:
-    """Write x and return the rest."""
+    """Write x and return the other results."""
     np.save(request["answer"], x.array_r)
     linear_iterations = (
         solver.getLinearSolveIterations() if isinstance(solver, PETSc.SNES) else iterations
@@ -236,16 +251,18 @@ def serve(
     methods: Mapping[str, Callable[[Request], Reply]],
     failures: tuple[type[Exception], ...] = (),
 ) -> None:
-    """Answer requests until the input ends; the first line that is sent tells the peer's version.
+    """Answer requests until the input ends.
+
+    The first line that is sent is the peer's version.
 
     Args:
-        version: of the peer.
-        methods: what can be asked for, by the request's `method`.
-        failures: what methods raise where they fail; the answer is then {"error": text}. Anything
-            else ends the program.
+        version: version of the peer.
+        methods: functions by the `method` of a request.
+        failures: exceptions of failed methods; the answer is then {"error": text}. Other
+            exceptions end the program.
     """
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    # what the peer prints must not get between the answers
+    # Output of the peer must not mix with the answers.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
     def send(reply: Reply) -> None:

@@ -1,4 +1,4 @@
-"""Who is asked: every peer with its version, or why it is missing."""
+"""Available peers with their versions, and why others are missing."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pathlib import Path
 from warp_lcp.benchmarks.peers import libraries, petsc
 from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer
 
-# cells a side up to which matrices are factorized: fill grows with the fourth power, work with the
-# sixth
+# Cells along a side up to which matrices are factorized: fill grows with the fourth power, work
+# with the sixth.
 FACTORS = 32
 EXTRA = "pip install 'warp-lcp[peers]'"
 HINTS = {
@@ -28,10 +28,10 @@ HINTS = {
 
 @dataclass(frozen=True)
 class Roster:
-    """Who is there."""
+    """Available peers and all versions."""
 
-    peers: tuple[Peer, ...]  # who can be asked
-    # of all libraries that were looked for; of missing ones, how to get them
+    peers: tuple[Peer, ...]  # installed peers
+    # Versions of all libraries; for a missing one, how to install it.
     versions: dict[str, str]
 
 
@@ -41,7 +41,7 @@ def _linear(device: str) -> list[Peer]:
         partial(libraries.warp_cg, device=device),
         partial(libraries.pyamg, build="ruge_stuben_solver"),
     )
-    # Warp's CG takes 15 ms an iteration at 24^3 on the CPU
+    # Warp's CG takes 15 ms per iteration at 24^3 on the CPU.
     most = 256 if device.startswith("cuda") else 32
     return [
         Peer("PyAMG SA-CG", "pyamg", libraries.pyamg, most=256),
@@ -74,10 +74,13 @@ QUADRATIC = (
 
 @contextmanager
 def roster(device: str) -> Iterator[Roster]:
-    """Find the peers; those in interpreters of their own run until the end of the block."""
+    """Find the peers.
+
+    Those with an interpreter of their own run until the end of the block.
+    """
     with (
         tempfile.TemporaryDirectory(prefix="peers-") as folder,
-        petsc.peers(Path(folder)) as (others, petsc_version),
+        petsc.peers(Path(folder)) as (petsc_peers, petsc_version),
     ):
         libraries = [
             "scipy",
@@ -99,7 +102,7 @@ def roster(device: str) -> Iterator[Roster]:
         yield Roster(
             tuple(
                 p
-                for p in (*_linear(device), *QUADRATIC, *others)
+                for p in (*_linear(device), *QUADRATIC, *petsc_peers)
                 if versions[p.library][:1].isdigit()
             ),
             versions,

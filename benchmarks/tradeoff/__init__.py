@@ -1,4 +1,7 @@
-"""What accuracy costs: seconds, iterations and bytes against residuals, errors, and what a user sees of a run."""
+"""Suite `tradeoff`: cost of accuracy.
+
+It compares seconds, iterations and bytes with residuals, errors and the visible results of a run.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from warp_lcp.simulation import StepFailed
 
 TITLE = "What accuracy costs"
 SCENES = {"dam-break": 32, "column-collapse-2d": 48}  # cells along the longest side
-QUICK = 16  # cells: below, runs are a check of the suite, and short
+QUICK = 16  # cells below which the runs are short, to test the suite
 QUICK_FRAMES = 3
 
 
@@ -43,7 +46,7 @@ def measure(options: Options, out: Path) -> Results:
 def _measure_scene(
     name: str, resolution: int, frames: int, options: Options, results: Results
 ) -> None:
-    """Add what a scene shows to the results."""
+    """Add the results of a scene."""
     runs = Runs(name, resolution, frames, options)
     scene = runs.scene()
     settings = settings_of(scene.scene.simulator)
@@ -63,7 +66,7 @@ def _measure_scene(
 
 
 def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
-    """Return a preset's settings but for those of models that a scene may not have."""
+    """Return a preset's settings without those of models that a scene may lack."""
     settings = price_table()[simulator].presets[preset].settings
     return tuple(
         f"{key}={value:g}"

@@ -1,4 +1,4 @@
-"""Tables and charts of what accuracy costs."""
+"""Tables and charts of the suite `tradeoff`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warp_lcp.benchmarks.tradeoff.runs import front_of
 
 PARETO = "Pareto front"
 FINEST = "distance_to_finest"
-SMALLEST = 1e-16  # that a logarithmic axis shows
+SMALLEST = 1e-16  # smallest value on a logarithmic axis
 RUN_REMARK = (
     "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is "
     "elsewhere than in a run of the same "
@@ -25,13 +25,19 @@ RUN_REMARK = (
 
 
 def run_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
-    """Return the distance to the finest run over the seconds of the runs, the Pareto front marked."""
+    """Return the chart of the distance to the finest run over seconds.
+
+    The Pareto front is marked.
+    """
     label = "mass elsewhere than in the finest reference run [share]"
     return _chart(scene, FINEST, label, "run", [(str(r.facts["curve"]), r) for r in records])
 
 
 def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
-    """Return the error over the seconds of the solves, the Pareto front marked."""
+    """Return the chart of the error over the seconds of the solves.
+
+    The Pareto front is marked.
+    """
     solves = [
         (f"{r.facts['method']}, {r.facts['precision']}", r)
         for r in records
@@ -43,7 +49,7 @@ def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
 def _chart(
     scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, Record]]
 ) -> list[Chart]:
-    """Return the chart of a figure over seconds, none where no record has it."""
+    """Return the chart of a figure over seconds; none if no record has it."""
     points = defaultdict[str, list[tuple[float, float]]](list)
     for curve, r in records:
         if (seconds := r.value("seconds")) is not None and (error := r.value(figure)) is not None:
@@ -75,7 +81,7 @@ def _front(records: Sequence[Record], figure: str) -> set[str]:
 
 
 def run_table(scene: str, records: Sequence[Record]) -> Table:
-    """Return the runs, the Pareto front of seconds and distance marked."""
+    """Return the table of runs, the Pareto front of seconds and distance marked."""
     ran = [r for r in records if r.figures]
     best, best_of_all = (
         _front([r for r in ran if r.facts["scale"] == 1.0], "distance"),
@@ -115,7 +121,7 @@ def run_table(scene: str, records: Sequence[Record]) -> Table:
 
 
 def solve_table(scene: str, records: Sequence[Record]) -> Table:
-    """Return the solves, the Pareto front of seconds and error marked."""
+    """Return the table of solves, the Pareto front of seconds and error marked."""
     solved = [r for r in records if r.facts["kind"] == "solve"]
     best = _front(solved, "error")
     rows = []
@@ -158,19 +164,24 @@ def solve_table(scene: str, records: Sequence[Record]) -> Table:
 
 
 def preset_table(scene: str, records: Sequence[Record]) -> Table:
-    """Return what the presets cost and lose."""
+    """Return the table of the presets' costs and errors."""
     presets = [r for r in records if str(r.facts["curve"]).startswith("preset ") and r.figures]
     slowest = max((r.figures["seconds"].value for r in presets), default=0.0)
     rows = []
     for r in presets:
         last = [figure for figure in ("volume_drift", "packing") if figure in r.figures][:1]
-        seen = (
+        visible = (
             shown(r, ["distance", "energy_error"], ".4f")
             + [*shown(r, ["front_error", *last], "+.4f"), "+0.0000"][:2]
         )
         times = [*shown(r, ["seconds"], ".3f"), f"{slowest / r.figures['seconds'].value:.1f}"]
         rows.append(
-            [str(r.facts["curve"]).removeprefix("preset "), str(r.facts["settings"]), *times, *seen]
+            [
+                str(r.facts["curve"]).removeprefix("preset "),
+                str(r.facts["settings"]),
+                *times,
+                *visible,
+            ]
         )
     columns = [
         "preset",

@@ -1,4 +1,4 @@
-"""Runs of a scene with many settings: what they cost, and how far what they show is from a reference run."""
+"""Runs of a scene with many settings: cost, and distance from a reference run."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ FRAMES = 18
 
 @dataclass
 class Run:
-    """What a setting took."""
+    """Runs of one setting."""
 
     setting: Setting  # the setting
-    trial: Trial | None = None  # of its first run
-    seconds: list[float] = field(default_factory=list)  # of all its runs
-    bytes: int = 0  # of device arrays at the end
+    trial: Trial | None = None  # result of its first run
+    seconds: list[float] = field(default_factory=list)  # seconds of all its runs
+    bytes: int = 0  # device arrays at the end
     failed: str = ""  # why it has no trial
 
 
 class Runs:
-    """A scene's runs and their references.
+    """Runs of a scene with all settings, and their reference runs.
 
     Args:
         name: the scene's name or file.
-        resolution: cells along its longest side, what settings scale.
-        frames: of a run.
-        options: device and repeats.
+        resolution: cells along its longest side; settings scale it.
+        frames: number of frames of a run.
+        options: device and number of repeats.
     """
 
     def __init__(self, name: str, resolution: int, frames: int, options: Options) -> None:
@@ -55,7 +55,7 @@ class Runs:
         )
 
     def measure(self, settings: Sequence[Setting]) -> list[Run]:
-        """Run all settings, in turns."""
+        """Run all settings, interleaved."""
         runs = [Run(setting) for setting in settings]
         for turn in range(self.options.repeat):
             for number, run in enumerate(runs):
@@ -70,12 +70,12 @@ class Runs:
         return runs
 
     def figures(self, run: Run) -> dict[str, Figure]:
-        """Return a run's figures; without it, none."""
+        """Return a run's figures; none if it has failed."""
         ran = run.trial
         if ran is None:
             return {}
         own, finest = self.reference(run.setting.scale), self.reference(REFERENCE)
-        found = {
+        values = {
             "seconds": Figure.least(run.seconds, "s"),
             "bytes": Figure(run.bytes, "B"),
             "distance": Figure(ran.distance(own)),
@@ -93,12 +93,12 @@ class Runs:
             "packing",
             "penetration",
         )
-        return found | {
+        return values | {
             name: Figure(value) for name in names if (value := getattr(ran, name)) is not None
         }
 
     def record(self, run: Run) -> Record:
-        """Return what a run took and showed."""
+        """Return the record of a run."""
         setting, scene = run.setting, self.scene().scene.name
         facts: dict[str, Any] = {
             "scene": scene,
@@ -115,7 +115,7 @@ class Runs:
         return Record(f"{scene} {setting.curve}: {setting.name}", self.figures(run), facts)
 
     def _reference(self, scale: float) -> Trial:
-        """Return the run of the smallest steps and tolerance at a resolution."""
+        """Return the reference at a resolution: smallest steps and tolerance."""
         scene = self.scene(scale=scale)
         self.options.say(f"{self.name}: reference at resolution {scene.domain.resolution}")
         best = changed(scene, price_table()[scene.scene.simulator].reference)
@@ -127,7 +127,7 @@ class Runs:
         before, after = array_bytes(), list[int]()
         try:
             scene = self.scene(run.setting.overrides, run.setting.scale)
-            if not run.seconds:  # loads kernels
+            if not run.seconds:  # loads the kernels
                 trial(scene, device=self.options.device, frames=1, box=self.box)
             ran = trial(
                 scene,
@@ -144,7 +144,10 @@ class Runs:
 
 
 def front_of(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return which points no other one beats in both coordinates (the Pareto front), by growing first coordinate."""
+    """Return the Pareto front: points that no other one beats in both coordinates.
+
+    They are in order of the first coordinate.
+    """
     best, found = float("inf"), []
     for index in sorted(range(len(points)), key=lambda i: points[i]):
         if points[index][1] < best:

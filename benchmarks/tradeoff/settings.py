@@ -1,4 +1,4 @@
-"""The settings that trade speed for accuracy: one table for each simulator."""
+"""Settings that trade speed for accuracy: one table for each simulator."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ LIQUID_STEPS: tuple[Step, ...] = (
     (0.5, 0.0025),
 )
 SAND_STEPS: tuple[Step, ...] = ((4.0, 0.04), (2.0, 0.02), (1.0, 0.01), (0.8, 0.005), (0.4, 0.0025))
-RESOLUTIONS = (0.5, 0.75, 1.5)  # of the scene's own
-REFERENCE = 2.0  # of the finest run's
+RESOLUTIONS = (0.5, 0.75, 1.5)  # factors of the scene's own resolution
+REFERENCE = 2.0  # factor of the finest run's resolution
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A scene's keys with other values."""
+    """Scene keys with other values."""
 
-    curve: str  # what it belongs to: settings that differ in one key alone
+    curve: str  # the curve of the setting; its settings differ in one key alone
     overrides: tuple[str, ...]  # as `warp-lcp run --set` takes them
-    scale: float = 1.0  # of the resolution
+    scale: float = 1.0  # factor of the resolution
 
     @property
     def name(self) -> str:
-        """Return it in a line."""
+        """Setting in one line."""
         return " ".join(
             [*([f"resolution x {self.scale:g}"] if self.scale != 1.0 else []), *self.overrides]
         )
 
 
 def settings_of(simulator: str) -> list[Setting]:
-    """Return the settings to try.
+    """Return the settings to measure.
 
     Raises:
-        ValueError: there are none for the simulator.
+        ValueError: the simulator has no settings here.
     """
     lists: dict[str, Callable[[], Iterator[Setting]]] = {"fluids": _liquid, "granular": _sand}
     if simulator not in lists:
@@ -128,7 +128,7 @@ def _sand() -> Iterator[Setting]:
 def _particles(
     steps: Sequence[Step], tolerance: float, corrections: Sequence[int]
 ) -> Iterator[Setting]:
-    """Yield what both materials' particles offer."""
+    """Yield the particle settings common to both materials."""
     offered = [(f"{n} particles along a cell", f"particles.per_axis={n}") for n in (1, 3)]
     offered += [
         (f"transfer {transfer}", f"particles.transfer={transfer}") for transfer in ("pic", "flip")

@@ -1,4 +1,4 @@
-"""Single problems of a run: what a method, a tolerance and a precision cost, and the error they leave."""
+"""Single problems of a run: cost and error of methods, tolerances and precisions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import Recorded, Simulation
 from warp_lcp.solvers.registry import grid_methods
 
-PROBLEMS, STATES = 4, 3  # of a run of liquid or sand, at equal distances
+# Numbers of problems of a run of liquid and of states of sand, at equal distances.
+PROBLEMS, STATES = 4, 3
 EXACT = wl.StoppingCriteria(rtol=1e-13, max_iterations=500)
 EXACT_STEP = {
     "solver.tolerance": 1e-7,
@@ -39,25 +40,25 @@ MOST_LIQUID, MOST_SAND = 1000, 3000  # iterations
 
 @dataclass(frozen=True)
 class Found:
-    """What came of a problem."""
+    """Results of a solve of one problem."""
 
     seconds: float
     iterations: int
-    residual: float  # recomputed
+    residual: float  # recomputed relative residual
     error: float
     status: str = ""
-    bytes: int | None = None  # of device arrays that the method holds
+    bytes: int | None = None  # device arrays of the method
 
 
 class Probe(ABC):
     """Problems of a run that are solved once for each setting."""
 
-    kind: str  # of problem
-    warm = 0  # solves before the first that counts: they load kernels
+    kind: str  # kind of the problems
+    warm = 0  # solves before the first that counts, which load kernels
     tolerances: tuple[float, ...]
-    residual: float  # the largest of the reference solutions
+    residual: float  # largest of the reference solutions
     problems: list[Any]
-    methods: dict[str, tuple[str, str]]  # method and precision by what records call the two
+    methods: dict[str, tuple[str, str]]  # method and precision, by their label in records
 
     def __init__(self, scene: Scene, device: str) -> None:
         self.scene, self.device, self.read = scene, device, clock(device)
@@ -66,11 +67,14 @@ class Probe(ABC):
     def solves(
         self, method: str, precision: str, tolerance: float
     ) -> Iterator[Callable[[], Found]]:
-        """Yield what solves each problem."""
+        """Yield a solve function for each problem."""
 
 
 def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
-    """Solve problems of a run by all methods to all tolerances; return a record of each setting, that of the reference first."""
+    """Solve problems of a run by all methods to all tolerances.
+
+    Return a record for each setting, that of the reference first.
+    """
     options.say(f"{scene.scene.name}: problems of a run")
     probe: Probe = PROBES[scene.scene.simulator](scene, options.device, frames)
     known, figures = (
@@ -104,7 +108,10 @@ def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
 def _measured(
     solves: Iterator[Callable[[], Found]], warm: int, repeat: int
 ) -> tuple[dict[str, Figure], str]:
-    """Solve all problems as often as asked for; return the figures of all together and how they ended."""
+    """Solve all problems `repeat` times.
+
+    Return the figures of all together, and their end statuses.
+    """
     samples = [[solve() for _ in range(warm + repeat)][warm:] for solve in solves]
     last = [found[-1] for found in samples]
     figures = {
@@ -140,10 +147,10 @@ def _simulation(scene: Scene, device: str) -> Simulation:
 
 
 class Reference:
-    """A problem's solution by a solve in float64 that converged as far as rounding allows, to measure errors from.
+    """Reference solution of a problem, to measure errors from.
 
-    Residuals are recomputed in float64 from the assembled matrix, whatever a solver says, relative
-    to that of clip(0, lower, upper).
+    It comes from a solve in float64 that converged to rounding. Residuals are recomputed in float64
+    from the assembled matrix, relative to that of clip(0, lower, upper).
     """
 
     def __init__(self, path: Path, device: str) -> None:
@@ -159,20 +166,28 @@ class Reference:
         self.residual_of_solution = self.residual(result.x.numpy())
 
     def residual(self, x: np.ndarray) -> float:
-        """Return the relative residual of a field like b; the absolute one where the reference is 0."""
+        """Return the relative residual of a field like b.
+
+        It is absolute if the reference is 0.
+        """
         return self._exact.residual(x.ravel()[self._fluid].astype(np.float64)) / self._unit
 
     def error(self, x: np.ndarray) -> float:
-        """Return ||x - x*|| / ||x*|| in the energy norm: of the kinetic energy that a wrong pressure leaves or takes."""
+        """Return the relative error ||x - x*|| / ||x*|| in the energy norm.
+
+        Its square is the share of kinetic energy that a wrong pressure leaves or removes.
+        """
         difference, A = x.ravel()[self._fluid] - self._x, self._exact.matrix
         return float(np.sqrt(max(difference @ (A @ difference), 0.0) / (self._x @ (A @ self._x))))
 
 
 class Pressures(Probe):
-    """Problems recorded in a run of liquid, solved from the run's own first guess.
+    """Pressure problems recorded in a run of liquid.
+
+    They are solved from the initial guess of the run.
 
     Raises:
-        ValueError: the scene's simulator shows none.
+        ValueError: the scene's simulator does not record pressure problems.
     """
 
     kind, warm, tolerances = "solve", 1, (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
@@ -186,7 +201,7 @@ class Pressures(Probe):
         with tempfile.TemporaryDirectory() as folder:
             simulation.record = ProblemFolder(Path(folder) / "problems").write
             found = [files(Path(folder) / "problems") for _ in _run(scene, simulation, frames)][-1]
-            # the first is free fall
+            # The first one is free fall.
             paths = [
                 found[i] for i in np.unique(np.linspace(1, len(found) - 1, PROBLEMS).astype(int))
             ]
@@ -202,7 +217,7 @@ class Pressures(Probe):
     def solves(
         self, method: str, precision: str, tolerance: float
     ) -> Iterator[Callable[[], Found]]:
-        """Yield what solves each problem."""
+        """Yield a solve function for each problem."""
         solver, stopping = (
             wl.METHODS[method](precision=precision),
             wl.StoppingCriteria(rtol=tolerance, max_iterations=MOST_LIQUID),
@@ -240,7 +255,10 @@ class Pressures(Probe):
 
 
 class Steps(Probe):
-    """Steps of a run of sand, from states that it came through; the error is that of the velocity over g dt."""
+    """Steps of a run of sand, from recorded states.
+
+    The error is that of the velocity over g dt.
+    """
 
     kind, warm, tolerances = "step", 0, (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5)
     tried: tuple[str, ...] = ("accelerated-projection", "interleaved-sweeps")
@@ -251,7 +269,7 @@ class Steps(Probe):
         self.gravity = float(np.linalg.norm(scene.physics.gravity)) or 1.0
         wanted = {round(frames * (n + 1) / (STATES + 1)) for n in range(STATES)}
         simulation, usual = _simulation(scene, device), 1.0 / scene.time.frames_per_second
-        # a state, the length of its next step [s], the velocities after it
+        # A state, the length of its next step [s], the velocities after it.
         self.problems, self.residual = [], 0.0
         for frame in _run(scene, simulation, max(wanted)):
             if frame in wanted:
@@ -263,7 +281,7 @@ class Steps(Probe):
     def solves(
         self, method: str, precision: str, tolerance: float
     ) -> Iterator[Callable[[], Found]]:
-        """Yield what takes the step from each state."""
+        """Yield a function that takes the step from each state."""
         keys = {
             "solver.method": method,
             "solver.tolerance": tolerance,
@@ -282,7 +300,10 @@ class Steps(Probe):
     def _step(
         self, scene: Scene, state: Any, dt: float
     ) -> tuple[np.ndarray, dict[str, Any], float]:
-        """Take a step from a state, and return the particles' velocities [m/s], the log's row and the seconds."""
+        """Take a step from a state.
+
+        Return the particles' velocities [m/s], the row of the log and the seconds.
+        """
         simulation = _simulation(scene, self.device)
         simulation.restore(state)
         begun = self.read()

@@ -1,7 +1,7 @@
-"""Physical checks of liquids, sand and bodies with known answers, each with set-ups that are wrong on purpose and must fail it.
+"""Physical checks of liquids, sand and bodies against known results.
 
-`warp-lcp bench validation` runs them all. A check is a file: what must hold, at two resolutions,
-with its negative controls.
+`warp-lcp bench validation` runs them all. Each check is a file. It states what must hold, at two
+resolutions, and has negative controls: set-ups that are wrong on purpose and must fail it.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def measure(options: Options, out: Path) -> Results:
             f"{sum(t.seconds for t in trials[name]):.0f} s"
         )
         charts += [chart for chart in drawn if chart.curves]
-    found = [t for own in trials.values() for t in own]
+    all_trials = [t for own in trials.values() for t in own]
     where = machine(options.device, elements=1 << 22, repeat=options.repeat)
     tables = [
         summary(trials),
@@ -75,15 +75,18 @@ def measure(options: Options, out: Path) -> Results:
         *(table(name, CHECKS[name].about.strip(), own) for name, own in trials.items()),
     ]
     return Results(
-        [where, *(t.record() for t in found)],
+        [where, *(t.record() for t in all_trials)],
         tables,
         charts,
-        [line for t in found for line in t.failures()],
+        [line for t in all_trials for line in t.failures()],
     )
 
 
 def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
-    """Return a row a check: how many figures keep their bounds, and how many controls fail theirs."""
+    """Return a row for each check.
+
+    The columns are figures within their bounds, and controls that fail theirs.
+    """
     rows, sums = list[list[str]](), np.zeros(4, dtype=int)
     for name, own in trials.items():
         kinds = [
@@ -119,7 +122,7 @@ def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
 
 
 def misses(trials: Mapping[str, Sequence[Trial]]) -> Table:
-    """Return what is not as it must be, and why that is known."""
+    """Return the failures, and why known ones occur."""
     rows = [
         [line, CHECKS[name].known]
         for name, own in trials.items()

@@ -1,4 +1,7 @@
-"""Columns of liquid that collapse: a dam break's front and height as experiments found them, and a volume that stays."""
+"""Collapsing columns of liquid: front and height of a dam break, and volume.
+
+The front and the height are compared with experiments. The volume must stay constant.
+"""
 
 from __future__ import annotations
 
@@ -31,26 +34,27 @@ from warp_lcp.benchmarks.validation.signals import (
 )
 from warp_lcp.fluids import LiquidSimulation
 
-RESOLUTIONS = (12, 24)  # cells of a
-LIMITS = {12: 5.0, 24: 3.0}  # [%] of the RMS error after the best shift
-A = 0.05715  # [m]
+RESOLUTIONS = (12, 24)  # cells of the column's base a
+LIMITS = {12: 5.0, 24: 3.0}  # [%] largest RMS error after the best shift
+A = 0.05715  # [m] base of the column
 N2 = 2.0
-LENGTH, HEIGHT = 6.0, 2.5  # of the tank, in units of a: the front meets no wall
-END = 3.7  # T
-MAX_SHIFT = 0.3  # of T: the experiment's time origin is uncertain
-FIRST, LAST = 0.84, 3.33  # T of the data compared
-WRONG_GRAVITY = (0.5, 0.8, 1.25, 2.0)  # of the real one, in the controls
+LENGTH, HEIGHT = 6.0, 2.5  # size of the tank, in units of a: the front meets no wall
+END = 3.7  # end of the run, in T
+MAX_SHIFT = 0.3  # limit of the shift in T, since the time origin of the experiment is uncertain
+FIRST, LAST = 0.84, 3.33  # range of T of the compared data
+WRONG_GRAVITY = (0.5, 0.8, 1.25, 2.0)  # gravity in the controls, as factors of the true one
 TAU_LAST = 2.45
 
-SIZE, COLUMN = [1.6, 0.8], 0.4  # [m]: of a domain with two columns, and the side of each
-DURATION, AVERAGED = 30.0, 2.0  # [s], and the end over which their volume is averaged
-# [s]: the column of the dam break fills a pool four cells deep
+SIZE, COLUMN = [1.6, 0.8], 0.4  # [m] domain with two columns, and the side of each
+# [s] length of the run, and the end over which the volume is averaged
+DURATION, AVERAGED = 30.0, 2.0
+# [s] The same for the column of the dam break, which fills a pool four cells deep.
 DAM_DURATION, DAM_AVERAGED = 3.0, 0.3
 UNCORRECTED: Row = {"density_correction": {"every": 0}}
-# in charts
+# Labels and titles of the charts.
 DATA, FRONT, HIGH = "Martin & Moyce", "Front of a collapsing column", "Height at the wall"
 
-# [MartinMoyce1952], front and height of the column of square section, n^2 = 2
+# [MartinMoyce1952], front and height of the column of square section, n^2 = 2.
 T = np.array(
     [0.41, 0.84, 1.19, 1.43, 1.63, 1.83, 1.98, 2.20, 2.32, 2.51, 2.65, 2.83, 2.98, 3.11, 3.33]
 )
@@ -64,26 +68,30 @@ H = np.array(
     [0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 0.33, 0.28, 0.22, 0.17, 0.11]
 )
 
-# the same experiment farther out, as read off its figure 3 (PySPH's `db_exp_data`), and what its
-# slope is compared over
+# The same experiment at larger distances, as read off its figure 3 (PySPH's `db_exp_data`), and the
+# range in which its slope is compared.
 FAR_T = np.array([3.345, 4.034, 4.418, 5.091, 5.685, 6.306, 6.822, 7.439, 8.031, 8.633, 9.237])
 FAR_Z = np.array([4.134, 4.944, 5.881, 6.980, 7.945, 8.966, 9.986, 10.963, 11.977, 13.005, 13.970])
-FAR, FAR_LENGTH, FAR_END = (4.0, 14.0), 16.0, 11.0  # Z; of the tank, in units of a; T
-VISCOSITY = 1e-6  # of water [m^2/s]
+# Range of Z; length of the tank in units of a; end of the run in T.
+FAR, FAR_LENGTH, FAR_END = (4.0, 14.0), 16.0, 11.0
+VISCOSITY = 1e-6  # kinematic viscosity of water [m^2/s]
 
 
 class Collapse(NamedTuple):
-    """A collapse in the experiment's units."""
+    """Collapse in the units of the experiment."""
 
-    T: np.ndarray  # of the front's stays at its places, T = n t sqrt(g / a)
-    Z: np.ndarray  # these places over a
+    T: np.ndarray  # times at which the front is at its places, T = n t sqrt(g / a)
+    Z: np.ndarray  # these places, over a
     tau: np.ndarray  # t sqrt(g / a) of every step
     H: np.ndarray  # height beside the wall over n^2 a
 
 
 @check_at("dam break", "{cells} cells of a, {numerics.name}")
 def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
-    """Compare a collapse with the data; the controls have another gravity than their time is measured in."""
+    """Compare a collapse with the data.
+
+    The controls have wrong gravity, but their time is measured with the true one.
+    """
     limit = LIMITS[cells]
     compared = (T >= FIRST) & (T <= LAST)
     at, expected = T[compared], Z[compared]
@@ -109,7 +117,7 @@ def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL)
             high=1.1,
             unit="g",
         )
-        if factor == min(WRONG_GRAVITY):  # nearer ones a shift can hide
+        if factor == min(WRONG_GRAVITY):  # a shift can hide the error of nearer ones
             rms = 100.0 * best_shift(wrong.T, wrong.Z, at, expected, MAX_SHIFT)[1]
             found.must_break(
                 f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%"
@@ -117,31 +125,39 @@ def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL)
 
 
 def shown_gravity(c: Collapse) -> float:
-    """Return the gravity with which the experiment's front would go as fast as a collapse's, over the real one.
+    """Return the gravity inferred from a collapse's front, over the true one.
 
-    Times go with 1 / sqrt(g), and where the experiment's begins is open. The speed of the even part
-    alone would not tell: it goes with sqrt(g) too, and data and simulation leave it a range as wide
-    as that from .8 g to 1.25 g.
+    It is the gravity with which the experiment's front would be as fast as the collapse's. Times
+    scale with 1 / sqrt(g), and the time origin of the experiment is uncertain. The speed of the
+    even part alone is not enough: it scales with sqrt(g) too, but data and simulation leave a range
+    as wide as that from 0.8 g to 1.25 g.
     """
     compared = (T >= FIRST) & (T <= LAST)
     return signals.best_pace(c.T, c.Z, T[compared], Z[compared], MAX_SHIFT) ** 2
 
 
 def slope(time: np.ndarray, place: np.ndarray) -> float:
-    """Return the speed of a front far from where it began, dZ/dT."""
+    """Return the speed of a front far from its start, dZ/dT."""
     far = (place >= FAR[0]) & (place <= FAR[1])
     return float(np.polyfit(time[far], place[far], 1)[0])
 
 
 def plate_friction() -> float:
-    """Return c_f of a smooth plate by Prandtl's law for turbulent flow, 0.074 Re^(-1/5): ten a long, as fast as the experiment's front."""
+    """Return the friction coefficient c_f of a smooth plate, 0.074 Re^(-1/5).
+
+    Prandtl's law for turbulent flow is used, for a plate of length 10 a at the speed of the
+    experiment's front.
+    """
     speed = slope(FAR_T, FAR_Z) * math.sqrt(N2 * GRAVITY * A)
     return 0.074 * (speed * 10.0 * A / VISCOSITY) ** -0.2
 
 
 @check_at("dam break with drag", "{cells} cells of a, {numerics.name}")
 def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
-    """Compare the speed of the front far out, where a floor without drag lets it run too fast; the control has none."""
+    """Compare the speed of the front at large distances.
+
+    A floor without drag lets it run too fast; the control has no drag.
+    """
     expected = slope(FAR_T, FAR_Z)
     for label, tables in (
         ("c_f of a smooth plate", {"wall_drag": {"coefficient": plate_friction()}}),
@@ -167,7 +183,10 @@ def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> Non
 def create(
     cells: int, numerics: Numerics, length: float = LENGTH, **tables: Any
 ) -> LiquidSimulation:
-    """Return a column on a floor that it can slip on, its base so many cells wide, in a tank of a `length` in units of it."""
+    """Return a column on a free-slip floor in a tank.
+
+    Its base has `cells` cells. `length` is that of the tank, in units of the base.
+    """
     column = box([0.0, 0.0], [A, N2 * A])
     return create_liquid(
         numerics, [length * A, HEIGHT * A], round(length * cells), [column], **tables
@@ -175,11 +194,14 @@ def create(
 
 
 def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Collapse:
-    """Let a column collapse; T and tau are measured in the real gravity, not in another [m/s^2]."""
+    """Simulate a collapse.
+
+    T and tau are measured with the true gravity, whatever `gravity` [m/s^2] is.
+    """
     simulation = create(cells, numerics, physics={"gravity": [0.0, -gravity]})
 
     def now(time: float) -> tuple[float, float, float]:
-        """Return the time [s], the front, and the height of the surface at the left wall [cells]."""
+        """Return the time [s], the front, and the surface height at the left wall [cells]."""
         wall = filled_fraction(*particles_in_cells(simulation))[:, 0]
         return time, front(fill(simulation)), surface_height(wall)
 
@@ -229,7 +251,10 @@ DAM_BREAK = Check(
 
 @check_at("volume", "{resolution} cells, {numerics.name}")
 def columns(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
-    """Compare the volume inside the surface with the one at the start; the control goes without the correction, which acts by itself."""
+    """Compare the volume inside the surface with the one at the start.
+
+    The control has no density correction; otherwise it is on by default.
+    """
     right = box([SIZE[0] - COLUMN, 0.0], [SIZE[0], COLUMN])
     late = []
     for label, tables in (("as it comes", {}), ("no correction", UNCORRECTED)):
@@ -241,8 +266,8 @@ def columns(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> 
         found.curve(label, time, volume)
         if not tables:
             found.add("volume of the last 2 s over that at the start", late[0], low=0.98, high=1.02)
-            # of single cells, which a correction that acts where a thousandth of the liquid crowds
-            # leaves to themselves
+            # The correction ignores crowding in single cells; it acts only if a thousandth of the
+            # liquid is too dense.
             found.add("mean of the largest densities", density.mean(), high=1.5)
     found.must_break(
         "no correction: volume of the last 2 s over that at the start", late[1], low=0.8
@@ -251,7 +276,10 @@ def columns(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> 
 
 @check_at("volume of the dam break", "{cells} cells of a, {numerics.name}")
 def dam(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
-    """Compare the volume of Martin & Moyce's column when it has come to the far wall and back; the control goes without the correction."""
+    """Compare the volume of Martin & Moyce's column with its initial volume.
+
+    It has then come to the far wall and back. The control has no density correction.
+    """
     for name, tables in (("", {}), ("no correction: ", UNCORRECTED)):
         time, volume, _ = watch(create(cells, numerics, **tables), DAM_DURATION)
         judge = found.must_break if tables else found.add
@@ -262,9 +290,11 @@ def dam(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
 def watch(
     simulation: LiquidSimulation, duration: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the ends of the steps [s], the volume inside the surface over that at the start, and the largest densities, if known.
+    """Return times [s], relative volumes and largest densities of the steps.
 
-    The surface is measured apart from the simulation: a count of particles could not show a loss.
+    Times are the ends of the steps. Volumes are those inside the surface, over that at the start.
+    Largest densities are given if known. The surface is reconstructed independently of the
+    simulation, since a count of particles could not show a loss of volume.
     """
 
     def volume() -> float:

@@ -1,4 +1,7 @@
-"""The energy of a simulation, and what sources, outlets, moving walls and ends of endless axes put in or take out."""
+"""Energy balance of a simulation.
+
+Sources, outlets, moving walls and periodic axes add or remove energy.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,11 @@ class Step:
     """Energies [J; J/m in 2-D] of a step.
 
     Attributes:
-        before: kinetic and potential energy at its start, bodies included.
-        after: at its end.
-        given: what came in from outside: with particles that sources add and outlets remove, by
-            walls that the scene moves, and where an endless axis takes particles back to its
-            beginning.
-        displaced: what the density correction's displacements lifted; part of `after`.
+        before: kinetic and potential energy at its begin, bodies included.
+        after: the same at its end.
+        given: energy from outside: of particles that sources add and outlets remove, of walls
+            that the scene moves, and of particles that pass a periodic side.
+        displaced: potential energy added by the density correction; part of `after`.
     """
 
     before: float
@@ -31,20 +33,21 @@ class Step:
 
     @property
     def gained(self) -> float:
-        """Energy out of nothing; negative: what was dissipated."""
+        """Energy gained without a source; negative values are dissipation."""
         return self.after - self.before - self.given
 
 
 class Ledger:
-    """Steps a simulation and keeps account of its energy, in float64 from its particles and bodies.
+    """Step a simulation and record its energy balance.
 
-    A particle's velocity is that of the middle of its step. Its energy of motion at the end has
-    what gravity does in half a step more: a power that is that of the mean velocity V, and that
-    changes as V has in the step, as far as that is free fall. Walls that move do the work of the
-    pressure's impulses at their faces; what they do to spray that they hit is not in `given`.
+    Energies are computed in float64 from particles and bodies. A particle's velocity is that of the
+    middle of its step. For the kinetic energy at the end, gravity's work in half a step more is
+    added. Its power is that of the mean velocity V; the change of V in the step counts as far as it
+    is free fall. Moving walls do the work of the pressure's impulses at their faces. Their work on
+    spray that they hit is not in `given`.
 
     Args:
-        simulation: of particles; a ledger stays with it, as it watches its parts.
+        simulation: particle simulation; it stays wrapped, since its parts are observed.
     """
 
     def __init__(self, simulation: Any) -> None:
@@ -76,11 +79,17 @@ class Ledger:
         self.now = self.energy()
 
     def energy(self) -> float:
-        """Return kinetic and potential energy of particles and bodies as they are [J; J/m]; the gain of free fall is not known yet."""
+        """Return kinetic and potential energy of particles and bodies [J; J/m].
+
+        The gain of free fall is not included.
+        """
         return self._material() + self._energy_of_bodies()
 
     def height(self) -> float:
-        """Return the energy that the material and the bodies have by their height over the domain's lowest corner [J; J/m], >= 0."""
+        """Return the potential energy of material and bodies [J; J/m], >= 0.
+
+        Heights are above the lowest corner of the domain.
+        """
         s = self.simulation
         gravity, size = self._gravity(), np.zeros(3)
         size[: s.grid.dimension] = s.scene.domain.size
@@ -92,7 +101,10 @@ class Ledger:
         )
 
     def total(self) -> float:
-        """Return the energy of motion and that of height over the domain's lowest corner [J; J/m]."""
+        """Return the sum of kinetic and potential energy [J; J/m].
+
+        Heights are above the lowest corner of the domain.
+        """
         bodies = self.simulation.bodies
         motion = (
             self.now
@@ -102,17 +114,17 @@ class Ledger:
         return max(motion, 0.0) + self.height()
 
     def set_back(self, state: dict[str, np.ndarray], energy: float) -> None:
-        """Put the simulation back to a state.
+        """Reset the simulation to a state.
 
         Args:
-            state: of the simulation.
-            energy: that `now` was then.
+            state: state of the simulation.
+            energy: value of `now` at that state.
         """
         self.simulation.restore(state)
         self._dt, self.now = self.simulation.last_dt, energy
 
     def step(self, dt: float) -> Step:
-        """Step by dt [s] and return the account."""
+        """Step by dt [s] and return the energy balance."""
         s = self.simulation
         before, momentum, self._dt = self.now, self._momentum(), dt
         bodies = self._bodies()
@@ -129,7 +141,10 @@ class Ledger:
         return Step(before, self.now, self._given, self._displaced)
 
     def _free_fall(self, mass: float, change: np.ndarray) -> float:
-        """Return what half a step more of falling as fast as the momentum has changed adds to the energy of motion."""
+        """Return the kinetic energy that free fall adds in half a step more.
+
+        The rate of fall is that of the momentum change in the step.
+        """
         g = self.simulation.gravity
         rate = float(g @ change) / self.simulation.kick_dt
         return 0.125 * self._dt**2 * min(max(rate, 0.0), mass * float(g @ g))
@@ -160,7 +175,10 @@ class Ledger:
         return -float(self.simulation.gravity @ self._moments()[1])
 
     def _gravity(self) -> np.ndarray:
-        """Return gravity [m/s^2] without its part along axes without an end, where there is no lowest place."""
+        """Return gravity [m/s^2] without its components along periodic axes.
+
+        A periodic axis has no lowest place.
+        """
         s = self.simulation
         axes = [axis in s.scene.endless for axis in range(3)]
         return np.where(axes, 0.0, s.gravity)
@@ -180,13 +198,16 @@ class Ledger:
         self._carried = self._momentum()
 
     def _note_walls(self) -> None:
-        """Note the work of the pressure's impulses, rho dx^d x a cell, on walls and sources, whose flow they push back."""
+        """Record the work of the pressure's impulses on walls and sources.
+
+        The impulse of a cell is rho dx^d times the pressure. The flow of sources pushes back.
+        """
         s: Any = self.simulation
         flow = s.scene.physics.density * s.grid.cell_volume * s.projection.pressure.numpy()
         self._given -= float((flow * wall_outflow(s)).sum())
 
     def _exchange(self, account: str) -> tuple[Callable[[], None], Callable[[], None]]:
-        depth = 0  # outlets call their own parts
+        depth = 0  # outlets call methods of their own parts
 
         def before() -> None:
             nonlocal depth
@@ -209,7 +230,7 @@ class Ledger:
         before: Callable[[], None] | None,
         after: Callable[[], None] | None,
     ) -> None:
-        """Call something before and after a method of a part."""
+        """Call functions before and after a method of a part."""
         method = getattr(part, name)
 
         def watched(*given: Any, **named: Any) -> Any:
@@ -224,10 +245,10 @@ class Ledger:
 
 
 def wall_outflow(simulation: Any) -> np.ndarray:
-    """Return what walls that the scene moves, and sources, take up of each cell's outflow [m/s], in the stored shape; bodies do not count.
+    """Return the outflow of each cell [m/s] into moving walls and sources.
 
-    On a face of the open fraction a_f it is s_f (1 - a_f) u_s,f, s_f = +-1 outward; a source's
-    cells are SOLID and their faces closed.
+    It is in the stored shape, and bodies do not count. On a face of the open fraction a_f it is s_f
+    (1 - a_f) u_s,f, s_f = +-1 outward. A source's cells are SOLID and their faces closed.
     """
     boundary, kind = simulation.boundary, simulation.projection.kind.numpy()
     bodies = simulation.bodies.numbers if simulation.bodies is not None else []

@@ -1,4 +1,7 @@
-"""Checks, and what they find: figures beside the bounds that they must keep, or must break where the set-up is wrong on purpose."""
+"""Checks and their findings: figures with bounds.
+
+A figure must keep its bound. In a negative control, which is wrong on purpose, it must break it.
+"""
 
 from __future__ import annotations
 
@@ -25,25 +28,28 @@ COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 @dataclass(frozen=True)
 class Finding:
-    """A figure and its bound."""
+    """Figure and its bound."""
 
-    what: str  # the figure, unique in its trial
-    value: float  # measured; NaN if it could not be
+    what: str  # name of the figure, unique in its trial
+    value: float  # measured value; NaN if it could not be measured
     low: float = -math.inf  # the bound from below
     high: float = math.inf  # the bound from above
-    unit: str = ""  # of value and bounds
-    # a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound
+    unit: str = ""  # unit of value and bounds
+    # Whether it is a negative control: its set-up is wrong on purpose and must break the bound.
     control: bool = False
 
     @property
     def passed(self) -> bool:
-        """Whether the figure keeps its bound; of a control, whether it breaks it. NaN does neither."""
+        """Whether the figure keeps its bound, or, in a control, breaks it.
+
+        NaN does neither.
+        """
         within = self.low <= self.value <= self.high
         return within != self.control and not math.isnan(self.value)
 
     @property
     def bound(self) -> str:
-        """The bound in words."""
+        """Bound as text."""
         unit = f" {self.unit}" if self.unit else ""
         if math.isinf(self.low):
             return f"<= {self.high:g}{unit}"
@@ -54,31 +60,31 @@ class Finding:
         )
 
     def row(self) -> list[str]:
-        """Return what a table says of it."""
+        """Return the row of the table."""
         bound = f"must break {self.bound}" if self.control else self.bound
         measured = f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}"
         return [self.what, measured, bound, "yes" if self.passed else "NO"]
 
 
 def control(finding: Finding) -> Finding:
-    """Return the figure as that of a negative control."""
+    """Return the finding as a negative control."""
     return replace(finding, what=f"control: {finding.what}", control=True)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A check at one resolution."""
+    """Check at one resolution."""
 
-    check: str  # its name
-    resolution: str  # in words
-    findings: Sequence[Finding]  # what was found
+    check: str  # name of the check
+    resolution: str  # resolution as text
+    findings: Sequence[Finding]  # measured figures
     seconds: float = 0.0  # wall time [s]
-    error: str = ""  # why it could not be finished; empty if it was
+    error: str = ""  # why the trial did not finish; empty if it did
     curves: dict[str, Curve] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """The name of its record."""
+        """Name of its record."""
         return f"{self.check}, {self.resolution}"
 
     @property
@@ -87,11 +93,11 @@ class Trial:
         return not self.error and bool(self.findings) and all(f.passed for f in self.findings)
 
     def value(self, what: str) -> float:
-        """Return a figure's value, NaN without it."""
+        """Return a figure's value; NaN if there is none."""
         return next((f.value for f in self.findings if f.what == what), math.nan)
 
     def record(self) -> Record:
-        """Return what the file keeps."""
+        """Return the record for the file."""
         figures = {
             f.what: Figure(f.value, f.unit) for f in self.findings if not math.isnan(f.value)
         }
@@ -107,7 +113,7 @@ class Trial:
         return Record(self.name, figures | {"seconds": Figure(self.seconds, "s")}, facts)
 
     def failures(self) -> list[str]:
-        """Return a line for each thing that is not as it must be."""
+        """Return a line for each failure."""
         lines = [f"{self.name}: {self.error}"] if self.error else []
         for f in self.findings:
             if not f.passed:
@@ -119,15 +125,15 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """What must hold, and by what it is tried and shown."""
+    """Check: what must hold, its trials and charts."""
 
-    about: str  # what must hold
-    # with their cases: arguments, in a tuple where there are several
+    about: str  # what the check tests
+    # Functions with their cases; a case is an argument, or a tuple of several.
     trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]
-    # what compares trials, after what it does in words
+    # A comparison of the trials: its description and its function.
     across: tuple[str, Callable[[Findings, Sequence[Trial]], None]] | None = None
     charts: Sequence[Drawing] = ()
-    known: str = ""  # why it is known not to hold everywhere; the report says so where it does not
+    known: str = ""  # known reason why it does not hold everywhere, for the report
 
     def run(self, device: str) -> tuple[list[Trial], list[Lines]]:
         """Run all trials on a device, and draw them."""
@@ -147,11 +153,11 @@ class Check:
 
 
 def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Callable[..., Trial]]:
-    """Make a function that adds findings to its first argument one that returns them as a trial.
+    """Make a function that adds findings into one that returns a trial.
 
     Args:
-        check: its name.
-        resolution: in words, with the function's arguments in braces.
+        check: name of the check.
+        resolution: resolution as text, with the function's arguments in braces.
     """
 
     def decorated(run: Callable[..., None]) -> Callable[..., Trial]:
@@ -171,26 +177,29 @@ def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Cal
 
 
 def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Trial:
-    """Run a check; a simulation that ends early is a failure of the check, not of the suite.
+    """Run a check; a simulation that ends early fails the check, not the suite.
 
     Args:
-        check: its name.
-        resolution: in words.
-        run: adds findings to what it is given.
+        check: name of the check.
+        resolution: resolution as text.
+        run: function that adds findings to its argument.
     """
-    found, begun, error = Findings(), time.perf_counter(), ""
+    found, start_time, error = Findings(), time.perf_counter(), ""
     try:
         run(found)
     except (StepFailed, SimulationFailed, ValueError) as reason:
         error = str(reason)
     return Trial(
-        check, resolution, found.findings, time.perf_counter() - begun, error, found.curves
+        check, resolution, found.findings, time.perf_counter() - start_time, error, found.curves
     )
 
 
 @dataclass
 class Findings:
-    """Collects what a check finds; `curves` are x and y of lines to draw, by label."""
+    """Collector of a check's findings.
+
+    `curves` holds x and y of lines to draw, by label.
+    """
 
     findings: list[Finding] = field(default_factory=list)
     curves: dict[str, Curve] = field(default_factory=dict)
@@ -204,13 +213,13 @@ class Findings:
         high: float = math.inf,
         unit: str = "",
     ) -> None:
-        """Note a figure that must keep its bound."""
+        """Add a figure that must keep its bound."""
         self.findings.append(Finding(what, float(value), low, high, unit))
 
     def curve(
         self, label: str, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray
     ) -> None:
-        """Note a line to draw."""
+        """Add a line to draw."""
         self.curves[label] = (np.asarray(x).tolist(), np.asarray(y).tolist())
 
     def must_break(
@@ -222,7 +231,7 @@ class Findings:
         high: float = math.inf,
         unit: str = "",
     ) -> None:
-        """Note a figure of a negative control, which must break the bound."""
+        """Add a figure of a negative control, which must break the bound."""
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
 
 
@@ -232,10 +241,10 @@ def curves_of(
     """Return the curves of trials by resolution and label.
 
     Args:
-        trials: whose curves.
-        labels: what a label begins with; any without.
-        check: whose trials only.
-        but: the label that is left out.
+        trials: trials of the curves.
+        labels: beginnings of the labels; all labels by default.
+        check: only trials of this check.
+        but: label that is left out.
     """
     chosen = [t for t in trials if check in ("", t.check)]
     return {
@@ -257,8 +266,11 @@ def plot(
     marked: Collection[str] = (),
     **chosen: str,
 ) -> Drawing:
-    """Return what draws exact curves and those of trials that `curves_of` chooses; those in `marked` are points."""
-    given = {
+    """Return a function that draws exact curves and those of trials.
+
+    `curves_of` chooses the latter; those in `marked` are points.
+    """
+    curves = {
         label: (np.asarray(a).tolist(), np.asarray(b).tolist())
         for label, (a, b) in (exact or {}).items()
     }
@@ -269,7 +281,7 @@ def plot(
             title,
             x,
             y,
-            given | curves_of(trials, *labels, **chosen),
+            curves | curves_of(trials, *labels, **chosen),
             log=log,
             marked=frozenset(marked),
         )
@@ -278,7 +290,10 @@ def plot(
 
 
 def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:
-    """Return all findings of a check; a control is wrong on purpose: it must break its bound."""
+    """Return the table of a check's findings.
+
+    A negative control must break its bound.
+    """
     rows = [[t.name, *f.row()] for t in trials for f in sorted(t.findings, key=lambda f: f.control)]
     rows += [[t.name, "error", t.error, "none", "NO"] for t in trials if t.error]
     return Table(check, COLUMNS, rows, remark)

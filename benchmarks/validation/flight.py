@@ -1,4 +1,4 @@
-"""What flies: whatever is thrown goes along its parabola, and a spinning drop keeps its angular momentum."""
+"""Free flight: parabolas of thrown material, angular momentum of spinning drops."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ from warp_lcp.benchmarks.validation.scenes import (
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
 from warp_lcp.fluids import LiquidSimulation
 
-RESOLUTIONS = (32, 64)  # cells along the domain of what is thrown, cells a meter of a spinning drop
-SIZE = [2.0, 2.0]  # [m]: no wall is met
-MOST = 1e-4  # of the way, off the parabola
+# Cells along the domain of thrown material, cells per meter for a spinning drop.
+RESOLUTIONS = (32, 64)
+SIZE = [2.0, 2.0]  # [m]; no wall is met
+MOST = 1e-4  # largest distance from the parabola, as a share of the way
 
 CFL = (2.0, 8.0)
-LOW, HIGH = [0.4, 0.8], [0.8, 1.2]  # [m]: corners of what is thrown
+LOW, HIGH = [0.4, 0.8], [0.8, 1.2]  # [m] corners of the thrown material
 VELOCITY = [1.5, 2.0]  # [m/s]
 DURATION = 0.4  # [s]
-POOL = box([0.0, 0.0], [2.0, 0.25])  # a rigid body needs some material in its scene
+POOL = box([0.0, 0.0], [2.0, 0.25])  # a scene with a rigid body needs some material
 BLOCK = box(LOW, HIGH, velocity=VELOCITY)
 CRATE: Row = BLOCK | {"density": 500.0, "angular_velocity": 4.0}
 
-KEPT = {32: 0.95, 64: 0.98}  # of the angular momentum
-# [m], [rad/s], [s]: .6 of a turn, at 2.4 m/s of the rim
+KEPT = {32: 0.95, 64: 0.98}  # least share of the angular momentum that remains
+# [m], [rad/s], [s]: 0.6 of a turn, at 2.4 m/s of the rim.
 RADIUS, SPIN, FLIGHT = 0.25, 3.0 * np.pi, 0.4
 LAUNCH = np.array([1.0, 2.0])  # [m/s]
 TRANSFERS = ("apic", "flip", "pic")
@@ -47,7 +48,10 @@ TRANSFERS = ("apic", "flip", "pic")
 
 @check_at("flight", "{cells} cells")
 def thrown(found: Findings, cells: int) -> None:
-    """Throw everything; in the controls gravity acts for a whole step before things move by it."""
+    """Throw each material.
+
+    In the controls, gravity acts for the whole step before things move.
+    """
     for what in THROWN:
         for cfl in CFL:
             old = off_its_parabola(what, cells, cfl, whole_kicks=True)
@@ -66,13 +70,15 @@ def thrown(found: Findings, cells: int) -> None:
 
 
 def off_its_parabola(what: str, cells: int, cfl: float, *, whole_kicks: bool = False) -> float:
-    """Return how far a center of mass is from where it should be after `DURATION`, over its way.
+    """Return the distance of a center of mass from its parabola, over its way.
+
+    The distance is taken after `DURATION`.
 
     Args:
         what: a key of `THROWN`.
-        cells: along the domain.
+        cells: cells along the domain.
         cfl: the Courant number.
-        whole_kicks: let gravity act for the whole step that it moves things by, as symplectic Euler
+        whole_kicks: let gravity act for the whole step before the motion, as symplectic Euler
             does.
     """
     simulation = THROWN[what](cells, time={"duration": 100.0, "cfl": cfl, "dt_max": 1.0})
@@ -94,7 +100,7 @@ def off_its_parabola(what: str, cells: int, cfl: float, *, whole_kicks: bool = F
 
 
 def off(moved: np.ndarray, velocity: np.ndarray, duration: float) -> float:
-    """Return how far a way is from that of what was thrown so long ago, over the latter."""
+    """Return the relative distance of a displacement from that of free flight."""
     way = velocity * duration - [0.0, 0.5 * GRAVITY * duration**2]
     return float(np.linalg.norm(moved - way) / np.linalg.norm(way))
 
@@ -125,14 +131,14 @@ THROWING = Check(
 def drop(
     n: int, *, transfer: str = "apic", thrown: bool = False, cfl: float = 2.0, keeps: bool = True
 ) -> LiquidSimulation:
-    """Return a drop that spins in a room of two meters, far from its walls.
+    """Return a spinning drop in a room of two meters, far from its walls.
 
     Args:
-        n: cells a meter.
-        transfer: of particles and grid.
-        thrown: give it the velocity LAUNCH and let gravity act.
+        n: cells per meter.
+        transfer: transfer between particles and grid.
+        thrown: whether it has the velocity LAUNCH and gravity acts.
         cfl: Courant number.
-        keeps: whether bodies in flight keep their momenta; False: the control.
+        keeps: whether airborne material conserves its momenta; False for the control.
     """
     tables: Row = {
         "particles": {"transfer": transfer},
@@ -154,7 +160,10 @@ def drop(
 
 
 def turning(simulation: LiquidSimulation) -> float:
-    """Return the angular momentum about the center of mass, of unit masses [m^2/s], what gradients carry included."""
+    """Return the angular momentum about the center of mass [m^2/s].
+
+    The masses are 1; the part of the affine velocities is included.
+    """
     particles = simulation.particles
     x, v = positions(simulation), particles.velocity.numpy().astype(np.float64)
     whole = angular_momentum(x, v, [g.numpy() for g in particles.affine], simulation.grid.spacing)
@@ -164,7 +173,10 @@ def turning(simulation: LiquidSimulation) -> float:
 
 @check_at("spin", "spinning drop, {n} cells a meter")
 def spinning(found: Findings, n: int) -> None:
-    """Let drops spin without gravity; the control has no law of bodies in flight."""
+    """Simulate spinning drops without gravity.
+
+    The control does not conserve the momenta of airborne material.
+    """
 
     def spun(label: str, simulation: LiquidSimulation) -> tuple[float, np.ndarray]:
         start = turning(simulation)
@@ -172,18 +184,18 @@ def spinning(found: Findings, n: int) -> None:
             (row["time"], turning(simulation) / start, row["kinetic_energy"])
             for row in steps(simulation, FLIGHT)
         ]
-        times, kept, energies = np.array(rows).T
-        found.curve(label, times, kept)
-        return float(kept[-1]), energies
+        times, shares, energies = np.array(rows).T
+        found.curve(label, times, shares)
+        return float(shares[-1]), energies
 
     for transfer in TRANSFERS:
         name, simulation = transfer.upper(), drop(n, transfer=transfer)
         middle = positions(simulation).mean(axis=0)
-        kept, energies = spun(f"{name}, {n} cells a meter", simulation)
+        shares, energies = spun(f"{name}, {n} cells a meter", simulation)
         way = float(np.linalg.norm(positions(simulation).mean(axis=0) - middle))
         found.add(
             f"{name}: angular momentum after {FLIGHT} s, of that at the start",
-            kept,
+            shares,
             low=KEPT[n],
             high=2.0 - KEPT[n],
         )
@@ -193,13 +205,16 @@ def spinning(found: Findings, n: int) -> None:
             np.diff(energies).max() / energies[0],
             high=1e-3,
         )
-    kept, _ = spun("APIC, control", drop(n, keeps=False))
-    found.must_break("APIC: angular momentum, bodies in flight left alone", kept, low=KEPT[n])
+    shares, _ = spun("APIC, control", drop(n, keeps=False))
+    found.must_break("APIC: angular momentum, bodies in flight left alone", shares, low=KEPT[n])
 
 
 @check_at("spin", "thrown spinning drop, {n} cells a meter")
 def parabolas(found: Findings, n: int) -> None:
-    """Throw drops that spin; the control has no law of bodies in flight."""
+    """Throw spinning drops.
+
+    The control does not conserve the momenta of airborne material.
+    """
 
     def missed(cfl: float, *, keeps: bool = True) -> float:
         simulation = drop(n, thrown=True, cfl=cfl, keeps=keeps)

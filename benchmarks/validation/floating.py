@@ -1,4 +1,7 @@
-"""Rigid bodies in a liquid: displacement at rest, added mass, momentum, and solves that do not depend on what bodies weigh."""
+"""Rigid bodies in a liquid: displacement, added mass, momentum, iterations.
+
+The iterations of a solve must not depend on the weight of the bodies.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +23,21 @@ from warp_lcp.benchmarks.validation.scenes import (
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import Window
 
-WIDE = 6  # diameters of the body that the closed tank has
-CELLS = {2: (16, 24), 3: (10, 14)}  # a diameter
-RATIOS = {2: (0.01, 0.5, 3.0), 3: (0.1, 3.0)}  # of the body's density over the liquid's
-# [s]: the acceleration is that of the first step, from rest; velocities are those of its middle
+WIDE = 6  # width of the closed tank, in diameters of the body
+CELLS = {2: (16, 24), 3: (10, 14)}  # cells per diameter, by dimension
+RATIOS = {2: (0.01, 0.5, 3.0), 3: (0.1, 3.0)}  # density of the body over that of the liquid
+# [s] The acceleration is that of the first step, from rest; velocities are those of its middle.
 STEP = 1e-3
-# cells of the tank's side and ratios of densities
+# Cells along the tank's side, and ratios of densities.
 FLOATS = {2: ((48, 0.6), (64, 0.6), (96, 0.3)), 3: ((32, 0.6),)}
 SETTLES = {2: 6.0, 3: 3.0}  # [s]
-BOX = 0.3, 0.2  # [m]: width and height of what floats
+BOX = 0.3, 0.2  # [m] width and height of the floating box
 EXTREMES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3)
 
 
 @check_at("floating", "{dimension}-D, {cells} cells a diameter")
 def accelerations(found: Findings, dimension: int, cells: int) -> None:
-    """Compare the first acceleration of a disc or sphere with that of potential flow."""
+    """Compare the first acceleration of a disc or sphere with potential flow."""
     for ratio in RATIOS[dimension]:
         expected = acceleration(dimension, ratio)
         found.add(
@@ -53,11 +56,12 @@ def accelerations(found: Findings, dimension: int, cells: int) -> None:
 
 
 def acceleration(dimension: int, ratio: float) -> float:
-    """Return the acceleration [m/s^2] from rest of a disc or sphere in a closed tank that is `WIDE` diameters wide.
+    """Return the acceleration [m/s^2] from rest of a disc or sphere in a closed tank.
 
-    (1 - ratio) g / (ratio + C) with the added mass C of a disc in a round tank, (1 + q^2) / (1 -
-    q^2), or of a sphere, (1 + 2 q^3) / (2 - 2 q^3), q = 1 / WIDE (Lamb, Hydrodynamics, 6th ed.,
-    art. 93): the square tank's are like them.
+    The tank is `WIDE` diameters wide. The result is (1 - ratio) g / (ratio + C), where C is the
+    added mass of a disc in a round tank, (1 + q^2) / (1 - q^2), or of a sphere, (1 + 2 q^3) / (2 -
+    2 q^3), with q = 1 / WIDE (Lamb, Hydrodynamics, 6th ed., art. 93). Those of the square tank are
+    close to them.
     """
     q = 1.0 / WIDE
     added = (
@@ -69,7 +73,10 @@ def acceleration(dimension: int, ratio: float) -> float:
 def _first_acceleration(
     dimension: int, cells: int, ratio: float, *, together: bool = True
 ) -> float:
-    """Return a body's vertical acceleration from rest; not `together`: the liquid is solved as if it did not move the body."""
+    """Return a body's vertical acceleration from rest.
+
+    If not `together`, the liquid is solved as if it did not move the body.
+    """
     ball = {
         "shape": "sphere",
         "center": [0.5] * dimension,
@@ -95,7 +102,7 @@ def _first_acceleration(
 
 @check_at("floating", "{dimension}-D, {cells} cells, a box of {ratio:g} times the liquid's density")
 def displacement(found: Findings, dimension: int, cells: int, ratio: float) -> None:
-    """Let a box bob, and compare the mean of what it displaces with its mass."""
+    """Let a box bob; compare its mean displaced mass with its mass."""
     width, height = BOX
     side = 1.0 if dimension == 2 else 0.8
     center, level = 0.5 * side, 0.45
@@ -123,7 +130,10 @@ def displacement(found: Findings, dimension: int, cells: int, ratio: float) -> N
 
 
 def water_level(simulation: LiquidSimulation, width: float) -> float:
-    """Return the mean height of the free surface [m] in the columns that are more than `width` / 4 away from the body."""
+    """Return the mean height of the free surface [m] away from the body.
+
+    Columns within `width` / 4 of the body are left out.
+    """
     dx, body = simulation.grid.spacing, simulation.bodies.bodies[0].position  # type: ignore[union-attr]
     phi = simulation.grid.interior(simulation.surface.phi.numpy())  # type: ignore[union-attr]
     z, x = (np.arange(n) * dx + 0.5 * dx for n in (phi.shape[0], phi.shape[2]))
@@ -148,7 +158,10 @@ def water_level(simulation: LiquidSimulation, width: float) -> float:
 
 @check_at("floating", "{dimension}-D, an impact")
 def momentum(found: Findings, dimension: int) -> None:
-    """Let liquid fly against a body far from walls: what the body gains is what the liquid loses, whatever the solve leaves."""
+    """Let liquid hit a body far from walls, and compare their momenta.
+
+    The body must gain what the liquid loses, whatever the residual of the solve.
+    """
     for ratio in (0.01, 1.0, 100.0):
         lost, exchanged = exchange(dimension, ratio)
         found.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
@@ -160,7 +173,10 @@ def momentum(found: Findings, dimension: int) -> None:
 
 
 def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[float, float]:
-    """Return the momentum that a step's projection loses and that it exchanges; not `together`: kinetic energy after over before, and 0."""
+    """Return the momentum that a step's projection loses, and the exchanged one.
+
+    If not `together`: the ratio of kinetic energy after to before, and 0.
+    """
     body = box(
         [0.46, 0.4, 0.4][:dimension], [0.61, 0.57, 0.57][:dimension], density=DENSITY * ratio
     )
@@ -178,8 +194,8 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
     assert coupling is not None and bodies is not None
     if not together:
         coupling._share = 0.0
-    begun = simulation.begin_step(0.01)
-    window: Window = simulation.window(begun)
+    totals = simulation.begin_step(0.01)
+    window: Window = simulation.window(totals)
     simulation.particles_to_grid(window)
     simulation.surface.mark(simulation.particles, window, simulation.projection.kind)
     simulation.surface.complete(
@@ -188,7 +204,7 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
     before = [field.numpy().astype(np.float64) for field in simulation.velocity]
     start = bodies.bodies[0].momentum.copy()
     energy = bodies.bodies[0].kinetic_energy
-    simulation._project(window, 0.01, simulation.top_speed(begun))
+    simulation._project(window, 0.01, simulation.top_speed(totals))
     wet = np.zeros(simulation.grid.shape, dtype=bool)
     wet[tuple(simulation.projection.fluid_cells().T)] = True
     scale, gained, energies = (
@@ -213,7 +229,7 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
 
 @check_at("floating", "{cells}^3 cells, bodies of all weights")
 def iterations(found: Findings, cells: int) -> None:
-    """Count the iterations of the first step of bodies of all weights under water."""
+    """Count the iterations of the first step of submerged bodies of all weights."""
     counts = {ratio: _iterations(cells, ratio, corrected=True) for ratio in EXTREMES}
     for ratio, count in counts.items():
         found.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)

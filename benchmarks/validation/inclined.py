@@ -1,18 +1,19 @@
-"""Sand on slopes: layers without an end, and blocks and hoppers on walls that lie askew to the grid.
+"""Sand on slopes: periodic layers, and blocks and hoppers on inclined walls.
 
-A layer rests, or runs with the acceleration that friction leaves of gravity's.
+The walls are inclined to the grid. A layer rests, or runs with the acceleration of gravity less
+that of friction.
 
-On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff
-sand slides on a smooth one with the wall's. Above the friction angle sand that runs goes on
-running; sand that has settled holds up to the angle whose sine is k, because it has pushed against
-itself along the slope. So the checks of running sand start it moving. A rough floor bears what sand
-beside it bears in simple shear, k times the load: a layer that runs slides on it, the lowest row as
-fast as the others.
+On a rough floor the friction is the sand's own, k = tan(friction angle) times the normal load. On a
+smooth floor stiff sand slides with the friction of the wall. Above the friction angle running sand
+keeps running. Sand that has settled rests up to the angle whose sine is k, because it has pushed
+against itself along the slope. Checks of running sand therefore start with a velocity. A rough
+floor bears the stress of sand in simple shear, k times the load: a running layer slides on it, and
+its lowest row is as fast as the others.
 
-Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer runs at
-a steady speed. Pressure and shear stress grow with the depth alike, so that I is the same
-everywhere, mu(I) = tan(slope). |Rate of shear| = I sqrt(p / rho_s) / d with p = rho g (H - y)
-cos(slope), rho = max_fraction rho_s, then integrates to Bagnold's profile, u = 2/3 I / d
+Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer reaches
+a steady speed. Pressure and shear stress grow equally with the depth, so that I is the same
+everywhere: mu(I) = tan(slope). The rate of shear is I sqrt(p / rho_s) / d with p = rho g (H - y)
+cos(slope) and rho = max_fraction rho_s. Its integral is Bagnold's profile, u = 2/3 I / d
 sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 """
 
@@ -38,43 +39,46 @@ from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.solids import SandSolids
 from warp_lcp.material.particle_assembly import Parts
 
-DEPTH, LENGTH = 0.32, 0.16  # [m]: of the layer, and of the domain
-RESOLUTIONS = (16, 32)  # cells of depth
-DT = 2e-3  # [s], at 16 cells
-# [s]: how long sand runs, settles, and is watched as it rests
+DEPTH, LENGTH = 0.32, 0.16  # [m] depth of the layer and length of the domain
+RESOLUTIONS = (16, 32)  # cells of the depth
+DT = 2e-3  # [s] at 16 cells
+# [s] Durations of running, settling and resting.
 RUNS, SETTLES, RESTS = 0.2, 0.12, 0.4
-START = 0.5  # [m/s] of sand that runs
+START = 0.5  # [m/s] initial speed of running sand
 ROUGH, SMOOTH = "stick", 0.5
 BAGNOLD = "Bagnold's layer"
-COEFFICIENT = 0.5  # of both
+COEFFICIENT = 0.5  # friction of the sand and of the wall
 FRICTION_ANGLE, STIFF = math.degrees(math.atan(COEFFICIENT)), 37.5  # degrees
 ANGLES, SLIDES = (27.5, 29.0, 31.0, 35.0), (26.8, 30.0, 35.0)
 REST, SLAB_REST, BOX_FLOWS = 26.0, 26.3, 26.0  # degrees
-# degrees, degrees and I0: glass beads [Jop, Forterre & Pouliquen 2006]
+# Angles [degrees] and I0 of glass beads [Jop, Forterre & Pouliquen 2006].
 STATIC, DYNAMIC, INERTIAL = 20.9, 32.76, 0.279
-# [m]: Bagnold's profile knows no other length than the depth, and with so large a grain it is
-# steady in a second
+# [m] The depth is the only other length in Bagnold's profile. With so large a grain the flow is
+# steady within a second.
 GRAIN = 0.3
-# degrees; degrees at which it rests after this time [s],
+# Slopes [degrees] of steady flow; a slope at which sand comes to rest, within this time [s],
 STEADY, BELOW, STOPPED = (24.0, 28.0), 19.0, 0.6
-CREEPS = 0.1  # from this speed [m/s]
-SETS_IN, OFF = 0.9, 0.8  # [s] until it is steady; what of the profile it starts with
+CREEPS = 0.1  # starting from this speed [m/s]
+SETS_IN, OFF = 0.9, 0.8  # [s] until the flow is steady; initial factor of the profile
 
-# degrees, friction of planes that the block slides on
+# Slopes [degrees], and friction of the planes on which the block slides.
 PLANES = ((10.0, 0.1), (20.0, 0.2), (30.0, 0.3), (45.0, 0.5))
 BLOCK_HEIGHT, BLOCK_LENGTH = 0.1, 0.4  # [m]
 BLOCK = {"friction_angle": 40.0, "cohesion": 5e3}
-AFTER, UNTIL = 0.03, 0.12  # [s], when the block's acceleration is measured
-HOPPER = 40  # cells of its width
-# of the hopper [m, degrees], and its friction
+AFTER, UNTIL = 0.03, 0.12  # [s] range in which the block's acceleration is measured
+HOPPER = 40  # cells of the hopper's width
+# Sizes of the hopper [m, degrees], and its friction.
 WIDTH, SLOT, STEEP, LIP, SLICK = 0.4, 0.1, 60.0, 0.025, 0.2
-SHIFTS = (0.0, 0.25, 0.5)  # of the grid [cells]
-FROM, TO, PARTS = 0.25, 0.6, 3  # [s], when the hopper's rate is measured
+SHIFTS = (0.0, 0.25, 0.5)  # shifts of the grid [cells]
+FROM, TO, PARTS = 0.25, 0.6, 3  # [s] range in which the hopper's rate is measured, and its parts
 
 
 @check_at("inclined layer", "{cells} cells of depth")
 def layer(found: Findings, cells: int, angles: tuple[float, ...] = ANGLES) -> None:
-    """Let sand rest and run on a rough slope; the control is the box of Narain et al., which gives way where sand should rest."""
+    """Let sand rest and run on a rough slope.
+
+    The control is the box of Narain et al., which yields where sand should rest.
+    """
     whole, late = rests(cells, REST)
     found.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
     found.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
@@ -94,7 +98,10 @@ def layer(found: Findings, cells: int, angles: tuple[float, ...] = ANGLES) -> No
 
 @check_at("sliding slab", "{cells} cells of depth")
 def slab(found: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> None:
-    """Let stiff sand rest and slide on a smooth slope; the control is a floor without friction."""
+    """Let stiff sand rest and slide on a smooth slope.
+
+    The control is a floor without friction.
+    """
     tables = {"material": {"friction_angle": STIFF}, "floor": SMOOTH}
     _, late = rests(cells, SLAB_REST, **tables)
     found.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
@@ -107,7 +114,10 @@ def slab(found: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> Non
 
 @check_at(BAGNOLD, "{cells} cells of depth")
 def bagnold(found: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> None:
-    """Let sand whose friction grows with the rate of shear run to its steady speed; the control is friction that does not grow."""
+    """Let sand with rate-dependent friction reach its steady speed.
+
+    The control is constant friction.
+    """
     beads: dict[str, Any] = {"material": {"friction_angle": STATIC}}
     growing = beads | {
         "friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}
@@ -158,7 +168,7 @@ def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:
 
 
 def steady(cells: int, angle: float, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights [m] of rows of sand that has run for a while on a slope [degrees], and their mean speeds [m/s]."""
+    """Return heights [m] of rows of steadily running sand and mean speeds [m/s]."""
     simulation = _create(cells, angle, 0.0, **tables)
     velocity = simulation.particles.velocity.numpy()
     velocity[:, 0] = OFF * bagnold_profile(simulation.particles.position.numpy()[:, 1], angle)
@@ -171,12 +181,15 @@ def steady(cells: int, angle: float, **tables: Any) -> tuple[np.ndarray, np.ndar
 
 
 def accelerates(angle: float) -> float:
-    """Return g (sin - mu cos) [m/s^2] for an angle [degrees]."""
+    """Return g (sin - mu cos) [m/s^2] for a slope [degrees]."""
     return GRAVITY * (math.sin(math.radians(angle)) - COEFFICIENT * math.cos(math.radians(angle)))
 
 
 def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> float:
-    """Return the acceleration of sand on a slope [degrees] in the second half of its run [m/s^2]."""
+    """Return the acceleration of running sand on a slope [m/s^2].
+
+    It is measured in the second half of the run; the slope is in degrees.
+    """
     simulation = _create(cells, angle, speed, **tables)
     time, mean = _watch(simulation, cells, RUNS)
     half = time > 0.5 * RUNS
@@ -184,7 +197,10 @@ def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> fl
 
 
 def rests(cells: int, angle: float, **tables: Any) -> tuple[float, float]:
-    """Return how fast sand that has settled on the level gains speed on a slope [degrees], in all and in the second half of RESTS [g]."""
+    """Return the acceleration [g] of sand that settled level and is then tilted.
+
+    The results are over all of RESTS, and over its second half; the slope is in degrees.
+    """
     simulation = _create(cells, 0.0, 0.0, **tables)
     _watch(simulation, cells, SETTLES)
     simulation.particles.velocity.zero_()
@@ -223,7 +239,10 @@ def _create(
 def _watch(
     simulation: SandSimulation, cells: int, duration: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Step for a time [s]; return the time since [s] and the mean velocity along the slope [m/s] after each step."""
+    """Step for a time; return times [s] and mean velocities along the slope [m/s].
+
+    There is one entry for each step.
+    """
     dt = DT * RESOLUTIONS[0] / cells
     mean = []
     for _ in range(round(duration / dt)):
@@ -293,7 +312,7 @@ def planes(found: Findings, cells: int, cases: tuple[tuple[float, float], ...] =
 
 @check_at("sand oblique", "hopper of {cells} cells")
 def hopper(found: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> None:
-    """Let sand run from a hopper whose place in the grid differs."""
+    """Let sand run from a hopper at several places in the grid."""
     cut, stairs = (
         np.array([discharge(shift, cells, whole=whole) for shift in shifts])
         for whole in (False, True)
@@ -320,11 +339,11 @@ def acceleration(
     """Return the acceleration of a stiff block down a plane [m/s^2].
 
     Args:
-        angle: of the plane [degrees].
-        friction: of the plane.
-        cells: of the block's height.
-        whole: solids are whole cells for the stresses.
-        shift: of the plane [cells].
+        angle: slope of the plane [degrees].
+        friction: friction of the plane.
+        cells: cells of the block's height.
+        whole: whether solids are whole cells for the stresses.
+        shift: shift of the plane in the grid [cells].
     """
     t, dx = math.radians(angle), BLOCK_HEIGHT / cells
     down, up = np.array([math.cos(t), -math.sin(t)]), np.array([math.sin(t), math.cos(t)])
@@ -344,12 +363,12 @@ def acceleration(
 
 
 def discharge(shift: float, cells: int, *, whole: bool = False) -> list[float]:
-    """Return a hopper's rate in parts of the time, over sqrt(g D^3).
+    """Return the discharge rates of a hopper in parts of the time, over sqrt(g D^3).
 
     Args:
-        shift: of the hopper [cells].
-        cells: of its width.
-        whole: solids are whole cells for the stresses.
+        shift: shift of the hopper in the grid [cells].
+        cells: cells of its width.
+        whole: whether solids are whole cells for the stresses.
     """
     dx, t, parts = WIDTH / cells, math.radians(STEEP), np.linspace(FROM, TO, PARTS + 1)
     middle, foot = 0.5 * WIDTH + shift * dx, 0.2 + 0.61 * shift * dx
@@ -380,7 +399,10 @@ def discharge(shift: float, cells: int, *, whole: bool = False) -> list[float]:
 
 
 def with_stairs(simulation: SandSimulation) -> SandSimulation:
-    """Return a simulation of the same, not yet begun, whose solids are whole cells for the stresses."""
+    """Return a new simulation of the same scene, with solids of whole cells.
+
+    They are whole cells for the stresses.
+    """
     scene, boundary = simulation.scene, simulation.boundary
     solids = SandSolids(simulation.grid, boundary.cut.solids, boundary, scene.wall_frictions())  # type: ignore[attr-defined]
     return SandSimulation(
@@ -394,9 +416,11 @@ def with_stairs(simulation: SandSimulation) -> SandSimulation:
 
 OBLIQUE = Check(
     about="""
-Sand on walls that lie askew to the grid: a stiff block slides as Coulomb says, and a smooth hopper runs evenly wherever the grid lies.
+Sand on walls that are inclined to the grid: a stiff block slides by Coulomb's law, and the rate of
+a smooth hopper does not depend on its place in the grid.
 
-The control are solids of whole cells, whose stairs hold the block, and whose hopper runs as its stairs happen to lie.
+The controls are solids of whole cells. Their stairs hold the block, and the rate of their hopper
+depends on the place of the stairs.
 """,
     trials=[(planes, (8, 16)), (hopper, [()])],
 )

@@ -1,4 +1,8 @@
-"""Liquids at rest and nearly so: they stay there, their pressure is that of their depth, and small waves go as linear theory says."""
+"""Liquids at rest, and small waves.
+
+A liquid at rest must stay at rest, with hydrostatic pressure. Small waves must follow linear
+theory.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +30,11 @@ from warp_lcp.benchmarks.validation.scenes import (
 )
 from warp_lcp.benchmarks.validation.signals import enclosed_cells, mode, period
 
-RESOLUTIONS = (20, 40)  # cells a side
-SIDE, LEVEL = 0.8, 0.4  # [m]: of the domain, and of a pool
+RESOLUTIONS = (20, 40)  # cells along a side
+SIDE, LEVEL = 0.8, 0.4  # [m] side of the domain, and level of a pool
 DURATION, TILTED_DURATION = 10.0, 20.0  # [s]
-AVERAGED = 1.0  # [s] at the end over which the pressure's bias is averaged
-SLOPE, TILT = 30.0, 20.0  # degrees: of the planes of a V, and of gravity
+AVERAGED = 1.0  # [s] at the end, over which the pressure's bias is averaged
+SLOPE, TILT = 30.0, 20.0  # degrees: planes of a V, and gravity
 
 POOL = [box([0.0, 0.0], [SIDE, LEVEL])]
 V = [
@@ -49,39 +53,44 @@ CASES: dict[str, scenes.Row] = {
     "full tilted box": {"liquid": FULL, "physics": tilted(TILT)},
 }
 
-WAVE_RESOLUTIONS = (14, 28)  # cells of depth
-LENGTH, DEPTH, HEIGHT = 1.0, 0.5, 0.75  # [m]: of the tank, of the liquid, of the tank
+WAVE_RESOLUTIONS = (14, 28)  # cells of the depth
+# [m] length of the tank, depth of the liquid, height of the tank
+LENGTH, DEPTH, HEIGHT = 1.0, 0.5, 0.75
 AMPLITUDE = 0.05 * DEPTH
 WAVENUMBER = math.pi / LENGTH
 PERIOD = 2.0 * math.pi / math.sqrt(GRAVITY * WAVENUMBER * math.tanh(WAVENUMBER * DEPTH))
 PERIODS = 5
-# of the particles: with whole cells the period is a matter of chance too, once the wave is lower
-# than a cell
+# Seeds of the particles: with whole cells the period also depends on chance, once the wave is lower
+# than a cell.
 SEEDS = (2015, 1, 2)
-POINTS = 257  # of the surface at the start
+POINTS = 257  # points of the initial surface
 SPEED = "t [s]", "largest speed / sqrt(g dx)"
-STAIRS = "whole cells: error of the period"  # a control
+STAIRS = "whole cells: error of the period"  # negative control
 
 
 class Rest(NamedTuple):
-    """What a liquid that should rest did."""
+    """Results of a liquid that should rest."""
 
     time: np.ndarray  # ends of the steps [s]
-    speed: np.ndarray  # largest of the particles, in units of sqrt(g dx)
-    # of the pressure below the surface at the end, in units of rho g dx, if it is level
+    speed: np.ndarray  # largest speed of the particles, in units of sqrt(g dx)
+    # Bias of the pressure below the surface at the end, in units of rho g dx, if the surface is
+    # level.
     bias: float
-    # heights of rows of cells [m] and their mean pressure [Pa]
+    # Heights of rows of cells [m] and their mean pressure [Pa].
     profile: tuple[np.ndarray, np.ndarray]
     volume: float  # inside the sub-cell surface at the end over that at the start
 
     def largest(self, begin: float, end: float) -> float:
-        """Return the largest speed of the steps that end in a span of time [s]."""
+        """Return the largest speed of the steps that end in a time interval [s]."""
         return float(self.speed[(self.time > begin) & (self.time <= end + 1e-9)].max())
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
 def whole_cells(found: Findings, resolution: int, numerics: Numerics = VOXEL) -> None:
-    """Rest with a surface and solids of whole cells; the controls are a pool that gravity tilts, and a surface within the cells."""
+    """Test rest with a surface and solids of whole cells.
+
+    The controls are a pool with tilted gravity, and a surface within the cells.
+    """
     for case, tables in CASES.items():
         rest = settle(resolution, VOXEL, DURATION, **tables)
         found.add(f"{case}: largest speed", rest.largest(0.0, DURATION), high=1e-3)
@@ -103,7 +112,10 @@ def whole_cells(found: Findings, resolution: int, numerics: Numerics = VOXEL) ->
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
 def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
-    """Rest with a sub-cell surface and cut cells; the control is the bias that a surface of whole cells has."""
+    """Test rest with a sub-cell surface and cut cells.
+
+    The control is the bias of a surface of whole cells.
+    """
     for case, tables in CASES.items():
         rest = settle(resolution, numerics, DURATION, **tables)
         found.add(f"{case}: largest speed in the first second", rest.largest(0.0, 1.0), high=0.05)
@@ -113,7 +125,7 @@ def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) ->
             found.add(f"{case}: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx")
         if case == "pool":
             _draw_profile(found, rest)
-    level = LEVEL + 0.5 * SIDE / resolution  # its surface goes through the cells' centers
+    level = LEVEL + 0.5 * SIDE / resolution  # its surface goes through the centers of cells
     rest = settle(resolution, numerics, DURATION, level, liquid=[box([0.0, 0.0], [SIDE, level])])
     found.add(
         "pool half a cell higher: |bias of the pressure|",
@@ -130,7 +142,10 @@ def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) ->
 
 @check_at("tilted rest", "{resolution} cells, {numerics.name}")
 def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED) -> None:
-    """Rest of a free surface that gravity tilts; the control is a surface of whole cells, whose stairs run."""
+    """Test rest of a free surface with tilted gravity.
+
+    The control is a surface of whole cells, whose stairs flow.
+    """
     normal = [-math.sin(math.radians(TILT)), math.cos(math.radians(TILT))]
     tables: scenes.Row = {
         "liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}],
@@ -156,7 +171,10 @@ def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes
 def settle(
     resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any
 ) -> Rest:
-    """Let a liquid rest for a time [s]; `level` is how high it stands if it stands level [m]."""
+    """Let a liquid rest for a time [s].
+
+    `level` is the height of a level surface [m].
+    """
     simulation = scenes.create_liquid(numerics, [SIDE, SIDE], resolution, **tables)
     dx = simulation.grid.spacing
     before, unit = enclosed_cells(*scenes.particles_in_cells(simulation)), math.sqrt(GRAVITY * dx)
@@ -179,7 +197,10 @@ def settle(
 def _bias(
     pressure: np.ndarray, dx: float, level: float = LEVEL
 ) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
-    """Return the mean of p - rho g (h - y) in the cells that lie a cell or more below the surface, and the rows' mean pressures."""
+    """Return the mean of p - rho g (h - y), and the mean pressures of the rows.
+
+    Only cells count that lie a cell or more below the surface.
+    """
     y = (np.arange(len(pressure)) + 0.5) * dx
     wet = pressure > 0.0
     deep = wet & (y < level - dx)[:, None]
@@ -221,7 +242,10 @@ RESTING = Check(
 
 @check_at("sloshing", "{cells} cells of depth, {numerics.name}")
 def sloshing(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
-    """Measure the period, the worst of some samples; the control is a surface of whole cells, which follows waves in stairs."""
+    """Measure the sloshing period, the worst of some samples.
+
+    The control is a surface of whole cells, which resolves waves in stairs only.
+    """
     for each in (numerics, VOXEL):
         waves = [slosh(cells, each, seed) for seed in SEEDS]
         periods = [period(*wave) for wave in waves]
@@ -238,7 +262,10 @@ def sloshing(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None
 
 
 def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and the amplitude of the first mode [m]; the seed is that of the particles' places."""
+    """Return times [s] and the amplitude of the first mode [m].
+
+    The seed is that of the particles' positions.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder, size = Path(name), [LENGTH, HEIGHT]
         write_wave(folder / "wave.obj")
@@ -265,8 +292,11 @@ def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndar
 
 
 def write_wave(path: Path) -> None:
-    """Write the liquid at the start as a closed surface, extruded along z: its cut by z = 0 lies below y = h + a cos(k x)."""
-    margin = 0.1 * LENGTH  # beyond the walls, so that none of the liquid's sides lies on them
+    """Write the initial liquid as a closed surface, extruded along z.
+
+    Its cut by z = 0 lies below y = h + a cos(k x).
+    """
+    margin = 0.1 * LENGTH  # beyond the walls, so that no side of the liquid lies on a wall
     x = np.linspace(-margin, LENGTH + margin, POINTS)
     outline = [
         *zip(x, DEPTH + AMPLITUDE * np.cos(WAVENUMBER * x), strict=True),

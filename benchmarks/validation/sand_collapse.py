@@ -1,4 +1,4 @@
-"""Columns of sand that collapse: how far they run, what every step of them must keep, and how their piles come to rest."""
+"""Collapsing columns of sand: runout, invariants of every step, final rest."""
 
 from __future__ import annotations
 
@@ -25,68 +25,70 @@ from warp_lcp.benchmarks.validation.scenes import (
 )
 from warp_lcp.granular.simulator import SandSimulation
 
-# aspects at each number of cells of a column's width
+# Aspect ratios by the number of cells of a column's width.
 CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}
-CONTROLLED = 2.0  # the aspect of the negative controls
-WIDENED = 0.2  # of the experiments' range
-HEIGHT = 0.1  # of the experiments' heights
-STEEPEST = 45.0  # degrees of a control: no cone is steeper
-# cells and aspects of columns whose friction grows with the rate of shear,
+CONTROLLED = 2.0  # aspect ratio of the negative controls
+WIDENED = 0.2  # tolerance around the range of the experiments
+HEIGHT = 0.1  # tolerance of the experiments' heights
+STEEPEST = 45.0  # degrees, of a control: no cone is steeper
+# Cells and aspect ratios of columns whose friction grows with the rate of shear.
 GROWTH = 20, (1.0, 2.0, 4.0)
-# by as much as that of glass beads
+# It grows by as much as that of glass beads.
 GAIN = math.tan(math.radians(32.76)) - math.tan(math.radians(20.9))
 DYNAMIC = math.degrees(math.atan(WALL_FRICTION + GAIN))
-GRAIN = 5.3e-4  # [m], and of their size [Jop, Forterre & Pouliquen 2006]
-TALL = 4.0  # the aspect from which that must bring the runout into the experiments' range
-STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
-# cells of height from which columns need more iterations a step than a scene allows by itself; how
-# many
+GRAIN = 5.3e-4  # [m] grain size of glass beads [Jop, Forterre & Pouliquen 2006]
+TALL = 4.0  # aspect ratio from which that must bring the runout into the experiments' range
+# [sqrt(height / g)] until a pile has stopped; [s] of observation from then on
+STOPS, STAYS = 3.5, 0.5
+# Cells of height from which columns need more iterations in a step than the default limit; their
+# limit.
 HIGH, MOST = 80, 1500
-STEEP = 40.0  # degrees of the control in 3-D, where no cone is steeper than 40.8
-CUBE = 48  # cells of the domain in 3-D
-CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m]: of the domain, and of the cube that collapses there
+STEEP = 40.0  # degrees, of the control in 3-D, where no cone is steeper than 40.8
+CUBE = 48  # cells along the domain in 3-D
+CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m] domain in 3-D, and the cube that collapses there
 
-RESOLUTIONS = (20, 40)  # cells of the width of a column whose steps or rest are watched
-ASPECT, LENGTH, DURATION = 2.0, 7.0, 1.2  # of that column; of the domain [widths]; [s]
+RESOLUTIONS = (20, 40)  # cells of the width of a column whose steps or rest are observed
+# Of that column: aspect ratio, domain [widths], duration [s].
+ASPECT, LENGTH, DURATION = 2.0, 7.0, 1.2
 FALL = math.sqrt(ASPECT * WIDTH / GRAVITY)  # [s]
-FEW = 10  # iterations of a control's solves
-EXCESS = 5e-3  # by which a step may overfill a cell, by its own stresses
-DENSEST = 1.1  # of a cell once particles have been moved apart
-STOPPED = 5.0  # [sqrt(height / g)] from the start: the kinetic energy is below 1e-3 of the largest
-AFTER, WATCHED = 1.0, 0.5  # [s] from then to the first watch, and of each watch
+FEW = 10  # iteration limit of a control
+EXCESS = 5e-3  # fraction by which a step may overfill a cell, by its own stresses
+DENSEST = 1.1  # fraction of a cell after the density correction
+STOPPED = 5.0  # [sqrt(height / g)] from the start: kinetic energy below 1e-3 of the largest
+AFTER, WATCHED = 1.0, 0.5  # [s] from then to the first observation, and length of each
 WATCHES = 3
-SLIPPERY = 5.0  # degrees: of the friction of a control
-DEEP, ALL = 1e-4, 1e-3  # [heights / s]
+SLIPPERY = 5.0  # degrees, friction of a control
+DEEP, ALL = 1e-4, 1e-3  # [heights / s] drift of the inside, and of all
 
 
 class Collapse(NamedTuple):
-    """What a column has become."""
+    """Result of a collapse."""
 
-    runout: float  # of the front, in widths
-    height: float  # of the pile, over that of Lube et al.
-    moved: float  # how far the front went in the end of the run, in widths
-    energy: float  # kinetic, at the end, over the largest
-    solved: float  # share of the steps whose stresses are within the tolerance [%]
+    runout: float  # place of the front, in widths
+    height: float  # height of the pile, over that of Lube et al.
+    moved: float  # way of the front at the end of the run, in widths
+    energy: float  # kinetic energy at the end, over the largest
+    solved: float  # share of the steps whose stresses meet the tolerance [%]
     outline: tuple[np.ndarray, np.ndarray]  # x and y of the pile's surface, in widths
 
 
 def lube(aspect: float) -> float:
-    """Return the runout, in widths, that [Lube2005] found: 1.2 a, 1.9 a^(2/3) from 1.8 on."""
+    """Return the runout of [Lube2005] in widths: 1.2 a, 1.9 a^(2/3) from 1.8 on."""
     return 1.2 * aspect if aspect < 1.8 else 1.9 * aspect ** (2.0 / 3.0)
 
 
 def lajeunesse(aspect: float) -> float:
-    """Return the runout, in widths, that [Lajeunesse2005] found: 1.8 a, then 2.3 a^(2/3)."""
+    """Return the runout of [Lajeunesse2005] in widths: 1.8 a, then 2.3 a^(2/3)."""
     return min(1.8 * aspect, 2.3 * aspect ** (2.0 / 3.0))
 
 
 def lube_height(aspect: float) -> float:
-    """Return the height of the pile, in widths, that [Lube2005] found: a, a^(2/5) from 1.15 on."""
+    """Return the height of [Lube2005] in widths: a, a^(2/5) from 1.15 on."""
     return aspect if aspect < 1.15 else float(aspect**0.4)
 
 
 def envelope(aspect: float) -> tuple[float, float]:
-    """Return the least and the largest runout that the experiments allow."""
+    """Return the smallest and the largest runout that the experiments allow."""
     found = lube(aspect), lajeunesse(aspect)
     return (1.0 - WIDENED) * min(found), (1.0 + WIDENED) * max(found)
 
@@ -95,13 +97,15 @@ def envelope(aspect: float) -> tuple[float, float]:
 def runouts(
     found: Findings, cells: int, aspects: tuple[float, ...] = (), *, controls: bool = True
 ) -> None:
-    """Compare runouts and heights with the experiments; the controls have half of their friction, and the most that a cone may have.
+    """Compare runouts and heights with the experiments.
+
+    The controls have half of the friction, and the largest friction of a cone.
 
     Args:
-        found: takes the figures.
-        cells: of a column's width.
-        aspects: height over width; those of the check without any.
-        controls: run the negative controls too.
+        found: collector of the figures.
+        cells: cells of a column's width.
+        aspects: ratios of height to width; those of the check by default.
+        controls: whether the negative controls run too.
     """
     chosen, ways = aspects or CASES[cells], []
     for aspect in chosen:
@@ -145,9 +149,9 @@ def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -
 
     Args:
         aspect: height over width.
-        cells: of the width.
-        length: of the domain [widths]; by the experiments without one.
-        tables: of the scene.
+        cells: cells of the width.
+        length: length of the domain [widths]; by default from the experiments.
+        tables: further tables of the scene.
     """
     more = {"solver": {"max_iterations": MOST}} if aspect * cells >= HIGH else {}
     simulation = column(
@@ -175,7 +179,10 @@ def _energy(rows: Sequence[Row]) -> float:
 def growing(
     found: Findings, cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]
 ) -> None:
-    """Compare columns whose friction grows with the rate of shear by as much as that of glass beads."""
+    """Compare columns with rate-dependent friction.
+
+    It grows by as much as that of glass beads.
+    """
     ways = []
     for aspect in aspects:
         c = collapse(aspect, cells, friction={"dynamic_angle": DYNAMIC, "grain_size": GRAIN})
@@ -191,19 +198,19 @@ def growing(
 
 @check_at("sand collapse", "3-D, {cells} cells")
 def cube(found: Findings, cells: int = CUBE) -> None:
-    """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do.
+    """Simulate the collapse of a square column in 3-D.
 
-    The controls are the cube itself, and sand of nearly the steepest cone. Sand with half of the
-    friction would meet the walls.
+    It must stop as a round pile with the runout of round columns. The controls are the cube itself,
+    and sand of nearly the steepest cone. Sand with half of the friction would meet the walls.
     """
     start, x, rows = _falling_cube({"friction_angle": FRICTION_ANGLE}, WALL_FRICTION, cells)
     found.add("kinetic energy in the end over the largest", _energy(rows), high=1e-3)
     found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
     found.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
     found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
-    radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of the same area
+    radius = CUBE_WIDTH / math.sqrt(math.pi)  # radius of a round column of equal area
     aspect = CUBE_WIDTH / radius
-    # [Lube2004], [Lajeunesse2004]
+    # [Lube2004], [Lajeunesse2004].
     low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)
     found.add(
         f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii"
@@ -224,7 +231,10 @@ def cube(found: Findings, cells: int = CUBE) -> None:
 def _falling_cube(
     material: Row, walls: float, cells: int
 ) -> tuple[np.ndarray, np.ndarray, list[Row]]:
-    """Return where the particles of a cube of sand are at the start and in the end, from its axis, shape (n, 2) [m], and the log's rows."""
+    """Return the initial and final particles of a cube of sand, and the log's rows.
+
+    Positions are from the cube's axis, shape (n, 2) [m].
+    """
     near, end = 0.5 * (CUBE_DOMAIN - CUBE_WIDTH), 0.5 * (CUBE_DOMAIN + CUBE_WIDTH)
     sand, size = (
         scenes.box([near, 0.0, near], [end, CUBE_WIDTH, end]),
@@ -239,13 +249,16 @@ def _falling_cube(
 
 
 def _squareness(x: np.ndarray) -> float:
-    """Return |mean of exp(4 i angle)| of the 5 % farthest from the axis: 1 of a square's corners, 0 of a circle."""
+    """Return |mean of exp(4 i angle)| of the 5 % of particles farthest from the axis.
+
+    It is 1 for a square's corners, 0 for a circle.
+    """
     far = np.linalg.norm(x, axis=1) > np.percentile(np.linalg.norm(x, axis=1), 95.0)
     return float(np.abs(np.exp(4.0j * np.arctan2(x[far, 1], x[far, 0])).mean()))
 
 
 def _reach(x: np.ndarray) -> float:
-    """Return how far from the axis the front is [m]."""
+    """Return the distance of the front from the axis [m]."""
     return float(np.percentile(np.linalg.norm(x, axis=1), 99.0))
 
 
@@ -274,7 +287,10 @@ COLLAPSES = Check(
 
 @check_at("sand invariants", "{cells} cells of width")
 def invariants(found: Findings, cells: int, duration: float = DURATION) -> None:
-    """Watch every step of a collapse; the controls move no particles apart, end their solves early, and lose sand through the floor."""
+    """Check the invariants of every step of a collapse.
+
+    The controls have no density correction, few iterations, and a leaking floor.
+    """
     simulation = column(ASPECT, cells, length=LENGTH)
     mass = simulation.particle_mass * simulation.particles.count
     rows, least, off = watch(simulation, duration)
@@ -343,7 +359,7 @@ def _change(rows: Sequence[Row], mass: float) -> float:
 
 
 def watch(simulation: SandSimulation, duration: float) -> tuple[list[Row], float, np.ndarray]:
-    """Step for a time [s].
+    """Step for a time [s] and record invariants.
 
     Returns:
         The log's rows, the least pressure of any cell [rho g dx], and the complementarity of the
@@ -370,7 +386,10 @@ INVARIANTS = Check(
 
 @check_at("sand rest", "{cells} cells of width")
 def resting(found: Findings, cells: int, watches: int = WATCHES) -> None:
-    """Watch a pile at rest; the control is of sand that hardly rubs."""
+    """Measure the drift of a pile at rest.
+
+    The control is sand of little friction.
+    """
     whole, deep = np.array(rest(cells, watches)).T
     found.add(
         f"{AFTER:g} s after the stop: drift four cells below the surface",
@@ -400,7 +419,10 @@ def resting(found: Findings, cells: int, watches: int = WATCHES) -> None:
 
 
 def rest(cells: int, watches: int, **tables: Any) -> list[tuple[float, float]]:
-    """Return the drift of all and of the inside of a pile [heights / s], in each watch."""
+    """Return the drift of all and of the inside of a pile, in each observation.
+
+    Drifts are in heights / s.
+    """
     simulation = column(ASPECT, cells, length=LENGTH, **tables)
     for _ in steps(simulation, STOPPED * FALL + AFTER):
         pass
@@ -409,9 +431,12 @@ def rest(cells: int, watches: int, **tables: Any) -> list[tuple[float, float]]:
 
 @check_at("sand models", "{cells} cells of width")
 def models(found: Findings, cells: int) -> None:
-    """Compare cone and box: what they cost, how far sand runs, and how it rests; the control's solves end after a few iterations."""
+    """Compare cone and box: cost, runout and rest.
+
+    The solves of the control end after a few iterations.
+    """
     low, high = envelope(ASPECT)
-    for model, least in (("cone", 95.0), ("box", 70.0)):  # the box's problem is the harder one
+    for model, least in (("cone", 95.0), ("box", 70.0)):  # the problem of the box is harder
         simulation = column(ASPECT, cells, length=LENGTH, friction={"model": model})
         begun = time.perf_counter()
         rows = list(steps(simulation, STOPPED * FALL + AFTER))
@@ -435,7 +460,8 @@ def models(found: Findings, cells: int) -> None:
 
 
 RESTING = Check(
-    about="""A pile that has collapsed comes to rest: its inside stands, and its surface moves less and less.
+    about="""
+A collapsed pile comes to rest: its inside does not move, and its surface moves less and less.
 
 The box of Narain et al. is compared with the cone on the same column.
 """,

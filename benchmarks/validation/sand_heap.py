@@ -1,9 +1,9 @@
-"""Heaps of sand that is poured slowly: how steep they are, that they are wedges and stay; and that wedges which are flatter stay too.
+"""Heaps of slowly poured sand: slope, shape and rest; rest of flatter wedges.
 
-In sand whose yield set has the slope k a layer that runs stops at atan k: what slides along a slope
-shears alone, under equal normal stresses. Sand that rests has pushed against itself along the
-slope, and so holds up to asin k: by 1, 5 and 17 degrees more at 20, 30 and 40. A heap lies between,
-and the check says by how much it is off the angle at which layers stop.
+If the slope of the yield set is k, a running layer stops at atan k: a layer that slides along a
+slope is in simple shear, with equal normal stresses. Resting sand has pushed against itself along
+the slope, and so rests up to asin k: by 1, 5 and 17 degrees more at 20, 30 and 40. The slope of a
+heap lies between the two. The check measures its difference from the angle at which layers stop.
 """
 
 from __future__ import annotations
@@ -21,32 +21,34 @@ from warp_lcp.granular.simulator import SandSimulation
 
 ANGLES = (20.0, 30.0, 40.0)  # degrees, at which a layer stops
 RESOLUTIONS = (96, 144)  # cells of the domain's length
-LENGTH, HEIGHT = 1.2, 0.5  # [m]: of the domain
-DROP, MOUTH, LIP, SPEED = 0.3, 0.05, 0.02, 0.125  # [m], [m], [m], [m/s]: of the source
-AREA = 0.04  # [m^2]: what it pours
-SEED_WIDTH, SEED_HEIGHT = 0.1, 0.025  # [m]: of the sand that is there at the start
-SETTLES, LASTS = 1.0, 5.0  # [s] from the end of the pouring to the first look, and to the last
-NEAR, ALIKE, CREEP = 2.0, 1.5, 0.2  # degrees; degrees between two resolutions; degrees a second
-# of a wedge: degrees below the angle; [m]; [s]; share of its height
+LENGTH, HEIGHT = 1.2, 0.5  # [m] domain
+DROP, MOUTH, LIP, SPEED = 0.3, 0.05, 0.02, 0.125  # source: [m], [m], [m], [m/s]
+AREA = 0.04  # [m^2] poured area
+SEED_WIDTH, SEED_HEIGHT = 0.1, 0.025  # [m] initial sand
+# [s] from the end of the pouring to the first and to the last observation
+SETTLES, LASTS = 1.0, 5.0
+# tolerances: degrees; degrees between two resolutions; degrees per second
+NEAR, ALIKE, CREEP = 2.0, 1.5, 0.2
+# Wedge: degrees below the angle; [m]; [s]; share of its height.
 BELOW, BASE, STANDS, SHRINKS = 3.0, 0.9, 5.0, 0.01
-CONTROLLED = 30.0  # degrees: of the negative control
-HIGHEST = 3  # columns that the height is the mean of
+CONTROLLED = 30.0  # degrees, of the negative control
+HIGHEST = 3  # number of columns whose mean is the height
 Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
 
 
 class Heap(NamedTuple):
-    """What has been poured."""
+    """Result of pouring a heap."""
 
-    angle: float  # of the wedge that fits best [degrees], a while after the pouring has ended
-    creep: float  # by how much it falls from then on [degrees/s]
+    angle: float  # slope of the best-fitting wedge [degrees], some time after the pouring
+    creep: float  # decrease of the angle from then on [degrees/s]
     wedge: float  # distance of the outline from that wedge, root mean square, over its height
-    solved: float  # share of the steps whose stresses are within the tolerance [%]
+    solved: float  # share of the steps whose stresses meet the tolerance [%]
     outline: Outline  # at the end
 
 
 @check_at("sand heap", "{cells} cells of length")
 def heaps(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
-    """Pour heaps; the control, at the least resolution, has half the friction."""
+    """Pour heaps; the control, at the lowest resolution, has half the friction."""
     for angle in angles:
         heap = pour(cells, angle)
         low, high = angle - NEAR, angle + NEAR
@@ -67,7 +69,10 @@ def heaps(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None
 
 @check_at("sand wedge", "{cells} cells of length")
 def wedges(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
-    """Let wedges stand that are flatter than a layer that stops; the control has half the friction."""
+    """Test the rest of wedges flatter than the angle at which a layer stops.
+
+    The control has half the friction.
+    """
     for angle in angles:
         found.add(
             f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle), high=SHRINKS
@@ -86,13 +91,13 @@ def half_as_steep(angle: float) -> float:
 
 
 def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> Heap:
-    """Pour a heap, and watch it.
+    """Pour a heap and observe it.
 
     Args:
-        cells: of the domain's length.
-        angle: at which a layer stops [degrees].
-        lasts: how long after the pouring the last look is [s].
-        tables: of the scene.
+        cells: cells of the domain's length.
+        angle: slope at which a layer stops [degrees].
+        lasts: time from the end of the pouring to the last observation [s].
+        tables: further tables of the scene.
     """
     middle, stop = 0.5 * LENGTH, AREA / (SPEED * MOUTH)
     seed = box([middle - 0.5 * SEED_WIDTH, 0.0], [middle + 0.5 * SEED_WIDTH, SEED_HEIGHT])
@@ -110,7 +115,10 @@ def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> He
 
 
 def lost(cells: int, angle: float, *, duration: float = STANDS, **tables: Any) -> float:
-    """Return the share of its height that a wedge, `BELOW` flatter than an angle [degrees], loses in a time [s]."""
+    """Return the relative height that a wedge loses in a time.
+
+    The wedge is `BELOW` flatter than `angle` [degrees].
+    """
     simulation = cut_wedge(
         cells, angle - BELOW, **({"material": {"friction_angle": angle}} | tables)
     )
@@ -138,7 +146,10 @@ def cut_wedge(cells: int, slope: float, **tables: Any) -> SandSimulation:
 
 
 def outline(simulation: SandSimulation) -> Outline:
-    """Return the middle of each column of cells, and how high its sand would stand at its densest [m]."""
+    """Return the centers of the columns of cells and their heights of sand [m].
+
+    The height is that of the column's sand at its densest packing.
+    """
     counts, dx = simulation.grid.counts, simulation.grid.spacing
     column = np.minimum(positions(simulation)[:, 0] / dx, counts[0] - 1).astype(int)
     area = simulation.particle_mass / simulation.scene.physics.density
@@ -151,24 +162,24 @@ def height(simulation: SandSimulation) -> float:
 
 
 def wedge(across: np.ndarray) -> np.ndarray:
-    """Return a wedge's height over the distance from its middle, in units of its own."""
+    """Return a wedge's height over the distance from its middle, normalized."""
     return np.maximum(1.0 - np.abs(across), 0.0)
 
 
 def dome(across: np.ndarray) -> np.ndarray:
-    """Return a parabola's height over the distance from its middle, in units of its own."""
+    """Return a parabola's height over the distance from its middle, normalized."""
     return np.maximum(1.0 - across**2, 0.0)
 
 
 def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float, float]:
-    """Return the angle of a shape that is fitted to an outline by least squares [degrees], how far it is off [m], and its height [m].
+    """Return angle [degrees], error [m], height [m] of a shape fitted to an outline.
 
-    All columns take part, so that single ones, which may be denser or looser than others, matter
-    little.
+    The fit is by least squares over all columns, so that the density of single columns has little
+    effect.
     """
     x, y = line
     middle = float(np.average(x, weights=y))
-    # a wedge's half width
+    # Half the width of a wedge.
     start = [
         float(y.max()),
         math.sqrt(6.0 * float(np.average((x - middle) ** 2, weights=y))),

@@ -1,7 +1,8 @@
-"""Sand runs out of a bin as fast however full it is, and as (D - delta)^(3/2) of its slot; a liquid slows down as its height's root.
+"""Discharge of sand through a slot: constant in time, and its law of the width.
 
-The bin's floor is rough: its friction is the sand's own. delta is a property of grains, which a
-continuum has not: it is near 0.
+The rate does not depend on the fill and grows as (D - delta)^(3/2) with the slot D. The discharge
+of a liquid falls with the square root of its height. The bin's floor is rough: its friction is the
+sand's own. delta is a property of grains; in a continuum it is near 0.
 """
 
 from __future__ import annotations
@@ -27,33 +28,36 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
 )
 
-OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells, by refinement
-# [m]: of the bin, the sand in it at the start, and the room below
+OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells of the slot, by refinement
+# [m] Bin, initial sand, and the room below.
 WIDTH, DEPTH, BELOW = 0.24, 0.44, 0.12
-SPACING = 0.005  # [m], before refinement
+SPACING = 0.005  # [m] before refinement
 PLATE = 2  # cells of the bin's floor, before refinement
-# the fill between which the discharge is measured [widths]: at first it grows
+# Range of the fill in which the discharge is measured [widths]; at first it grows.
 FIRST, LEAST = 1.65, 1.2
-LOW = 0.3  # the fill down to which the liquid is followed
-PARTS = 5  # the fill's range is cut in
-WALLS = 0.4  # friction of the sides
+LOW = 0.3  # fill down to which the liquid is measured
+PARTS = 5  # parts of the range
+WALLS = 0.4  # friction of the side walls
 
 
 class Discharge(NamedTuple):
-    """What has left a bin."""
+    """Discharge of a bin."""
 
     fill: np.ndarray  # in the middle of each part of the range [widths]
     rate: np.ndarray  # in each part [m^2/s]
-    solved: float = math.nan  # share of the steps whose stresses are within the tolerance [%]
+    solved: float = math.nan  # share of the steps whose stresses meet the tolerance [%]
 
     @property
     def spread(self) -> float:
-        """The largest less the smallest rate, over their mean [%]."""
+        """Range of the rates over their mean [%]."""
         return 100.0 * float(np.ptp(self.rate) / self.rate.mean())
 
 
 def trial(refinement: int, openings: tuple[int, ...] = ()) -> Trial:
-    """Measure the discharge of slots of several widths in cells, those of the check without any; the control is a liquid."""
+    """Measure the discharge of slots of several widths in cells.
+
+    The control is a liquid.
+    """
 
     def run(found: Findings) -> None:
         dx, rates, chosen = SPACING / refinement, [], openings or OPENINGS[refinement]
@@ -111,7 +115,7 @@ def trial(refinement: int, openings: tuple[int, ...] = ()) -> Trial:
 
 
 def sand(cells: int, refinement: int, floor: float | str = "stick", **tables: Any) -> Discharge:
-    """Let sand run through a slot of so many cells on a floor of some friction."""
+    """Simulate sand that runs through a slot on a floor with friction."""
     dx = SPACING / refinement
     size, solids, fill, drain = _bin(cells * dx, DEPTH)
     solids = [solid | {"friction": floor} for solid in solids]
@@ -131,7 +135,10 @@ def sand(cells: int, refinement: int, floor: float | str = "stick", **tables: An
 
 
 def liquid(cells: int) -> tuple[Discharge, Discharge]:
-    """Let a liquid run through a slot of so many cells; return what sand is measured on, and what leaves down to LOW."""
+    """Simulate a liquid that runs through a slot.
+
+    Return the discharge in the range of sand, and the one down to LOW.
+    """
     size, solids, fill, drain = _bin(cells * SPACING, DEPTH)
     simulation = create_liquid(
         scenes.VOXEL,
@@ -151,7 +158,10 @@ def liquid(cells: int) -> tuple[Discharge, Discharge]:
 def _empty(
     simulation: scenes.Simulation, area: float, low: float, rows: list[Row]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Step until a bin is as low [widths], note the log's rows; return the times [s] and how much is in the bin [m^2]."""
+    """Step until a bin's fill is `low` [widths]; return times [s] and areas [m^2].
+
+    The area is that of the material in the bin. The rows of the log are appended to `rows`.
+    """
     time, left = [0.0], [simulation.particles.count]
     while left[-1] * area > low * WIDTH**2:
         rows += steps(
@@ -165,7 +175,10 @@ def _empty(
 def _bin(
     slot: float, depth: float
 ) -> tuple[list[float], list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
-    """Return the size of the domain, the halves of a bin's floor, what fills the bin, and a drain below."""
+    """Return the scene of a bin.
+
+    It has the size of the domain, the halves of the floor, the fill, and a drain below.
+    """
     top = BELOW + PLATE * SPACING
     size = [WIDTH, top + depth + 4.0 * SPACING]
     left, right = 0.5 * (WIDTH - slot), 0.5 * (WIDTH + slot)
@@ -181,7 +194,7 @@ def _bin(
 def _rates(
     time: np.ndarray, area: np.ndarray, first: float, last: float, parts: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middle of each part of a range of fills [widths] and the rate in it [m^2/s]."""
+    """Return centers [widths] and rates [m^2/s] of the parts of a range of fills."""
     ends = np.linspace(first, last, parts + 1)
     at = np.interp(-ends * WIDTH**2, -area, time)
     return 0.5 * (ends[1:] + ends[:-1]), -np.diff(ends) * WIDTH**2 / np.diff(at)

@@ -1,12 +1,14 @@
-"""Sand at rest between walls presses on the ground as Janssen's law says: what is deep rests on the walls, and hardly more on the ground.
+"""Sand at rest between walls: Janssen's law of the load on the ground.
+
+The walls bear the weight of deep sand. The vertical stress at the depth z is
 
     sigma(z) / (rho g W) = (1 - exp(-c mu K z / W)) / (c mu K),
 
-c = 2 between two walls, 4 in a square of four [Janssen 1895]. K, how much of the vertical stress
-presses on the walls, lies between 1/3, where sand of a sine of 1/2 gives way sideways, and 1:
-bounds are a tenth beyond either. The vertical stress is the pressure less the deviator's part,
-averaged over a cross-section; depth is the mass above it over rho W, which holds wherever the
-surface may be.
+with c = 2 between two walls, and 4 in a square of four [Janssen 1895]. K is the ratio of the stress
+on the walls to the vertical stress. It lies between 1/3, where sand of a sine of 1/2 yields
+sideways, and 1; the bounds of the check are a tenth beyond either. The vertical stress is the
+pressure less the deviator's part, averaged over a cross-section. The depth is the mass above it
+over rho W, which does not depend on the surface.
 """
 
 from __future__ import annotations
@@ -24,31 +26,31 @@ from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
 from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
-SLOT = 4  # cells along z of a silo without an end there
-FRICTIONS = (0.2, 0.5, 0.8)  # of the walls
-RATIOS, BEYOND = (1.0 / 3.0, 1.0), 0.1  # least and largest K, and what loads may lie beyond theirs
-DEEP = {2: 5.25, 3: 3.25}  # widths of sand
+SLOT = 4  # cells along the periodic axis z
+FRICTIONS = (0.2, 0.5, 0.8)  # friction of the walls
+RATIOS, BEYOND = (1.0 / 3.0, 1.0), 0.1  # least and largest K, and the tolerance of the loads
+DEEP = {2: 5.25, 3: 3.25}  # [widths] height of the sand
 WIDTH = 0.2  # [m]
 DENSITY = 1600.0  # [kg/m^3]
 HEADROOM = 4  # cells above the sand
 RESTS = 0.3  # [s]
-TINY, PERIOD = 1e-5, 20  # [s] of a short step, and how many steps there are from one to the next
+TINY, PERIOD = 1e-5, 20  # [s] of a short step, and number of other steps between them
 LOAD, LID = 2.0, 0.25  # [rho g W] of a lid; its height [widths]
-CLEAR = 1e-3  # of a cell between a lid and the walls
-# [widths]: rows nearer to the surface have no walls beside them in part of their cells' kernels
+CLEAR = 1e-3  # gap between a lid and the walls [cells]
+# [widths] Rows nearer to the surface lack walls in part of their cells' kernels.
 NEAR = 0.25
-RISE = 0.01  # [m/s] of a floor
+RISE = 0.01  # [m/s] speed of the floor
 Step = Callable[[SandSimulation, float], None]
 
 
 class Silo(NamedTuple):
-    """What a silo bears."""
+    """Loads in a silo."""
 
-    # of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,)
+    # Of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,).
     depth: np.ndarray
-    load: np.ndarray  # the vertical stress there [rho g W], shape (rows,)
-    shear: np.ndarray  # what walls bear, upward, over the load, shape (rows,)
-    fell: float  # how far the center of mass has gone at most, over the height
+    load: np.ndarray  # vertical stress there [rho g W], shape (rows,)
+    shear: np.ndarray  # upward load on the walls, over the load, shape (rows,)
+    fell: float  # largest way of the center of mass, over the height
 
     def at(self, depth: float) -> float:
         """Return the vertical stress [rho g W] at a depth [widths]."""
@@ -56,7 +58,10 @@ class Silo(NamedTuple):
 
 
 def janssen(depth: float, friction: float, ratio: float, walls: int = 2) -> float:
-    """Return Janssen's vertical stress [rho g W] at a depth [widths] for K = ratio, between `walls` walls."""
+    """Return Janssen's vertical stress [rho g W] at a depth [widths].
+
+    K is `ratio`, and the number of walls is `walls`.
+    """
     rate = walls * friction * ratio
     return depth if rate == 0.0 else (1.0 - math.exp(-rate * depth)) / rate
 
@@ -69,7 +74,10 @@ def trial(
     frictions: tuple[float, ...] = FRICTIONS,
     deep: float = 0.0,
 ) -> None:
-    """Compare what a silo bears with Janssen's law: as it is, with short steps, under a lid, and between walls without friction."""
+    """Compare the loads of a silo with Janssen's law.
+
+    The silo runs as it is, with short steps, under a lid, and between walls without friction.
+    """
     more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3}
     depths = range(1, math.ceil(more["deep"]))
     for friction in frictions:
@@ -118,7 +126,11 @@ def slot(found: Findings, cells: int) -> None:
 
 @check_at("sand silo, wrong", "{cells} cells of width, 2-D")
 def controls(found: Findings, cells: int) -> None:
-    """Push sand up, which turns the walls' friction over, and pack and start solves as was done before: all must miss the law."""
+    """Run the negative controls, which must all miss the law.
+
+    The controls are sand pushed up, which reverses the walls' friction, and former rules of packing
+    and warm starts.
+    """
     depths = range(1, 6)
     plain = rest(fill(cells, 0.5))
     for label, silo in (
@@ -150,7 +162,7 @@ def controls(found: Findings, cells: int) -> None:
 def bears(
     found: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2
 ) -> None:
-    """Add what a silo bears at whole widths of depth."""
+    """Add the loads of a silo at whole widths of depth."""
     loads = np.array([silo.at(z) for z in depths])
     least, most = (
         np.array([janssen(z, friction, ratio, walls) for z in depths]) for ratio in reversed(RATIOS)
@@ -183,7 +195,7 @@ def bears(
 
 
 def change(one: Silo, other: Silo, depths: range) -> float:
-    """Return by how much the loads of a silo differ from another's at most, relative."""
+    """Return the largest relative difference of the loads of two silos."""
     return max(abs(other.at(z) / one.at(z) - 1.0) for z in depths)
 
 
@@ -198,17 +210,17 @@ def fill(
     rise: float = 0.0,
     **tables: Any,
 ) -> SandSimulation:
-    """Return a silo filled at rest.
+    """Return a filled silo at rest.
 
     Args:
-        cells: of its width.
-        friction: of its walls.
+        cells: cells of its width.
+        friction: friction of its walls.
         deep: height of the sand [widths].
-        deeper: cells along z; 1: two dimensions.
-        lid: what lies on the sand [rho g W].
-        square: whether z has walls as x has; else it has no end.
+        deeper: cells along z; 1 in 2-D.
+        lid: load of a lid on the sand [rho g W].
+        square: whether z has walls as x has; otherwise z is periodic.
         rise: speed of the floor [m/s], in 2-D.
-        tables: of the scene.
+        tables: further tables of the scene.
     """
     dx, high = WIDTH / cells, round(deep * cells)
     more = [cells * dx] if square else [deeper * dx] if deeper > 1 else []
@@ -241,12 +253,12 @@ def fill(
 def rest(
     simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0, each: Step | None = None
 ) -> Silo:
-    """Let sand rest and measure what it bears.
+    """Let sand rest and measure the loads.
 
     Args:
-        simulation: of `fill`.
-        duration: [s].
-        tiny: length of a short step after `PERIOD` others [s]; 0: there are none.
+        simulation: a simulation of `fill`.
+        duration: simulated time [s].
+        tiny: length of a short step after `PERIOD` others [s]; 0 for none.
         each: called before each step with its length [s].
     """
     heights: list[Any] = []
@@ -263,9 +275,9 @@ def rest(
     )
     x = simulation.stress.now.numpy()[(slice(None), *inner)].astype(np.float64)
     flat, across, cells = grid.dimension == 2, (0, 2), x.shape[3]
-    unit = GRAVITY * simulation.stress.kick_dt * cells  # of rho g W
+    unit = GRAVITY * simulation.stress.kick_dt * cells  # load unit rho g W
     load = (x[0] + x[1] if flat else x[0] - x[2]).mean(axis=across) / unit
-    # what walls bear of a row is the mean of its copies, see `granular.yield_set`
+    # The wall load of a row is the mean of its copies, see `granular.yield_set`.
     xy = x[2:6] if flat else x[4:8]
     sides = [xy[1::2, :, :, -1].mean(axis=(0, 1)), -xy[::2, :, :, 0].mean(axis=(0, 1))]
     if not flat and not simulation.scene.endless:
@@ -279,7 +291,10 @@ def rest(
 def _drive(
     simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> None:
-    """Have the packing's drive follow a rule of fractions and what it was [cells a step]."""
+    """Replace the rule of the packing's drive.
+
+    The rule maps fractions and the former drive [cells per step] to the drive.
+    """
     packing, rate = simulation.packing, simulation.grid.spacing / dt
 
     def update(
@@ -292,17 +307,17 @@ def _drive(
     packing.update = update  # type: ignore[method-assign]
 
 
-# let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below
-# the surface
+# Expand too dense sand through the stresses: drive = (1 - phi) dx / dt of either sign below the
+# surface.
 _pack_as_before = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
-# count a cell as full at the nominal density, and no sooner
+# A cell is full at the nominal density, not earlier.
 _close_all_gaps = partial(
     _drive, rule=lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive)
 )
 
 
 def _keep_impulses(simulation: SandSimulation, dt: float) -> None:
-    """Start a solve from the last impulses, however long they acted."""
+    """Start a solve from the last impulses, whatever the last step's length."""
     simulation.stress.kick_dt = 0.5 * (simulation.last_dt + dt)
 
 

@@ -1,4 +1,4 @@
-"""Small liquids and piles of sand, most in two dimensions: their scenes, and how they are stepped and looked at."""
+"""Scenes of small liquids and piles of sand, mostly 2-D, and their measurements."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
 from warp_lcp.simulation import Cells
 
-DEVICE = ContextVar("device", default="cpu")  # where scenes are made, while a check runs there
+DEVICE = ContextVar("device", default="cpu")  # device of new scenes, set while a check runs
 GRAVITY = 9.81  # [m/s^2]
 DENSITY = 1000.0  # [kg/m^3] of liquids
 DT_MAX = 0.02  # [s]
 PER_AXIS = 2  # particles along an edge of a cell
-SHORTEST = 1e-9  # [s]: what rounding may leave before a time to reach
+SHORTEST = 1e-9  # [s] rounding error of a time to reach
 
 FRICTION_ANGLE = 30.0  # degrees
 WALL_FRICTION = math.tan(math.radians(FRICTION_ANGLE))
-WIDTH = 0.2  # [m]: of a column of sand
-FLOOR, HEADROOM = 2, 4  # cells of the solid that columns stand on, and cells above a column
+WIDTH = 0.2  # [m] width of a column of sand
+FLOOR, HEADROOM = 2, 4  # cells of the solid below columns, and cells above a column
 CORRECTED: dict[str, Any] = {"density_correction": {}}
-TOLERANCE = 1e-3  # of the stresses [rho g dx]
-FRONT = 99.0  # percentile of the particles that is the front
-FULL = 0.5  # fraction of a cell that is part of a pile
+TOLERANCE = 1e-3  # tolerance of the stresses [rho g dx]
+FRONT = 99.0  # percentile of the particles that defines the front
+FULL = 0.5  # least fraction of a cell that is part of a pile
 
 Row = dict[str, Any]
 Simulation = LiquidSimulation | SandSimulation
@@ -39,7 +39,7 @@ Simulation = LiquidSimulation | SandSimulation
 
 @dataclass(frozen=True)
 class Numerics:
-    """How solids and surface are represented: keys of a scene."""
+    """Representation of solids and surface: keys of a scene."""
 
     name: str
     solids: str
@@ -61,15 +61,15 @@ def create_liquid(
     folder: Path | None = None,
     **tables: Any,
 ) -> LiquidSimulation:
-    """Return a simulation.
+    """Return a simulation of a liquid.
 
     Args:
-        numerics: of solids and surface.
-        size: of the domain [m].
+        numerics: representation of solids and surface.
+        size: size of the domain [m].
         resolution: cells along its longest side.
-        liquid: shapes.
-        folder: where the files are that shapes name.
-        tables: of the scene; `wall` and `cfl` are short for domain.wall and time.cfl.
+        liquid: tables of its shapes.
+        folder: folder of the files that shapes name.
+        tables: further tables; `wall` and `cfl` are short for domain.wall and time.cfl.
     """
     data: Row = {
         "scene": {"simulator": "fluids"},
@@ -91,7 +91,10 @@ def create_liquid(
 def create_sand(
     size: list[float], resolution: int, sand: list[Row], solids: Sequence[Row] = (), **tables: Any
 ) -> SandSimulation:
-    """Return a simulation; arguments as of a liquid's, `walls` is short for domain.friction."""
+    """Return a simulation of sand.
+
+    Arguments are those of a liquid; `walls` is short for domain.friction.
+    """
     data: Row = {
         "scene": {"simulator": "granular"},
         "time": {"duration": 100.0},
@@ -118,11 +121,11 @@ def column(
 
     Args:
         aspect: height over width.
-        cells: of the width.
-        length: of the domain [widths].
-        angle: of friction [degrees].
-        floor: its friction.
-        tables: of the scene.
+        cells: cells of the width.
+        length: length of the domain [widths].
+        angle: friction angle [degrees].
+        floor: friction of the floor.
+        tables: further tables of the scene.
     """
     dx = WIDTH / cells
     nx, ny = round(length * cells), round(aspect * cells) + FLOOR + HEADROOM
@@ -133,7 +136,7 @@ def column(
 
 
 def box(low: list[float], high: list[float], **more: Any) -> Row:
-    """Return a box of a scene."""
+    """Return the table of a box."""
     return {"shape": "box", "min": low, "max": high, **more}
 
 
@@ -163,7 +166,7 @@ def velocities(simulation: Simulation) -> np.ndarray:
 
 
 def fill(simulation: LiquidSimulation) -> np.ndarray:
-    """Return the particles of each cell over those of a full one, shape (ny, nx)."""
+    """Return the particles of each cell over those of a full cell, shape (ny, nx)."""
     nx, ny, _ = simulation.grid.counts
     cells = np.floor(positions(simulation) / simulation.grid.spacing).astype(int)
     i, j = np.clip(cells[:, 0], 0, nx - 1), np.clip(cells[:, 1], 0, ny - 1)
@@ -171,7 +174,10 @@ def fill(simulation: LiquidSimulation) -> np.ndarray:
 
 
 def particles_in_cells(simulation: LiquidSimulation) -> tuple[np.ndarray, tuple[int, int], float]:
-    """Return what `signals.filled_fraction` takes: positions [cells], cells along x and y, and a particle's volume [cells]."""
+    """Return the arguments of `signals.filled_fraction`.
+
+    They are positions [cells], cells along x and y, and a particle's volume [cells].
+    """
     nx, ny, _ = simulation.grid.counts
     return positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / PER_AXIS**2
 
@@ -187,19 +193,22 @@ def pressures(simulation: LiquidSimulation) -> np.ndarray:
 
 
 def runout(simulation: SandSimulation) -> float:
-    """Return how far the front is beyond the column's width [widths]."""
+    """Return the distance of the front beyond the column's width [widths]."""
     return float(np.percentile(positions(simulation)[:, 0], FRONT)) / WIDTH - 1.0
 
 
 def profile(simulation: SandSimulation) -> np.ndarray:
-    """Return the number of the highest cell of each column of cells that is part of the pile, 0 without one; shape (nx + 2,)."""
+    """Return the highest cell of the pile in each column, shape (nx + 2,).
+
+    It is 0 if a column has no sand.
+    """
     full = simulation.packing.fraction.numpy()[1] > FULL
     rows = np.arange(full.shape[0])[:, None]
     return np.asarray((full * rows).max(axis=0))
 
 
 def height(simulation: SandSimulation) -> float:
-    """Return how high the sand in three columns of cells is, were it packed densely, where it is most [widths]."""
+    """Return the largest height of three columns of densely packed sand [widths]."""
     sand = (
         simulation.packing.fraction.numpy()[1, 1 + FLOOR : -1, 1:-1].sum(axis=0)
         * simulation.grid.spacing
@@ -209,7 +218,10 @@ def height(simulation: SandSimulation) -> float:
 
 
 def depth(simulation: SandSimulation) -> np.ndarray:
-    """Return how many cells each particle lies below the surface, shape (n,); negative above it."""
+    """Return the depth of each particle below the surface [cells], shape (n,).
+
+    It is negative above the surface.
+    """
     cells = np.floor(positions(simulation) / simulation.grid.spacing).astype(int) + 1
     return np.asarray(profile(simulation)[cells[:, 0]] - cells[:, 1])
 
@@ -217,19 +229,19 @@ def depth(simulation: SandSimulation) -> np.ndarray:
 def drift(
     simulation: SandSimulation, duration: float, height: float, deep: int = 4
 ) -> tuple[float, float]:
-    """Step for a time [s] and return how fast particles went from where they were to where they are [heights / s].
+    """Step for a time and return the drift speed of the particles [heights / s].
 
-    Particles, which are sorted now and then, are followed through steps in which they move less
-    than their distance.
+    The drift is the distance from the initial to the final position, over the time. Particles are
+    sorted now and then; they are tracked through steps in which they move less than their distance.
 
     Args:
-        simulation: to step.
-        duration: [s].
+        simulation: the simulation to step.
+        duration: simulated time [s].
         height: unit of length [m].
-        deep: cells below the surface.
+        deep: least depth below the surface [cells].
 
     Returns:
-        The mean over all, and over those that lie `deep`.
+        The mean over all particles, and over those at least `deep` below the surface.
     """
     start, low = positions(simulation), depth(simulation)
     at, origin = start, np.arange(len(start))
@@ -242,5 +254,5 @@ def drift(
 
 
 def share_solved(rows: Sequence[Row]) -> float:
-    """Return the share of the steps [%] whose stresses are within the tolerance."""
+    """Return the share of the steps [%] whose stresses meet the tolerance."""
     return 100.0 * float(np.mean([row["coupled_residual"] <= TOLERANCE for row in rows]))

@@ -1,9 +1,11 @@
-"""Numbers from curves and particles, all of it plain NumPy: periods, curves compared after a shift in time, fronts, heights, volumes.
+"""Quantities from curves and particles, in plain NumPy.
 
-What liquid a sub-cell surface encloses is found from the particles alone, by a formula of its own:
-an oracle for the simulator's level set. The density of particles under the quadratic B-spline of a
-cell, over the same kernel's integral over the domain, is the filled fraction of a half space at the
-distance s from the cell's center when that fraction is F(-s): s is the signed distance.
+Periods, curves compared after a shift in time, fronts, heights, volumes.
+
+The volume inside a sub-cell surface is found from the particles alone, by an independent formula:
+an oracle for the simulator's level set. The filled fraction of a cell is the density of particles
+under its quadratic B-spline, over the kernel's integral over the domain. A half space at the
+distance s from the cell's center has the fraction F(-s). This relation gives the signed distance s.
 """
 
 from __future__ import annotations
@@ -15,29 +17,36 @@ from scipy.ndimage import map_coordinates
 
 HALF_FULL = 0.5
 SHIFT_STEP = 0.01
-PACES = 141  # a percent apart
+PACES = 141  # one percent apart
 KNOTS = np.linspace(-1.5, 1.5, 3001)
-SAMPLES = 6  # a cell and axis, of the volume
+SAMPLES = 6  # samples of a cell along each axis, for the volume
 
 
 def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times at which a signal rises and at which it falls through 0, linear between samples."""
+    """Return the times of upward and of downward zero crossings of a signal.
+
+    The signal is linear between samples.
+    """
     time, signal = np.asarray(time, dtype=float), np.asarray(signal, dtype=float)
     below, above = signal[:-1], signal[1:]
-    found = []
+    crossing_times = []
     for at in (
         np.flatnonzero((below < 0) & (above >= 0)),
         np.flatnonzero((below > 0) & (above <= 0)),
     ):
-        found.append(time[at] + (time[at + 1] - time[at]) * below[at] / (below[at] - above[at]))
-    return found[0], found[1]
+        crossing_times.append(
+            time[at] + (time[at + 1] - time[at]) * below[at] / (below[at] - above[at])
+        )
+    return crossing_times[0], crossing_times[1]
 
 
 def period(time: np.ndarray, signal: np.ndarray) -> float:
-    """Return the period of a signal: from crossings in one direction, so that its mean need not be 0 and it may fade.
+    """Return the period of a signal.
+
+    Only crossings in one direction count, so that the signal's mean need not be 0 and it may decay.
 
     Raises:
-        ValueError: neither direction is crossed twice.
+        ValueError: there are no two crossings in one direction.
     """
     rising, falling = crossings(time, signal)
     spans = [(len(at) - 1, at[-1] - at[0]) for at in (rising, falling) if len(at) > 1]
@@ -47,16 +56,16 @@ def period(time: np.ndarray, signal: np.ndarray) -> float:
 
 
 def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
-    """Return the amplitude [m] of cos(k x) in a liquid's elevation, from equal particles that fill it.
+    """Return the amplitude [m] of cos(k x) in a liquid's elevation.
 
-    The integral of cos(k x) over a liquid of depth h + eta(x) is that of eta cos(k x), where k is a
-    multiple of pi / length.
+    Equal particles fill the liquid. The integral of cos(k x) over a liquid of depth h + eta(x) is
+    that of eta cos(k x), where k is a multiple of pi / length.
 
     Args:
-        x: of the particles [m], shape (n,).
-        wavenumber: k [1/m].
-        area: of one particle [m^2].
-        length: of the tank [m].
+        x: positions of the particles [m], shape (n,).
+        wavenumber: wave number k [1/m].
+        area: area of one particle [m^2].
+        length: length of the tank [m].
     """
     return float(2.0 / length * area * np.cos(wavenumber * np.asarray(x)).sum())
 
@@ -64,7 +73,10 @@ def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
 def relative_rms(
     time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, shift: float = 0.0
 ) -> float:
-    """Return the root mean square of values(at + shift) / expected - 1, linear between samples."""
+    """Return the root mean square of values(at + shift) / expected - 1.
+
+    The curve is linear between samples.
+    """
     found = np.interp(np.asarray(at) + shift, time, values)
     return float(np.sqrt(np.mean((found / np.asarray(expected) - 1.0) ** 2)))
 
@@ -72,7 +84,7 @@ def relative_rms(
 def best_shift(
     time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float
 ) -> tuple[float, float]:
-    """Return the shift within +-limit that makes `relative_rms` smallest, and that error."""
+    """Return the shift within +-limit that minimizes `relative_rms`, and that error."""
     count = round(limit / SHIFT_STEP)
     shifts = np.linspace(-limit, limit, 2 * count + 1)
     errors = [relative_rms(time, values, at, expected, shift) for shift in shifts]
@@ -83,7 +95,10 @@ def best_shift(
 def best_pace(
     time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float
 ) -> float:
-    """Return how many times as fast as expected a curve runs: the factor on its time, .5 to 2, with which `best_shift` errs least."""
+    """Return the speed of a curve relative to the expected one.
+
+    It is the factor on its time, 0.5 to 2, for which `best_shift` has the least error.
+    """
     paces = np.geomspace(0.5, 2.0, PACES)
     return float(
         paces[
@@ -98,7 +113,9 @@ def best_pace(
 
 
 def front(fill: np.ndarray) -> int:
-    """Return the right edge, in cells, of the farthest floor cell that is at least half full; 0 if there is none.
+    """Return the right edge [cells] of the farthest floor cell that is half full.
+
+    The result is 0 if there is none.
 
     Args:
         fill: fraction of each cell that is liquid, shape (ny, nx), the floor first.
@@ -108,10 +125,10 @@ def front(fill: np.ndarray) -> int:
 
 
 def stays(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middle of the time that an advancing front stayed at each place, and these places; the last stay has no end.
+    """Return the middle times of an advancing front's stays, and its places.
 
-    A front that is known to a cell is on average where the stair of its places says, and best known
-    in the middle of a tread.
+    The last stay has no end and is left out. A front that is resolved to a cell follows a
+    staircase. It is on average at its places, and known best in the middle of a tread.
     """
     time, place = np.asarray(time, dtype=float), np.asarray(place, dtype=float)
     farthest = np.maximum.accumulate(place)
@@ -120,7 +137,9 @@ def stays(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def surface_height(column: np.ndarray) -> float:
-    """Return the height, in cells, where the liquid's fraction in a column of cells falls below a half for the last time.
+    """Return the surface height [cells] of a column.
+
+    There the liquid's fraction falls below a half for the last time.
 
     Args:
         column: fraction of each cell that is liquid, the floor first; linear between the cells'
@@ -135,7 +154,10 @@ def surface_height(column: np.ndarray) -> float:
 
 
 def order(errors: list[float], refinement: float = 2.0) -> float:
-    """Return the order of convergence that the first and the last error show; the step shrinks by `refinement` from one to the next."""
+    """Return the order of convergence between the first and the last error.
+
+    The step shrinks by `refinement` from one to the next.
+    """
     return math.log(errors[0] / errors[-1]) / math.log(refinement) / (len(errors) - 1)
 
 
@@ -147,17 +169,23 @@ def cumulative(s: np.ndarray) -> np.ndarray:
 
 
 def weights(f: np.ndarray) -> list[np.ndarray]:
-    """Return the quadratic B-spline at the cell of a point and its neighbors; f: distance from the cell's center [cells]."""
+    """Return the quadratic B-spline at the cell of a point and its neighbors.
+
+    f is the distance from the cell's center [cells].
+    """
     return [0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2]
 
 
 def filled_fraction(cells: np.ndarray, counts: tuple[int, int], volume: float) -> np.ndarray:
-    """Return the density of particles in units of their density at rest, shape (ny, nx).
+    """Return the density of particles over their density at rest, shape (ny, nx).
+
+    The density of a cell is the sum of the particles' volumes, weighted by its quadratic B-spline.
+    At rest it is the integral of the B-spline over the domain, which is below 1 beside walls.
 
     Args:
         cells: x and y of the particles in cells from the domain's corner, shape (n, 2).
-        counts: cells (nx, ny).
-        volume: of a particle [cells].
+        counts: numbers of cells (nx, ny).
+        volume: volume of a particle [cells].
     """
     nx, ny = counts
     rho = np.zeros((ny + 2, nx + 2))
@@ -173,12 +201,12 @@ def filled_fraction(cells: np.ndarray, counts: tuple[int, int], volume: float) -
 
 
 def enclosed_cells(cells: np.ndarray, counts: tuple[int, int], volume: float) -> float:
-    """Return the volume inside the surface, in cells; arguments as of `filled_fraction`."""
+    """Return the volume inside the surface [cells]; arguments as `filled_fraction`."""
     nx, ny = counts
     fraction = np.clip(filled_fraction(cells, counts, volume), 0.0, 1.0)
     distance = np.pad(-np.interp(fraction, cumulative(KNOTS), KNOTS), 1, mode="edge")
     y, x = ((np.arange(n * SAMPLES) + 0.5) / SAMPLES + 0.5 for n in (ny, nx))
     sampled = map_coordinates(distance, np.meshgrid(y, x, indexing="ij"), order=1)
-    # of the little square around a sample, by a surface at this distance
+    # Covered part of the small square around a sample, by a surface at this distance.
     covered = np.clip(0.5 - SAMPLES * sampled, 0.0, 1.0)
     return float(covered.sum()) / SAMPLES**2

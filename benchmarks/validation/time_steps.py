@@ -1,4 +1,7 @@
-"""The energy of a collapse converges as its steps get shorter, and no step makes any, the first one from rest included."""
+"""Convergence of a collapse's energy with the time step; no step adds energy.
+
+The first step from rest is included.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from warp_lcp.operators.grid_poisson import FLUID
 
 RESOLUTIONS = (24, 48)  # cells along the domain
 SIZE, COLUMN = [0.8, 0.4], box([0.0, 0.0], [0.2, 0.3])  # [m]
-# [s]: steps of the first run
+# [s] Step lengths of the first run.
 LONGEST = {
     "liquid, whole cells": 0.02,
     "liquid, sub-cell": 0.02,
@@ -30,16 +33,19 @@ LONGEST = {
     "sand": 0.01,
 }
 HALVINGS = 4
-# [s] at which runs are compared: the front meets no wall
+# [s] at which runs are compared; the front meets no wall.
 MOMENTS = np.array([0.04, 0.08, 0.12, 0.16, 0.2])
-MOST = 1e-3  # of the total, that a step may add
-CHANGE = 5e-3  # of the total, that the last halving may change
+MOST = 1e-3  # share of the total energy that a step may add
+CHANGE = 5e-3  # share of the total energy that the last halving may change
 Watched = Callable[[Any], None]
 
 
 @check_at("time steps", "{what}, {cells} cells")
 def trial(found: Findings, cells: int, what: str) -> None:
-    """Halve the steps of a collapse; the controls push crowds apart within the step, and let gravity act for whole steps."""
+    """Halve the steps of a collapse.
+
+    The controls push dense material apart within the step, and let gravity act for whole steps.
+    """
     lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
     runs = [collapse(what, cells, dt) for dt in lengths]
     changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
@@ -72,18 +78,17 @@ def collapse(
     change: Watched | None = None,
     moments: np.ndarray = MOMENTS,
 ) -> tuple[np.ndarray, float]:
-    """Let a column collapse from rest.
+    """Simulate a column that collapses from rest.
 
     Args:
         what: a key of `LONGEST`.
-        cells: along the domain.
+        cells: cells along the domain.
         dt: length of the steps [s].
-        change: makes the simulation a control.
-        moments: at which the energy is wanted [s].
+        change: function that makes the simulation a control.
+        moments: times at which the energy is returned [s].
 
     Returns:
-        The energy at the moments over that at the start, and the most that a step added to it, over
-        it.
+        The energy at the moments, and the largest gain of a step, both over the initial energy.
     """
     simulation: Any
     if what == "sand":
@@ -106,7 +111,10 @@ def collapse(
 
 
 def _push_sand_apart(simulation: Any) -> None:
-    """Let a fifth of what is too dense be pushed out within a step, however short, as a velocity."""
+    """Push out a fifth of the excess density within a step, as a velocity.
+
+    The fraction does not depend on the length of the step.
+    """
     packing = simulation.packing
     update = packing.update
 
@@ -122,12 +130,15 @@ def _push_sand_apart(simulation: Any) -> None:
 
 
 def _push_liquid_apart(simulation: Any) -> None:
-    """Let all that is too dense be pushed out within a step, however short, as a velocity."""
+    """Push out all excess density within a step, as a velocity.
+
+    The amount does not depend on the length of the step.
+    """
     projection = simulation.projection
     prepare = projection.prepare
 
     def pushed(velocity: Any, dt: float, *given: Any) -> bool:
-        there: bool = prepare(velocity, dt, *given)
+        has_liquid: bool = prepare(velocity, dt, *given)
         excess = np.maximum(
             simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0
         )
@@ -135,7 +146,7 @@ def _push_liquid_apart(simulation: Any) -> None:
         projection._b.assign(
             projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt
         )
-        return there
+        return has_liquid
 
     projection.prepare = pushed
 

@@ -1,4 +1,4 @@
-"""Particles and grid: what the transfers conserve, and the order of the advection."""
+"""Transfers between particles and grid: conservation, and order of the advection."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
-RESOLUTIONS = (16, 32)  # cells a side
+RESOLUTIONS = (16, 32)  # cells along a side
 PER_CELL = 4
 RANDOM_SEED = 4711
 REALS: dict[str, tuple[Any, Any, Any, float]] = {
@@ -26,15 +26,15 @@ REALS: dict[str, tuple[Any, Any, Any, float]] = {
     "float64": (wp.float64, wp.vec3d, np.float64, 1e-12),
 }
 CENTER = np.array([0.5, 0.5, 0.0])
-TURN_STEPS = (20, 40, 80)  # of one turn of Zalesak's disk
+TURN_STEPS = (20, 40, 80)  # steps of one turn of Zalesak's disk
 VORTEX_GRIDS = (16, 32, 64)
-# [m], [s] at 1 rad/s in the middle; steps enough for the grid's error to show
+# [m], [s] at 1 rad/s in the middle; enough steps to show the error of the grid.
 VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96
 
 
 @dataclass
 class Cloud:
-    """Particles away from the walls, and the fields that they are transferred to."""
+    """Particles away from the walls, and the fields of their transfers."""
 
     grid: StaggeredGrid
     position: wp.array[Any]
@@ -55,7 +55,11 @@ class Cloud:
         return np.asarray(self.velocity.numpy(), dtype=np.float64).sum(axis=0)
 
     def angular_momentum(self) -> float:
-        """Return it about the origin, with what the affine part carries in the tents around a particle: f (1 - f) dx^2 dv/dx."""
+        """Return the angular momentum about the origin.
+
+        The affine part is included: in the tent functions around a particle it is f (1 - f) dx^2
+        dv/dx.
+        """
         gradients = [g.numpy() for g in self.affine]
         return angular_momentum(
             self.position.numpy(), self.velocity.numpy(), gradients, self.grid.spacing
@@ -65,18 +69,22 @@ class Cloud:
 def angular_momentum(
     position: np.ndarray, velocity: np.ndarray, gradients: list[np.ndarray], dx: float
 ) -> float:
-    """Return the angular momentum of equal particles of unit mass about the origin, the affine part included.
+    """Return the angular momentum of equal particles of unit mass about the origin.
+
+    The first part is the sum of x v - y u. The affine part adds f (1 - f) dx^2 dv/dx and subtracts
+    f (1 - f) dx^2 du/dy, where f is the place between two nodes: a particle's tent function spreads
+    its velocity over both.
 
     Args:
-        position: [m], shape (n, 2 or 3).
-        velocity: [m/s], same shape.
-        gradients: of each component [1/s]; empty without an affine part.
+        position: positions [m], shape (n, 2 or 3).
+        velocity: velocities [m/s], same shape.
+        gradients: velocity gradient of each component [1/s]; empty without an affine part.
         dx: the grid's spacing [m].
     """
     x, v = np.asarray(position, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
     total = float((x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]).sum())
     for component, gradient in enumerate(gradients):
-        along = 1 - component  # the arm: x for v, y for u
+        along = 1 - component  # axis of the arm: x for v, y for u
         f = x[:, along] / dx + 0.5  # from the nodes, which are centers of cells along that axis
         f -= np.floor(f)
         share = float(
@@ -112,7 +120,10 @@ def cloud(n: int, real: str, *, affine: bool) -> Cloud:
 
 @check_at("transfers", "{n} cells")
 def round_trip(found: Findings, n: int) -> None:
-    """Transfer to the grid and back; the control is PIC, which loses angular momentum."""
+    """Transfer to the grid and back.
+
+    The control is PIC, which loses angular momentum.
+    """
     for real, (*_, limit) in REALS.items():
         linear, angular = changes(cloud(n, real, affine=True))
         found.add(f"APIC, {real}: change of momentum", linear, high=limit)
@@ -123,7 +134,10 @@ def round_trip(found: Findings, n: int) -> None:
 
 
 def changes(c: Cloud) -> tuple[float, float]:
-    """Return the changes of momentum and angular momentum in a round trip, relative to the sums of the particles' |v| and |x| |v|."""
+    """Return the relative changes of momentum and angular momentum in a round trip.
+
+    The changes are relative to the sums of the particles' |v| and |x| |v|.
+    """
     speed, arm = (np.linalg.norm(a.numpy(), axis=1) for a in (c.velocity, c.position))
     linear, angular = c.momentum(), c.angular_momentum()
     c.round_trip()
@@ -138,7 +152,10 @@ def changes(c: Cloud) -> tuple[float, float]:
     f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells",
 )
 def orders(found: Findings) -> None:
-    """Find the order of the advection in time on Zalesak's disk, and in space in a vortex."""
+    """Find the order of the advection in time and in space.
+
+    The order in time is found on Zalesak's disk, that in space in a vortex.
+    """
     turns = [zalesak_error(steps) for steps in TURN_STEPS]
     found.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
     found.add(
@@ -161,7 +178,10 @@ def orders(found: Findings) -> None:
 
 
 def zalesak_error(steps: int, n: int = 64) -> float:
-    """Return the largest error [m] of particles of Zalesak's disk after a turn; the grid interpolates a rigid rotation exactly."""
+    """Return the largest error [m] of Zalesak's disk after a turn.
+
+    The grid interpolates a rigid rotation exactly.
+    """
     x, y = np.meshgrid(*[(np.arange(2 * n) + 0.5) / (2 * n)] * 2)
     disk = ((x - 0.5) ** 2 + (y - 0.75) ** 2 < 0.15**2) & ~((abs(x - 0.5) < 0.025) & (y < 0.85))
     start = np.stack([x[disk], y[disk], 0.0 * x[disk]], axis=1)
@@ -170,18 +190,23 @@ def zalesak_error(steps: int, n: int = 64) -> float:
 
 
 def euler_error(steps: int) -> float:
-    """Return the largest error [m] of the same disk's farthest point after a turn of Euler's steps."""
+    """Return the largest error [m] of the disk after a turn of Euler steps.
+
+    It is the error of the disk's farthest point.
+    """
     growth = abs(1.0 + 2.0j * math.pi / steps) ** steps
     turned = steps * math.atan(2.0 * math.pi / steps)
     return math.hypot(0.15, 0.25) * abs(growth * complex(math.cos(turned), math.sin(turned)) - 1.0)
 
 
 def vortex_error(n: int, *, off: float = 0.0) -> float:
-    """Return the largest error [m] of a ring of particles in a vortex whose angular velocity falls off with the radius.
+    """Return the largest error [m] of a ring of particles in a vortex.
+
+    The angular velocity falls with the radius.
 
     Args:
-        n: cells a side.
-        off: cells by which the fields are sampled off their faces, along both axes.
+        n: cells along a side.
+        off: distance of the samples from their faces, along both axes [cells].
     """
     angle = np.linspace(0.0, 2.0 * math.pi, 97)[:-1]
     start = CENTER + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), 0.0 * angle], axis=1)
@@ -200,9 +225,10 @@ def vortex_error(n: int, *, off: float = 0.0) -> float:
 def carried(
     start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: float = 0.0
 ) -> np.ndarray:
-    """Return where particles are [m] after `count` steps in a steady field that turns about the center with rate(r) [rad/s].
+    """Return positions [m] after `count` steps in a steady field.
 
-    The field is sampled `off` cells beside its faces.
+    The field turns about the center with rate(r) [rad/s]. It is sampled `off` cells beside its
+    faces.
     """
     grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, DEVICE.get())
     j, i = np.meshgrid(np.arange(n + 2), np.arange(n + 2), indexing="ij")

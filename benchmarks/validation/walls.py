@@ -1,4 +1,7 @@
-"""Liquids that let go of a ceiling and slide along a slope: walls may hold nothing back."""
+"""Separating walls: liquids fall from a ceiling and slide along a slope.
+
+The walls must not hold anything back.
+"""
 
 from __future__ import annotations
 
@@ -24,27 +27,30 @@ from warp_lcp.benchmarks.validation.scenes import (
 from warp_lcp.fluids import LiquidSimulation
 
 DURATION = 0.25  # [s]
-SIZE, LOW = [0.4, 0.8], 0.55  # [m]: of the domain with a ceiling, and where the block begins
+SIZE, LOW = [0.4, 0.8], 0.55  # [m] domain with a ceiling, and bottom of the block
 SLANTED = math.radians(5.0)
 CEILINGS: dict[str, list[scenes.Row]] = {
     "flat": [],
-    # cuts cells
+    # Cuts cells.
     "slanted": [
         {"shape": "plane", "point": [0.2, 0.76], "normal": [math.sin(SLANTED), -math.cos(SLANTED)]}
     ],
 }
-# [Pa] that the block's height would have below it at rest
+# [Pa] hydrostatic pressure of the block's height
 WEIGHT = scenes.DENSITY * GRAVITY * (SIZE[1] - LOW)
 
-WAY_IN_DEPTHS, LENGTH_IN_DEPTHS = 10.0, 4.0  # the way, and the sliding layer's length
+WAY_IN_DEPTHS, LENGTH_IN_DEPTHS = 10.0, 4.0  # way, and length of the sliding layer, in depths
 ANGLE = 30.0  # degrees
 DEPTH, SPEED = 0.1, 1.0  # [m], [m/s]
-POINT = np.array([0.1, 0.06])  # [m]: the wall goes through it, and the layer's end stands on it
+POINT = np.array([0.1, 0.06])  # [m] point of the wall on which the layer's end stands
 SLOPE_SIZE = [1.4, 1.0]  # [m]
 
 
 class Fall(NamedTuple):
-    """How far particles fell [cells], sorted from the floor up, how far they should have, and the lowest and highest pressure [Pa]."""
+    """Fall of particles: ways [cells], the expected way, and extreme pressures [Pa].
+
+    Ways are sorted from the floor up.
+    """
 
     fallen: np.ndarray
     expected: float
@@ -59,7 +65,7 @@ class Fall(NamedTuple):
 
 @check_at("ceiling", "{resolution} cells, {numerics.name}, {ceiling}")
 def falling(found: Findings, resolution: int, numerics: Numerics, ceiling: str = "flat") -> None:
-    """Drop the block, then again with each thing that would hold it."""
+    """Drop the block; then repeat with each thing that would hold it."""
     fall = drop(resolution, numerics, ceiling)
     found.add("expected way", fall.expected, low=8.0, unit="cells")
     found.add("worst particle", fall.worst, high=0.5, unit="cells")
@@ -87,15 +93,15 @@ def drop(
 ) -> Fall:
     """Let a block fall.
 
-    Particles are told apart by their order from the floor up, which a rigid fall keeps and a
-    straggler can only lose places in.
+    Particles are matched by their order from the floor up. A rigid fall keeps it, and a straggler
+    can only lose places in it.
 
     Args:
         resolution: cells of the domain's height.
-        numerics: of solids and surface.
+        numerics: representation of solids and surface.
         ceiling: a key of CEILINGS.
         wall: separating or free-slip.
-        release: whether faces of cells that let go may take the liquid's velocity.
+        release: whether faces of separated cells may take the liquid's velocity.
     """
     simulation = create_liquid(
         numerics, SIZE, resolution, [box([0.0, LOW], SIZE)], solid=CEILINGS[ceiling], wall=wall
@@ -113,7 +119,7 @@ def drop(
 
 
 def _hold(simulation: LiquidSimulation) -> None:
-    """Let the extension of velocity take no cell for released, as if nobody had thought of it."""
+    """Treat no cell as released when velocity is extrapolated."""
     extend, contact = simulation.boundary.extrapolate_velocity, simulation.projection.contact
     nothing = wp.zeros_like(contact)
 
@@ -141,7 +147,10 @@ CEILING = Check(
 
 @check_at("slope", "{cells} cells of depth, {numerics.name}")
 def sliding(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
-    """Let a layer slide on both kinds of wall; the control is a free-slip wall of whole cells, whose stairs stop it."""
+    """Let a layer slide on both kinds of wall.
+
+    The control is a free-slip wall of whole cells, whose stairs stop it.
+    """
     for wall in ("separating", "free-slip"):
         loss, lift, way = slide(cells, numerics, wall)
         found.add(f"{wall}: way", way, low=0.98 * WAY_IN_DEPTHS * cells, unit="cells")
@@ -156,11 +165,13 @@ def sliding(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
 
 
 def slide(cells: int, numerics: Numerics, wall: str) -> tuple[float, float, float]:
-    """Let a layer of so many cells of depth slide up a slope for its way; `wall` is separating or free-slip.
+    """Let a layer of `cells` cells of depth slide up a slope for its way.
+
+    `wall` is separating or free-slip.
 
     Returns:
-        The loss of momentum along the wall over that at the start, and the mean ways off the wall
-        and along it [cells].
+        The loss of momentum along the wall over that at the start, and the mean displacements off
+        the wall and along it [cells].
     """
     angle = math.radians(ANGLE)
     tangent, normal = (

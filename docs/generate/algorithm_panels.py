@@ -1,6 +1,7 @@
-"""Draw `docs/algorithms.png`, a panel for each algorithm and figure of the book that has no picture elsewhere.
+"""Draw `docs/algorithms.png`: algorithms and figures of the book.
 
-Every panel shows a run of the library: `python docs/generate/algorithm_panels.py`.
+Each has a panel if it has no picture elsewhere. Every panel shows a run of the library. Run
+`python docs/generate/algorithm_panels.py`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 
 OUT = Path(__file__).parents[1] / "algorithms.png"
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=400, patience=400)
-FAST = 300.0  # slip [m/s] that friction hardly turns
+FAST = 300.0  # slip [m/s] that friction hardly deflects
 
 
 def residuals(problem: wl.LCP, method: Any, workspace: Any = None) -> np.ndarray:
@@ -85,7 +86,7 @@ def frame_panel(axes: Any) -> None:
     contacts = world.contacts()
     low, high = contacts.point.min(axis=0), contacts.point.max(axis=0)
     length = 0.4 * float((high - low).max())
-    # oblique: x to the right, z up, y to the back
+    # Oblique view: x to the right, z up, y to the back.
     view = np.array([[1.0, 0.4, 0.0], [0.0, 0.3, 1.0]])
     order = np.argsort(np.arctan2(*(contacts.point - 0.5 * (low + high))[:, [1, 0]].T))
     face = contacts.point[np.append(order, order[0])] @ view.T
@@ -104,7 +105,7 @@ def frame_panel(axes: Any) -> None:
 
 
 def pivots_panel(axes: Any) -> None:
-    """Draw pivots over unknowns of random positive definite problems."""
+    """Draw the number of pivots over the unknowns of random definite problems."""
     sizes = (8, 16, 32, 64, 128)
     for label, method in (("Lemke", "lemke"), ("incremental pivoting", "incremental-pivoting")):
         counts = [np.mean([pivots(method, n, seed) for seed in range(20)]) for n in sizes]
@@ -144,7 +145,7 @@ def sweep_panel(axes: Any) -> None:
 
 
 def contraction_panel(axes: Any) -> None:
-    """Draw residuals of Jacobi and Gauss-Seidel beside the factor of the contraction test."""
+    """Draw residuals of Jacobi and Gauss-Seidel, and the contraction factor."""
     problem = wl.LCP(np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([-1.0, -2.0]), -np.inf)
     for label, method in (
         ("Jacobi", wl.ProjectedJacobi(omega=1.0)),
@@ -160,7 +161,10 @@ def contraction_panel(axes: Any) -> None:
 
 
 def diagonal_panel(axes: Any) -> None:
-    """Draw the energy of one unknown in [0, 1] and where a sweep goes, for each sign of a."""
+    """Draw the energy of one unknown in [0, 1] and the sweep's result.
+
+    There is one energy for each sign of a.
+    """
     x = np.linspace(0, 1, 50)
     for a in (2.0, 0.0, -2.0):
         b = -0.8 if a >= 0 else 0.7
@@ -196,7 +200,7 @@ def blocks_panel(axes: Any) -> None:
 
 
 def search_panel(axes: Any) -> None:
-    """Draw a merit along the projected path, the bound of Armijo, and the step that the search takes."""
+    """Draw a merit along the projected path, Armijo's bound, and the accepted step."""
     A, b = np.array([[2.0, 1.2], [1.2, 1.5]]), np.array([-1.0, 0.6])
     x, d = np.array([0.2, 0.1]), np.array([2.5, -0.2])
 
@@ -224,7 +228,7 @@ def search_panel(axes: Any) -> None:
 
 
 def descent_panel(axes: Any) -> None:
-    """Draw residuals of gradient descent beside Fischer-Newton."""
+    """Draw residuals of gradient descent and of Fischer-Newton."""
     n = 40
     A = scipy.sparse.diags_array(
         [-np.ones(n - 1), 2.1 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]
@@ -276,7 +280,7 @@ def gmres_panel(axes: Any) -> None:
 
 
 class NoPreconditioner:
-    """The identity, z = r."""
+    """Identity preconditioner, z = r."""
 
     def __init__(self, n: int) -> None:
         self.r = wp.zeros(n, dtype=wp.float64)

@@ -1,4 +1,7 @@
-"""Write the measured section of `docs/choosing-a-method.md` from the stored results of the suite `choose`."""
+"""Write the measured section of `docs/choosing-a-method.md`.
+
+The figures are the stored results of the suite `choose`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ SHOWN = ("rule", "method", "problems", "solved", "x best (most)", "alternatives 
 
 
 def section() -> str:
-    """Return what the default reaches on all problems, and the table of the rules."""
+    """Return the results of the default on all problems, and the table of the rules."""
     found = read_json(RESULTS)
     machine = found.pop(MACHINE)
     hardware = machine.facts["hardware"]
@@ -59,7 +62,7 @@ def section() -> str:
 
 
 def table(records: list[Record]) -> list[str]:
-    """Return the lines of the table: a row for each rule that a problem has met."""
+    """Return the lines of the table: a row for each rule that applied to a problem."""
     columns = [RULE_COLUMNS.index(name) for name in SHOWN]
     rows = [rule_row(number, records) for number in range(1, len(RULES) + 1)]
     kept = [[row[c] for c in columns] for row in rows if row[2] != "0"]

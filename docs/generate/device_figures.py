@@ -1,4 +1,7 @@
-"""Writes the table of `docs/gpu.md` that puts machines side by side, from the files that the suite `devices` left: one for each machine."""
+"""Write the table of machines in `docs/gpu.md`.
+
+The figures are the result files of the suite `devices`, one for each machine.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,15 @@ BEGIN, END = (
 
 
 def files() -> dict[str, Path]:
-    """Return the kept files by the name of the machine."""
+    """Return the stored result files by the name of the machine."""
     return {path.parent.name: path for path in sorted(RESULTS.glob("*/devices.json"))}
 
 
 def table() -> str:
-    """Return the table: a row for each piece of work that two machines did, a column for each machine, milliseconds with iterations."""
+    """Return the table of milliseconds and iterations.
+
+    Each piece of work that at least two machines have done has a row; each machine has a column.
+    """
     machines: dict[str, dict[str, Any]] = {}
     for name, path in files().items():
         machines[name] = {record.pop("name"): record for record in json.loads(path.read_text())}
@@ -55,7 +61,7 @@ def _order(work: str) -> tuple[str, int]:
 
 
 def page() -> str:
-    """Return the page with the table as it is now."""
+    """Return the page with the current table."""
     before, _, rest = PAGE.read_text().partition(BEGIN)
     return before + BEGIN + "\n" + table() + "\n" + END + rest.partition(END)[2]
 

@@ -1,4 +1,7 @@
-"""Docstrings as the site shows them: an extension of Griffe, which reads the sources for mkdocstrings."""
+"""Extension of Griffe for the docstrings of the site.
+
+Griffe reads the sources for mkdocstrings.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,10 @@ from griffe import Extension, Object
 
 
 class ExampleSections(Extension):
-    """Makes `Example:` the section that Griffe calls `Examples:`, so that doctests are shown as code."""
+    """Rename sections `Example:` to `Examples:`.
+
+    Griffe shows doctests of such sections as code.
+    """
 
     def on_instance(self, *, obj: Object, **_: Any) -> None:
         """Rename the section of one object's docstring."""

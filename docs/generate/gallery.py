@@ -1,7 +1,7 @@
-"""Runs the built-in scenes, draws each and writes docs/gallery.md: `python docs/generate/gallery.py [--scene NAME]... [--work DIR]`.
+"""Run the built-in scenes, draw each and write docs/gallery.md.
 
-Scenes that were not asked for keep their picture and their figures, which docs/gallery/figures.json
-holds.
+Run `python docs/generate/gallery.py [--scene NAME]... [--work DIR]`. Other scenes keep their
+picture and their figures, which are stored in docs/gallery/figures.json.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from warp_lcp.benchmarks.harness.machine import cpu_model
 DOCS = Path(__file__).parents[1]
 PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"
 FIGURES = FOLDER / "figures.json"
-PICTURES = 3  # of a sheet: early, in the middle, late
-SIZE = "1500x480"  # pixels: one row
-# of 3-D scenes, besides their own
+PICTURES = 3  # pictures of a sheet: early, in the middle, late
+SIZE = "1500x480"  # pixels of one row
+# Settings of 3-D scenes, in addition to their own.
 SETTINGS = {"fluids": ("output.surface=true",), "granular": (), "contacts": ()}
 SURFACE = ("--show", "surface")
-PHOTOS = {  # frames of which `render --look photo` makes the picture
+PHOTOS = {  # frames drawn by `render --look photo`
     "column-collapse": 9,
     "crown-splash": 12,
     "dam-break": 30,
@@ -61,7 +61,7 @@ Run times are of one core of a shared {device},
 
 
 def scene_text(name: str) -> str:
-    """Return a built-in scene's file."""
+    """Return the text of a built-in scene."""
     return (files("warp_lcp.scene.scenes") / f"{name}.toml").read_text()
 
 
@@ -82,7 +82,7 @@ def scene_names() -> list[str]:
 
 
 def commands(name: str) -> tuple[list[str], list[str]]:
-    """Return the command that runs a scene and the one that draws it, without folders."""
+    """Return the commands that run and draw a scene, without folders."""
     scene = tomllib.loads(scene_text(name))
     simulator = scene["scene"]["simulator"]
     deep = len(scene["domain"]["size"]) == 3
@@ -93,7 +93,7 @@ def commands(name: str) -> tuple[list[str], list[str]]:
 
 
 def measured(command: list[str]) -> int:
-    """Run a command; return the most memory that it held [bytes]."""
+    """Run a command; return its peak memory [bytes]."""
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
@@ -103,7 +103,7 @@ def measured(command: list[str]) -> int:
 
 
 def show(name: str, work: Path) -> dict[str, Any]:
-    """Run a scene, keep its picture and return its figures."""
+    """Run a scene, store its picture and return its figures."""
     program = Path(sys.executable).parent / "warp-lcp"
     out, (run, draw) = work / name, commands(name)
     memory = measured([str(program), *run[1:], "--out", str(out), "--force"])
@@ -149,7 +149,7 @@ def _sheet(program: Path, out: Path, options: list[str], last: int) -> Image.Ima
 
 
 def entry(name: str, figures: dict[str, Any]) -> str:
-    """Return what the page says of a scene."""
+    """Return the section of a scene on the page."""
     about = tomllib.loads(scene_text(name))["scene"]
     description = about["description"][0].upper() + about["description"][1:].partition(" (")[0]
     return (
@@ -165,7 +165,7 @@ def page(figures: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the scenes asked for, all unless any is named."""
+    """Run the requested scenes, all by default."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", action="append", choices=scene_names(), help="may be repeated")
     parser.add_argument("--work", type=Path, default=Path("out/gallery"), help="where the runs go")

@@ -1,4 +1,7 @@
-"""Runs the notebooks' cells, without Jupyter, and stores their output: `python docs/generate/notebook_outputs.py [NAME]...`."""
+"""Run the cells of notebooks, without Jupyter, and store their output.
+
+Run `python docs/generate/notebook_outputs.py [NAME]...`.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,20 @@ from pathlib import Path
 from typing import Any
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("*.ipynb"))
-DOTS = 80  # per inch of a picture
+DOTS = 80  # dots per inch of a picture
 
 
 def code_cells(notebook: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the cells of code."""
+    """Return the code cells."""
     return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
 
 
 def printed(notebook: dict[str, Any], pictures: list[list[bytes]] | None = None) -> list[str]:
-    """Run the code cells one after the other in one name space; return the text that each prints.
+    """Run the code cells in one name space; return the printed text of each.
 
     Args:
-        notebook: as read from its file.
-        pictures: gets the PNG files of each cell's Matplotlib figures, if given.
+        notebook: contents of the notebook's file.
+        pictures: list to which the PNG files of each cell's figures are appended.
     """
     names: dict[str, Any] = {}
     texts = []
@@ -40,19 +43,19 @@ def printed(notebook: dict[str, Any], pictures: list[list[bytes]] | None = None)
 
 def drawn(plt: Any) -> list[bytes]:
     """Return the open figures as PNG files, and close them."""
-    found = []
+    pictures = []
     for figure in map(plt.figure, plt.get_fignums()):
         file = io.BytesIO()
         figure.savefig(
             file, format="png", dpi=DOTS, bbox_inches="tight", metadata={"Software": None}
         )
-        found.append(file.getvalue())
+        pictures.append(file.getvalue())
     plt.close("all")
-    return found
+    return pictures
 
 
 def kept(notebook: dict[str, Any]) -> list[str]:
-    """Return the printed text that each code cell holds."""
+    """Return the stored printed text of each code cell."""
     return [
         "".join("".join(output.get("text", "")) for output in cell["outputs"])
         for cell in code_cells(notebook)
@@ -60,7 +63,7 @@ def kept(notebook: dict[str, Any]) -> list[str]:
 
 
 def outputs(text: str, pictures: list[bytes], alt: str) -> list[dict[str, Any]]:
-    """Return the outputs of a cell as a notebook holds them."""
+    """Return the outputs of a cell in the format of a notebook."""
     lines = text.splitlines(keepends=True)
     shown = [
         {"image/png": base64.b64encode(picture).decode(), "text/plain": [alt]}

@@ -1,4 +1,7 @@
-"""Draws the pictures of docs/problems.md and computes the tables of its results: `python docs/generate/problems.py [--tables]`."""
+"""Draw the pictures of docs/problems.md and compute its tables.
+
+Run `python docs/generate/problems.py [--tables]`.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ DEVICE = "cpu"
 
 
 def table(problem: str) -> str:
-    """Return what others have printed for a problem and what comes out here, a row each."""
+    """Return printed results of other authors for a problem, and ours, a row each."""
     rows = ["| case | printed | by | here |", "|---|---|---|---|"]
     for p in PUBLISHED:
         if p.problem == problem:
@@ -47,7 +50,7 @@ def table(problem: str) -> str:
 
 
 def page(text: str) -> str:
-    """Return the page with its tables computed anew."""
+    """Return the page with its tables recomputed."""
     return TABLE.sub(lambda found: f"<!-- figures: {found[1]} -->\n{table(found[1])}", text)
 
 
@@ -65,7 +68,7 @@ def shade(
     title: str,
     held: np.ndarray | None = None,
 ) -> None:
-    """Draw a field in colors, and hatch where it is held by a bound."""
+    """Draw a field in colors; hatch the unknowns at a bound."""
     picture = axes.pcolormesh(x, y, field, cmap="viridis", shading="gouraud", rasterized=True)
     axes.figure.colorbar(picture, ax=axes)
     if held is not None:
@@ -156,7 +159,7 @@ def seepage() -> Figure:
 
 
 def put() -> Figure:
-    """Draw prices above the payoff and where the option is exercised."""
+    """Draw prices above the payoff, and the exercise boundary."""
     figure, axes = panels(2)
     m = Heston()
     prices = m.put(128, 64, 64, device=DEVICE)
@@ -190,7 +193,7 @@ def put() -> Figure:
 
 
 def ice() -> Figure:
-    """Draw the dome and its section beside the exact one."""
+    """Draw the dome and its section with the exact one."""
     figure, axes = panels(2)
     dome = IceDome(nodes=65)
     H, s = dome.solve(device=DEVICE), np.linspace(-900, 900, 65)
@@ -218,7 +221,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 
 
 def main() -> None:
-    """Draw the pictures, unless tables alone are asked for, and write the tables."""
+    """Draw the pictures, unless `--tables` is set, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tables", action="store_true", help="the tables alone")
     mpl.use("Agg")

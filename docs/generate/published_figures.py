@@ -1,4 +1,7 @@
-"""Write the table of `docs/published-methods.md` from the stored results of the suite `published`."""
+"""Write the table of `docs/published-methods.md`.
+
+The figures are the stored results of the suite `published`.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ LINEAR = "linear solve"
 
 
 def table() -> str:
-    """Return the table, a row per method and a column per kind of bounds and size, and when it was measured."""
+    """Return the table, and the date of the measurement.
+
+    Each method has a row; each kind of bounds and size has a column.
+    """
     machine, *records = json.loads(RESULTS.read_text())
     kept = {(r["method"], r["bounds"], r["size"]): r for r in records}
     sources = {r["method"]: r["source"] for r in records}

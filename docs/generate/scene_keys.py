@@ -1,4 +1,7 @@
-"""Writes docs/scenes.md from the schemas of scene files: `python docs/generate/scene_keys.py`."""
+"""Write docs/scenes.md from the schemas of scene files.
+
+Run `python docs/generate/scene_keys.py`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ PAGE = Path(__file__).parents[1] / "scenes.md"
 SHAPES = ("box", "sphere", "capsule", "plane", "mesh")
 SHARED = ("scene", "time", "domain", "physics", "output", "camera")
 SAMPLED = ("particles", "particles.reseed", "particles.narrow_band", "density_correction")
-# by their headings
+# Keys whose headings explain them.
 SELF_EVIDENT = (
     "scene",
     "time",
@@ -27,7 +30,7 @@ SELF_EVIDENT = (
     "friction",
 )
 ELSEWHERE = "unused with bodies alone"  # begins the description of a key that bodies alone inherit
-LONG_LISTS = {  # by a key's default
+LONG_LISTS = {  # words that replace a list of allowed values, by the key's default
     "vtu": "[formats](frames-and-films.md#other-formats)",
     "projected-multigrid": "others: those with * in [methods](methods.md)",
     "sweeps-and-newton": "[methods](bodies.md#without-a-material)",
@@ -137,7 +140,10 @@ LIMITS = """## Limits
 
 
 def reference(prop: Definition) -> str | None:
-    """Return the name of the definition that a property refers to, itself or as one of its alternatives."""
+    """Return the name of the definition that a property refers to.
+
+    The reference is that of the property itself, or of one of its alternatives.
+    """
     for part in (prop, *prop.get("anyOf", ())):
         if "$ref" in part:
             return str(part["$ref"]).rsplit("/", 1)[1]
@@ -145,7 +151,7 @@ def reference(prop: Definition) -> str | None:
 
 
 def toml(value: Any) -> str:
-    """Return a default as a scene file has it."""
+    """Return a default in the form of a scene file."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -154,13 +160,13 @@ def toml(value: Any) -> str:
 
 
 def words(prop: Definition) -> list[str]:
-    """Return the words that a key may hold, itself or as entries of a list."""
+    """Return the words that a key or the entries of its list may hold."""
     parts = [prop, *prop.get("anyOf", ()), prop.get("items", {})]
     return [word for part in parts for word in part.get("enum", ()) if isinstance(word, str)]
 
 
 def bounds(prop: Definition) -> str:
-    """Return the range of a number if it says more than a sign or a share."""
+    """Return the range of a number, unless it is only a sign or a share."""
     for part in (prop, *prop.get("anyOf", ())):
         if "minimum" in part and "maximum" in part:
             return f"{part['minimum']:g} to {part['maximum']:g}"
@@ -170,7 +176,7 @@ def bounds(prop: Definition) -> str:
 
 
 def default_of(name: str, prop: Definition, required: bool) -> str:
-    """Return the cell of a key's default."""
+    """Return the table cell of a key's default."""
     default = prop.get("description", "").partition("; default: ")[2]
     if prop.get("default") not in (None, ""):
         return f"`{toml(prop['default'])}`"
@@ -190,7 +196,7 @@ def default_of(name: str, prop: Definition, required: bool) -> str:
 
 
 def beyond(text: str, base: str) -> str:
-    """Return a text without the words that it begins with as `base` does."""
+    """Return a text without the initial words that it shares with `base`."""
     own, other = text.split(), base.split()
     alike = itertools.takewhile(
         lambda pair: pair[0].strip(";") == pair[1].strip(";"), zip(own, other, strict=False)
@@ -205,7 +211,7 @@ def described(prop: Definition) -> str:
 
 
 def meaning_of(prop: Definition) -> str:
-    """Return what a key means and which words it may hold."""
+    """Return the meaning of a key and its allowed words."""
     meaning, allowed = described(prop), words(prop)
     if len(allowed) > 6:
         return f"{meaning}; {LONG_LISTS[prop['default']]}"
@@ -217,12 +223,12 @@ def meaning_of(prop: Definition) -> str:
 def row(
     name: str, prop: Definition, required: bool, others: dict[str, Definition] | None = None
 ) -> str:
-    """Return a key's line of a table.
+    """Return a key's row of a table.
 
     Args:
-        name: of the key.
-        prop: of the schema.
-        required: whether it must be given.
+        name: name of the key.
+        prop: property of the schema.
+        required: whether the key is required.
         others: the key's properties in scenes of other materials, by their names.
     """
     meaning, default = meaning_of(prop), default_of(name, prop, required)
@@ -247,8 +253,8 @@ def table(
     """Return the keys of a definition as a Markdown table, empty if it has none.
 
     Args:
-        definition: of the schema.
-        leave_out: keys that other tables have.
+        definition: definition of the schema.
+        leave_out: keys that are in other tables.
         others: the same table in scenes of other materials, by their names.
     """
     required, rows = definition.get("required", ()), []
@@ -275,12 +281,12 @@ def table(
 def variant_table(
     kinds: dict[str, Definition], column: str, leave_out: frozenset[str], *, defaults: bool = True
 ) -> str:
-    """Return the keys of tables that come in several kinds as one Markdown table.
+    """Return the keys of tables of several kinds as one Markdown table.
 
     Args:
-        kinds: the definitions by kind.
-        column: head of the column of kinds.
-        leave_out: keys that other tables have.
+        kinds: definitions by kind.
+        column: heading of the column of kinds.
+        leave_out: keys that are in other tables.
         defaults: whether there is a column of defaults.
     """
     rows: dict[tuple[str, str, str], list[str]] = {}
@@ -319,15 +325,15 @@ def section(name: str, definition: Definition, others: dict[str, Definition] | N
 
 
 def tables_of(schema: Definition) -> dict[str, Definition]:
-    """Return a simulator's tables by name, tables within tables included."""
-    found = {}
+    """Return a simulator's tables by name, including nested tables."""
+    tables = {}
     for name, prop in schema["properties"].items():
         if (target := reference(prop)) is not None:
-            found[name] = schema["$defs"][target]
-            for inner, part in found[name]["properties"].items():
+            tables[name] = schema["$defs"][target]
+            for inner, part in tables[name]["properties"].items():
                 if (deeper := reference(part)) is not None:
-                    found[f"{name}.{inner}"] = schema["$defs"][deeper]
-    return found
+                    tables[f"{name}.{inner}"] = schema["$defs"][deeper]
+    return tables
 
 
 def shapes_of(schema: Definition, name: str) -> dict[str, Definition]:
@@ -337,7 +343,7 @@ def shapes_of(schema: Definition, name: str) -> dict[str, Definition]:
 
 
 def lists_of(schema: Definition) -> dict[str, Definition]:
-    """Return the arrays of tables of a simulator's scenes, but for shapes, by name."""
+    """Return the arrays of tables of a simulator's scenes by name, without shapes."""
     entries = {
         name: reference(prop.get("items", {})) for name, prop in schema["properties"].items()
     }
@@ -385,7 +391,7 @@ def motion_section(schema: Definition) -> str:
 
 
 def material_section(liquid: Definition, sand: Definition) -> str:
-    """Return the keys of material, sources and drains besides those of the shape."""
+    """Return the keys of material, sources and drains, without those of the shape."""
     of_shape = frozenset(shapes_of(liquid, "drain")["box"]["properties"]) - {"start", "stop"}
     arrays = {"liquid": liquid, "sand": sand, "source": liquid, "drain": liquid}
     kinds = {name: shapes_of(schema, name)["box"] for name, schema in arrays.items()}

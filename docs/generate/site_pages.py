@@ -1,7 +1,7 @@
-"""What the site shows besides Markdown files under docs: a hook of MkDocs.
+"""Hook of MkDocs for pages of the site that are no Markdown files under docs.
 
-Notebooks become pages, and so do the files of the repository that pages link to. Formulas become
-MathML, which browsers draw themselves, without a script, with the font that comes along.
+Notebooks become pages, and so do files of the repository that pages link to. Formulas become
+MathML, which browsers draw without a script, in the included font.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from importlib.metadata import distribution
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-NOTEBOOK = re.compile(r"\]\(((?:\.\./)?[\w-]+)\.ipynb\)")  # a link to one
-FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
-# what the plug-in `offline` loads for the search, and our copy
+NOTEBOOK = re.compile(r"\]\(((?:\.\./)?[\w-]+)\.ipynb\)")  # link to a notebook
+FONT = "STIXTwoMath-Regular.ttf"  # font of ziamath; docs/site.css names it
+# Script that the plug-in `offline` loads for the search, and our copy.
 SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"
-# a link from a page right under docs to a file of the repository
+# Link from a page directly under docs to a file of the repository.
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")
-# What pymdownx.arithmatex makes of $...$ and $$...$$.
+# Output of pymdownx.arithmatex for $...$ and $$...$$.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[([](.*?)\\[])]</\1>', flags=re.S)
 
 LITERAL = re.compile(r"(<(pre|code|math)\b.*?</\2>|<[^>]*>)", flags=re.S)
@@ -28,7 +28,10 @@ POWER = re.compile(r"(?<=[\w)\]|])\^(?:\(([^)]*)\)|(-1/2|-?\d+(?:\.\d+)?|[a-z]\b
 
 
 def page_of_notebook(text: str, name: str) -> tuple[str, dict[str, bytes]]:
-    """Return a notebook as Markdown, with its text, code, printed text and pictures, and these pictures by their file names."""
+    """Return a notebook as Markdown, and its pictures by their file names.
+
+    The page has the text, code, printed text and pictures.
+    """
     parts, pictures = [], {}
     for cell in json.loads(text)["cells"]:
         source = "".join(cell["source"])
@@ -44,17 +47,23 @@ def page_of_notebook(text: str, name: str) -> tuple[str, dict[str, bytes]]:
 
 
 def outside_links(text: str) -> set[str]:
-    """Return the files of the repository, relative to its root, that a page right under docs links to."""
+    """Return the repository files, relative to its root, that a page links to.
+
+    The page is directly under docs.
+    """
     return {match[1] for match in OUTSIDE.finditer(text)}
 
 
 def inside(text: str) -> str:
-    """Return the page with those links made links within the site."""
+    """Return the page with these links made links within the site."""
     return OUTSIDE.sub(r"](\1\2)", text)
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the notebooks' pages, and the files outside docs that the navigation and the pages name, with what these show."""
+    """Add the pages of notebooks, and files outside docs.
+
+    The latter are those that the navigation and the pages name, and the files that these show.
+    """
     from mkdocs.structure.files import File
 
     docs = Path(config.docs_dir)
@@ -97,20 +106,20 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def formula(found: re.Match[str]) -> str:
-    """Return a formula of TeX as MathML."""
+    """Return a TeX formula as MathML."""
     from latex2mathml.converter import convert
 
-    made = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
-    if "\\" in made:
+    mathml = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
+    if "\\" in mathml:
         raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
-    made = made.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace(
+    mathml = mathml.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace(
         "<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>"
     )
-    return f'<div class="formula">{made}</div>' if found[1] == "div" else made
+    return f'<div class="formula">{mathml}</div>' if found[1] == "div" else mathml
 
 
 def typeset(text: str) -> str:
-    """Return words with powers raised and signs of comparison as they are written by hand."""
+    """Return text with raised powers and typeset comparison signs."""
     return (
         POWER.sub(lambda found: f"<sup>{found[1] or found[2]}</sup>", text)
         .replace("&lt;=", "≤")
@@ -119,22 +128,25 @@ def typeset(text: str) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Set formulas, and what is like one in the words between tags and code."""
+    """Typeset formulas, and similar text between tags and code."""
     parts = LITERAL.split(FORMULA.sub(formula, content))
     parts[::3] = map(typeset, parts[::3])
     return "".join(part for place, part in enumerate(parts) if place % 3 < 2)
 
 
 def own_shim(output: str, path: str) -> str:
-    """Return a page, whose path in the site is given, that takes the search's script from the site and fetches nothing from elsewhere."""
+    """Return a page that takes the search script from the site.
+
+    The page then fetches nothing from elsewhere. `path` is its path in the site.
+    """
     return output.replace(SHIM, "../" * path.count("/") + OWN_SHIM)
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:
-    """Let the search work from the disk, without a network."""
+    """Make the search work from the disk, without a network."""
     return own_shim(output, page.url)
 
 
 def on_post_template(output: str, template_name: str, **_: Any) -> str:
-    """Let the search work from the disk in what is no page."""
+    """Make the search work from the disk in files that are no pages."""
     return own_shim(output, template_name)

@@ -1,4 +1,7 @@
-"""The suite of the book's experiments at its smallest size, and what it finds: the recipes' solutions, tests and semi-definite problems."""
+"""Suite of the book's experiments at its smallest size, and its findings.
+
+Solutions of the recipes, convergence tests and semi-definite problems.
+"""
 
 import numpy as np
 import pytest
@@ -86,12 +89,15 @@ def test_planted_solutions_are_solutions_and_those_of_the_recipes_are_not(kind):
         assert (p.solution >= 0).all()
         assert_allclose(p.solution * y, 0, atol=1e-12)
         infeasible = y.min() < -1e-3
-        # of contacts most
+        # Of most contacts.
         assert infeasible == (kind == "fluid, recipe") or kind == "contact, recipe"
 
 
 def test_the_fluid_recipe_has_nothing_complementary():
-    """Its matrix is an M-matrix and b <= 0 where x > 0, 0 elsewhere: the linear system's solution is positive everywhere."""
+    """Positive solution of the linear system for the fluid recipe.
+
+    The matrix is an M-matrix, b <= 0 where x > 0 and b = 0 elsewhere, so nothing is complementary.
+    """
     p = kinds(SMALL)["fluid, recipe"](3)
     x = np.linalg.solve(p.A.toarray(), -p.b)
     assert x.min() > 0
@@ -142,7 +148,7 @@ def test_verdicts_are_num4lcp_s():
 
     assert trace([9.0, 1.0, 1e-4]).verdict(Merit.FISCHER, Limits())[:2] == ("absolute", 3)
     assert trace([9.0, 1.0, 1.0]).verdict(Merit.FISCHER, Limits())[:2] == ("relative", 3)
-    # tested after a sweep
+    # Sweeps are tested after each one.
     assert trace([9.0, 1.0, 1e-4]).verdict(Merit.PRODUCT, Limits())[:2] == ("absolute", 2)
     assert trace([9.0, 8.0, 7.0]).verdict(Merit.FISCHER, Limits(most=2))[:2] == (
         "max iterations",

@@ -1,4 +1,7 @@
-"""The suite `choose`: every rule has a kind of problems that meets it; times, shares and alternatives are those of the trials."""
+"""Suite `choose`: rules, times, shares and alternatives.
+
+Every rule applies to a kind of problems. The figures are those of the trials.
+"""
 
 import numpy as np
 import pytest
@@ -35,7 +38,7 @@ def test_a_kind_meets_its_rule(kind):
 
 
 def made(rule, name, status, seconds, alternatives=()):
-    """Return a record of a problem that rule number `rule` applies to."""
+    """Return a record of a problem to which rule number `rule` applies."""
     figures = {method: Figure(t, "s") for method, t in seconds.items()}
     facts = {
         "kind": name,

@@ -1,4 +1,4 @@
-"""Losses against peers."""
+"""Losses of ratios to peers between two results."""
 
 import pytest
 
@@ -17,15 +17,15 @@ def result(*samples, figure="pyamg_over_this"):
     ("old", "new", "lost"),
     [
         ([30.0, 31.0, 32.0], [15.0, 16.0, 17.0], True),
-        ([30.0, 31.0, 32.0], [24.0, 24.5, 25.0], False),  # 20 to 25 % less at the most
-        ([30.0, 31.0, 32.0], [15.0, 16.0, 29.0], False),  # one sample is as it was: noise
+        ([30.0, 31.0, 32.0], [24.0, 24.5, 25.0], False),  # a loss of at most 20 to 25 %
+        ([30.0, 31.0, 32.0], [15.0, 16.0, 29.0], False),  # one sample is unchanged: noise
         ([30.0, 31.0, 32.0], [60.0, 61.0, 62.0], False),  # a gain
     ],
 )
 def test_a_loss_is_one_that_noise_does_not_explain(old, new, lost):
     for figure in ("pyamg_over_this", "over_engine", "over Numba product"):
         assert bool(losses(result(*old, figure=figure), result(*new, figure=figure))) == lost
-    # seconds are not judged
+    # Seconds are not judged.
     assert not losses(result(*old, figure="seconds"), result(*new, figure="seconds"))
 
 

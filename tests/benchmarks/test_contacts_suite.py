@@ -1,4 +1,7 @@
-"""The suite of rigid contacts, with few scenes and sweeps: it measures every method, and its comparison is what the residuals say."""
+"""Suite of rigid contacts with few scenes and sweeps.
+
+It measures every method, and its comparison follows from the residuals.
+"""
 
 import pytest
 

@@ -1,4 +1,7 @@
-"""The account of a step's energy against what is known by hand, and steps of any length in the middle of small scenes."""
+"""Energy balance of a step against known values, and steps of any length.
+
+The steps start in the middle of small scenes.
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,12 +35,15 @@ def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
 
 
 def test_what_a_source_brings_is_not_made() -> None:
-    """The first step emits what the velocity brings in: its energy is that of particles at that velocity, nothing else happens."""
+    """Energy of emitted particles: that of particles at the inflow velocity.
+
+    The first step emits them; nothing else happens.
+    """
     source = box([0.0, 0.25], [0.125, 0.5], velocity=[2.0, 0.0])
     simulation = scenes.create_liquid(VOXEL, [1.0, 1.0], 16, [], source=[source], physics=STILL)
     ledger = Ledger(simulation)
     before = simulation.particles.count
-    done = ledger.step(0.0625)  # the way of two cells
+    done = ledger.step(0.0625)  # the particles move by two cells
     emitted = simulation.particles.count - before
     assert emitted > 0
     assert done.given == pytest.approx(0.5 * simulation.particle_mass * emitted * 2.0**2, rel=1e-6)
@@ -45,7 +51,10 @@ def test_what_a_source_brings_is_not_made() -> None:
 
 
 def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its_velocity() -> None:
-    """From rest to u at once takes m u^2: half of it becomes motion, half is lost in the blow."""
+    """Work of a wall that accelerates liquid from rest to u at once: m u^2.
+
+    Half of it becomes kinetic energy, half is lost in the impact.
+    """
     motion = {"kind": "translation", "velocity": [0.8, 0.0]}
     piston = box([-2.0, -1.0], [0.25, 2.0], motion=motion, wall="free-slip")
     simulation = scenes.create_liquid(
@@ -66,8 +75,8 @@ def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its
 TAP = {"shape": "box", "min": [0.0, 0.5], "max": [0.125, 0.625], "velocity": [1.5, 0.0]}
 
 
-# without surface tension, whose energy no account has: cells along the longest side, and the time
-# [s] whose parts are moments
+# Cells along the longest side and times [s] of the tests. Surface tension is left out, since the
+# balance has no term for its energy.
 SCENES = {
     "balls-on-sand-2d": (48, 0.6),
     "carried-box-2d": (48, 0.7),
@@ -100,12 +109,15 @@ SCENES = {
     "waterfall": (32, 1.2),
     "wave-maker": (120, 2.4),
 }
-SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], than the normal step
-MOST = 1e-3  # of the total that a step may add
+SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], shorter than the normal step
+MOST = 1e-3  # share of the total that a step may add
 
 
 class Rise(NamedTuple):
-    """The energy that a step of a length [s] made, and what of it the density correction lifted, over the total."""
+    """Energy gained by a step of a length [s], and its part from density correction.
+
+    Both are divided by the total energy.
+    """
 
     length: float
     gained: float
@@ -113,7 +125,10 @@ class Rise(NamedTuple):
 
 
 def along(ledger: Ledger, moments: list[float], dt_max: float) -> list[Rise]:
-    """Step from moment to moment, and try all lengths, and rows of short and normal steps in turns, at each."""
+    """Step from moment to moment and try steps of all lengths at each.
+
+    Also rows of short and normal steps in turns.
+    """
     simulation, rises = ledger.simulation, list[Rise]()
     for moment in moments:
         while simulation.time < moment or simulation.step_count == 0:
@@ -145,7 +160,10 @@ def test_no_step_in_the_middle_of_a_scene_makes_energy(name: str) -> None:
 
 @pytest.mark.parametrize("what", ["liquid and a tap", "unilateral", "thick liquid", "sand"])
 def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
-    """But for what the density correction lifts, which is a matter of positions and the same whatever the step."""
+    """No energy gain, except by the density correction.
+
+    The correction changes positions alone and is the same for any step.
+    """
     simulation: Any
     if what == "sand":
         simulation = scenes.create_sand([0.8, 0.4], 24, [box([0.0, 0.0], [0.2, 0.3])], walls=0.5)
@@ -160,7 +178,7 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
         )
     found = along(Ledger(simulation), [0.02, 0.2], simulation.scene.time.dt_max)
     assert len(found) > 20
-    # what creeps loses
+    # Loss of creeping material.
     assert max(rise.gained - rise.displaced for rise in found) < (
         0.0 if what == "thick liquid" else MOST
     )
@@ -168,7 +186,10 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
 
 @pytest.mark.parametrize("what", ["liquid, unilateral", "sand"])
 def test_the_old_relaxation_is_told(what: str) -> None:
-    """Crowds that are pushed apart within a step get the faster the shorter it is."""
+    """Detection of the former relaxation, which pushed dense material apart in a step.
+
+    The shorter the step, the faster the material moved.
+    """
     _, gained = time_steps.collapse(
         what, 24, 1e-3, change=time_steps.PUSHED_APART[what], moments=np.array([0.01])
     )

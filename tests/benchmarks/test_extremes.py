@@ -1,4 +1,4 @@
-"""The suite of hostile cases: its residual against an oracle, its judgment, the wrong solvers that it must catch, a few families."""
+"""Suite of hostile cases: residual oracle, judgement, wrong solvers, families."""
 
 import json
 import time
@@ -37,7 +37,7 @@ FAST = (
 
 
 def wrong(cases):
-    """What is not as it must be, a line each."""
+    """Return a line for each failure."""
     verdicts = [judge(c, precision, "cpu") for c in cases for precision in c.precisions]
     assert verdicts
     return [f"{v.name}: {v.outcome}" for v in verdicts if v.wrong]
@@ -55,7 +55,7 @@ def test_every_family(family):
 
 
 def test_there_are_enough_cases_of_every_kind():
-    cases = list(extremes.cases(4217))  # refuses names that are there twice
+    cases = list(extremes.cases(4217))  # refuses names that occur twice
     kinds = Counter(c.promise(p).expected for c in cases for p in c.precisions)
     assert len(cases) >= 150
     assert set(kinds) == set(Expected)
@@ -67,7 +67,10 @@ def test_there_are_enough_cases_of_every_kind():
 @pytest.mark.parametrize("name", broken.SOLVERS)
 @pytest.mark.parametrize("precision", case.PRECISIONS)
 def test_a_wrong_solver_is_caught(name, precision):
-    """Expected to solve the problem, as a right one is: the same case passes with wl.solve."""
+    """Catch a wrong solver that is expected to solve the problem.
+
+    The same case passes with wl.solve.
+    """
     for _, make, method in broken.RIGHT:
         assert judge(SolveCase("right", "right", make, method), precision, "cpu").wrong == []
         verdict = judge(
@@ -76,7 +79,7 @@ def test_a_wrong_solver_is_caught(name, precision):
         assert verdict.wrong
         if name == "steps backwards":
             assert verdict.attempt.status != "CONVERGED"
-        else:  # the result claims success: only the independent residual shows that it is none
+        else:  # the result claims success; only the independent residual shows the error
             assert verdict.attempt.status == "CONVERGED"
             assert any("CONVERGED at a residual of" in line for line in verdict.wrong)
 
@@ -128,7 +131,7 @@ def test_time_of_other_programs_is_not_in_a_budget(monkeypatch):
 
 
 def worked(seconds):
-    """Be busy for so many seconds of processor time."""
+    """Use CPU time for some seconds."""
     begun = time.process_time()
     while time.process_time() < begun + seconds:
         pass
@@ -187,7 +190,11 @@ def test_the_norm_neither_vanishes_nor_overflows(scale):
 
 
 def test_values_whose_squares_vanish_are_refused():
-    """What once was CONVERGED with a residual of 0, at a residual of 100 % of the start's."""
+    """Refusal of values whose squares underflow.
+
+    Without it the status was CONVERGED with a residual of 0, while the true residual was that of
+    the start.
+    """
     A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
     for tiny in (1e-150, -1e-170, 1e-310):
         with pytest.raises(ValueError, match="b: largest value"):
@@ -202,7 +209,10 @@ def test_values_whose_squares_vanish_are_refused():
 
 
 def test_a_tolerance_below_what_float32_holds_costs_few_iterations():
-    """Linear solves that no longer lower the residual end: 3,236 iterations where each runs to its limit."""
+    """End of linear solves that no longer reduce the residual.
+
+    Without it each runs to its limit: 3,236 iterations.
+    """
     problem = bounds.pool((96, 96)).lcp("cpu", wp.float32)
     result = wl.solve(
         problem, wl.MinimumMapNewton(precision="single"), stopping=wl.StoppingCriteria(rtol=1e-13)

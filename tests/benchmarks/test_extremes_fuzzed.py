@@ -1,4 +1,7 @@
-"""Problems and simulations that nobody thought of: whatever ends as solved is solved, whatever is not says why."""
+"""Fuzzed problems and simulations: honest statuses.
+
+Whatever is reported as solved is solved; anything else has a reason.
+"""
 
 import numpy as np
 import pytest
@@ -12,12 +15,15 @@ from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 from warp_lcp.benchmarks.extremes.simulations import RunCase, liquid, made, sand
 
 METHODS = ("projected-multigrid", "minimum-map-newton")
-TAME = 2  # decades of coefficients that every precision but single must cope with
+TAME = 2  # decades of coefficients that every precision except single must solve
 
 
 @st.composite
 def grid_problems(draw):
-    """A grid with random cells, coefficients over some decades, bounds and scale; and over how many decades."""
+    """Draw a grid problem and the number of decades of its coefficients.
+
+    Cells, coefficients, bounds and scale are random.
+    """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     shape = tuple(draw(st.lists(st.integers(1, 12), min_size=2, max_size=3)))
     liquid_share = draw(st.sampled_from([0.2, 0.6, 0.9, 1.0]))
@@ -55,7 +61,10 @@ def grid_problems(draw):
 
 
 def solvable(problem):
-    """Whether a grid problem has a solution, by the sums of b over its floating pools; None where rounding decides."""
+    """Return whether a grid problem has a solution; None if rounding decides.
+
+    By the sums of b over its floating pools.
+    """
     exact = problem.exact()
     count, label = scipy.sparse.csgraph.connected_components(exact.matrix != 0, directed=False)
     sums = np.abs(np.asarray(exact.matrix.sum(axis=1)).ravel())
@@ -86,10 +95,10 @@ def test_fuzzed_grid_problems(drawn, method, precision):
     assert attempt.faults == []
     possible = solvable(problem)
     if possible is False:
-        # what is lost is small
+        # The excess is small.
         assert attempt.status == "INFEASIBLE" or (attempt.status == "CONVERGED" and attempt.met)
     elif possible:
-        # x may be no float32 number
+        # x may exceed the range of float32.
         beyond = precision == "single" and decades > TAME and np.abs(problem.b).max() > 1e25
         assert attempt.status in HONEST | {"CONVERGED"} | ({"NON_FINITE"} if beyond else set())
         if precision != "single" and decades <= TAME:
@@ -99,7 +108,10 @@ def test_fuzzed_grid_problems(drawn, method, precision):
 
 @st.composite
 def matrix_problems(draw):
-    """A symmetric matrix B B' + s I with many or few zero eigenvalues, over some decades of scale."""
+    """Draw a symmetric matrix B B' + s I with many or few zero eigenvalues.
+
+    Its scale varies over some decades.
+    """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n, rank = draw(st.integers(1, 20)), draw(st.integers(0, 20))
     B = rng.standard_normal((n, rank)) * 10.0 ** rng.uniform(-draw(st.integers(0, 4)), 0, (n, 1))

@@ -1,4 +1,4 @@
-"""Host time of a step by stage: what is counted, and that replays of native calls change nothing."""
+"""Host time of a step by stage: counts, and exact replays of native calls."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.cpu_form("native calls are the CPU's")
 
 @pytest.fixture
 def addition():
-    """Return x, of zeros, and the bound pass x += 1."""
+    """Return x, all zeros, and the bound pass x += 1."""
     x, z = wp.zeros(8, dtype=wp.float32, device="cpu"), wp.ones(8, dtype=wp.float32, device="cpu")
     bound = ADD.bind(rows_of(x), z=z, x=x)
     bound.launch()
@@ -49,7 +49,7 @@ def test_calls_are_counted_in_the_stage_that_makes_them(addition):
             bound.launch()
             program.run()
             with timer.stage("within"):
-                # its own fill is no call of ours
+                # The fill inside `zeros` is not counted.
                 made = wp.zeros(4, dtype=wp.float32, device="cpu")
             made.numpy()
         wp.copy(made, made)

@@ -1,4 +1,7 @@
-"""Hostile inputs by seed: the judge sees wrong answers, and cases of each kind are solved or refused."""
+"""Hostile inputs by seed: judgement of wrong answers, and cases of each kind.
+
+Each case is solved or refused.
+"""
 
 from dataclasses import replace
 
@@ -28,7 +31,10 @@ def categories(truth, answer, method=None):
 
 @pytest.mark.parametrize("large", [1.0, 1e8, 1e16])
 def test_a_wrong_x_is_a_false_convergence(large):
-    """b = (-1, large) has x = (1/2, 0), however large the inactive row is."""
+    """False convergence at a wrong x.
+
+    b = (-1, large) has the solution x = (1/2, 0), however large the inactive row is.
+    """
     truth = box([-1.0, large], solution=np.array([0.5, 0.0]), solvable=True, unique=True)
     assert categories(truth, Answer("CONVERGED", np.array([0.5, 0.0]))) == ["converged"]
     for wrong in ([0.0, 0.0], [0.49, 0.0], [0.5, 0.01], [-0.5, 0.0], [np.nan, 0.0]):
@@ -45,7 +51,10 @@ def test_signs_at_upper_bounds_and_in_equations():
 
 
 def test_a_row_that_others_hide_is_told():
-    """x_1 = 0 is wrong in its own row, but 1e-12 of the norm that the tolerance is relative to."""
+    """Report of a row that others hide.
+
+    x_1 = 0 is wrong in its own row, but only 1e-12 of the norm to which the tolerance is relative.
+    """
     truth = Box(
         A=np.eye(2),
         b=np.array([-1.0, -1e12]),
@@ -61,7 +70,10 @@ def test_a_row_that_others_hide_is_told():
 
 
 def test_a_false_infeasible_is_seen():
-    """By what is planted, by a linear program for monotone A, and by enumeration."""
+    """Detection of a false INFEASIBLE.
+
+    It is detected by the planted solution, by a linear program for monotone A, and by enumeration.
+    """
     claim = Answer("INFEASIBLE", np.zeros(2))
     assert categories(box([-1.0, 1.0], solvable=True), claim) == ["FALSE INFEASIBLE"]
     assert categories(box([-1.0, 1.0]), claim) == ["FALSE INFEASIBLE"]
@@ -85,7 +97,10 @@ def test_what_ends_honestly():
 
 
 def test_scales_hardly_depend_on_units():
-    """d = 1 / (r c) turns into about s_i d_i where rows are scaled by s: Ruiz's limit depends on where it starts."""
+    """Approximate independence of the scale from units.
+
+    d = 1 / (r c) becomes about s_i d_i if rows are scaled by s. Ruiz's limit depends on its start.
+    """
     rng = np.random.default_rng(SEED)
     M, b, s = rng.standard_normal((5, 5)), rng.standard_normal(5), 10.0 ** rng.integers(-6, 6, 5)
     plain = Box(A=M, b=b, lower=np.zeros(5), upper=np.full(5, np.inf))
@@ -102,7 +117,7 @@ def test_programs_are_judged_in_plain_units():
     pytest.importorskip("clarabel", reason="the judge's second opinion")
     pytest.importorskip("piqp")
     one = np.ones((1, 1))
-    plain = qpsolvers.Problem(one, -np.ones(1), G=one, h=np.array([0.5]))  # least at x = 0.5
+    plain = qpsolvers.Problem(one, -np.ones(1), G=one, h=np.array([0.5]))  # minimum at x = 0.5
     truth = Program(scaled=plain, plain=plain, expected="solvable", unique=True)
     assert categories(truth, Answer("CONVERGED", np.array([0.5]))) == ["converged"]
     for wrong in (0.4, 0.6, 0.0, 1.0):
@@ -131,7 +146,10 @@ def test_values_and_exceptions():
 
 
 def test_the_stencil_oracle_follows_the_definition():
-    """A closed side adds its coefficient to the diagonal; AIR adds nothing there."""
+    """Oracle of the stencil's definition.
+
+    A closed side adds its coefficient to the diagonal; AIR adds nothing there.
+    """
     coefficients = {
         (0, 0): np.full((1, 2), 20.0),
         (0, 1): np.array([[-1.0, -5.0]]),
@@ -161,7 +179,10 @@ def test_a_case_is_that_of_its_seed(kind):
 
 
 def test_planted_solutions_solve():
-    """What is planted meets the criterion, or verdicts on it would mean nothing."""
+    """Planted solutions that meet the criterion.
+
+    Otherwise verdicts on them are meaningless.
+    """
     rng, planted = np.random.default_rng(SEED), 0
     for kind in KINDS:
         for _ in range(8):

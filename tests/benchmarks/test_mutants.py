@@ -1,4 +1,7 @@
-"""Mutants: drawn by seed from all packages, one change each, that leaves code; tests by the name of what is changed."""
+"""Mutants: valid code with one change each, drawn by seed from all packages.
+
+Tests are chosen by the name of the changed code.
+"""
 
 import ast
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Peers: the same residual for all, the exchange with other interpreters, and what is said where one is missing."""
+"""Peers: equal residuals, exchange with other interpreters, missing libraries."""
 
 import json
 import sys
@@ -136,7 +136,7 @@ def test_exchange(stub):
     assert stub.ask({"method": "double", "x": 21}) == {"x": 42}
     with pytest.raises(PeerFailed, match="json: singular matrix"):
         stub.ask({"method": "fail"})
-    assert stub.ask({"method": "double", "x": 1}) == {"x": 2}  # it goes on after a failure
+    assert stub.ask({"method": "double", "x": 1}) == {"x": 2}  # it continues after a failure
     with pytest.raises(PeerFailed, match="ended with exit code 7"):
         stub.ask({"method": "end"})
     with pytest.raises(PeerFailed, match="ended with exit code 7"):
@@ -157,7 +157,7 @@ def test_a_missing_peer_tells_how_to_get_it(monkeypatch):
 
 
 def contest(question, errors):
-    """Return a contest of a peer whose answer is off by a share of the tolerance that it is asked for."""
+    """Return a contest of a peer whose error is a share of its tolerance."""
     x = dense_solution(question)
 
     def solve(asked, tolerance):
@@ -170,7 +170,7 @@ def contest(question, errors):
 
 def test_tolerances_are_tightened_until_the_residual_is_as_asked(question):
     x = dense_solution(question)
-    size = question.residual(2 * x)  # the residual that an error as large as x has
+    size = question.residual(2 * x)  # residual of an error as large as x
     exact, loose, hopeless, broken = (
         contest(question, e) for e in (0.5 / size, 20 / size, 1e9 / size, None)
     )

@@ -1,4 +1,4 @@
-"""The measured problems are what they say, and the assembled matrix is the operator."""
+"""Problems of the benchmarks, and their assembled matrix against the operator."""
 
 import numpy as np
 import pytest

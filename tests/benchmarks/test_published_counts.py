@@ -1,4 +1,7 @@
-"""Iteration counts of named methods against published ones; NumPy shows the reasons where they differ by more than two."""
+"""Iteration counts of named methods against published ones.
+
+Where they differ by more than two, NumPy shows the reason.
+"""
 
 import dataclasses
 import re
@@ -24,7 +27,7 @@ ROWS = [
 
 
 def documented(count):
-    """Return the counts found here, as the page has them, and the rest of the row."""
+    """Return the counts on the page, and the rest of the row."""
     pattern = re.escape(count.row(())).replace(re.escape("|  |"), r"\| ([\d., ]+) \|")
     found = re.search(f"^{pattern}$", PAGE, flags=re.M)
     assert found, count.row(())
@@ -36,7 +39,8 @@ def test_counts_are_the_published_ones(count):
     here = count.measure()
     off = [abs(a - b) for a, b in zip(here, count.printed, strict=True)]
     assert all(n > counts.WITHIN for n in off) if count.reason else max(off) <= counts.WITHIN, here
-    assert np.allclose(here, documented(count), rtol=0, atol=1.0)  # rounding may move the last step
+    # Rounding may change the last step.
+    assert np.allclose(here, documented(count), rtol=0, atol=1.0)
     assert count.method in wl.METHODS
 
 
@@ -45,18 +49,24 @@ def test_reasons_are_on_the_page():
 
 
 def test_active_sets_have_the_printed_sizes():
-    """Of deal.II's output: those after its iterations 0, 1, 17 and 18, and two norms."""
+    """Sizes of the active sets in deal.II's output.
+
+    They are those after its iterations 0, 1, 17 and 18; two norms are compared too.
+    """
     problem, _ = counts.stairs_problem()
     result = wl.solve(problem, counts.ACTIVE_SET, stopping=wl.StoppingCriteria(rtol=1e-9))
     sizes = [record.active for record in result.history[2:]]
     assert [*sizes[:2], *sizes[17:19]] == [13164, 12363, 5399, 5399]
     assert result.history[0].residual == pytest.approx(0.310059, abs=5e-7)
-    # the linear solves are inexact
+    # The linear solves are inexact.
     assert result.history[2].residual == pytest.approx(3.9373, rel=1e-3)
 
 
 def fischer_newton(A, b, lower, scale, tolerance):
-    """Full Newton steps on s (x - l) + y - sqrt(s^2 (x - l)^2 + y^2) with Armijo's search; returns their number."""
+    """Return the number of full Newton steps on the scaled Fischer-Burmeister map.
+
+    The map is s (x - l) + y - sqrt(s^2 (x - l)^2 + y^2), with Armijo's search.
+    """
     x = np.maximum(0.0, lower)
 
     def evaluate(x):
@@ -81,7 +91,10 @@ def fischer_newton(A, b, lower, scale, tolerance):
 
 
 def test_fischer_newton_takes_more_steps_as_its_map_is_scaled():
-    """PETSc's map has no scale; this library's default, by A's diagonal, takes two to three steps more."""
+    """Effect of the scale of the Fischer-Burmeister map on the number of steps.
+
+    PETSc's map has no scale. This library scales by A's diagonal and takes two to three steps more.
+    """
     unscaled, scaled, sizes = [], [], (17, 33, 65)
     for n in sizes:
         sparse = counts.hemisphere(n).sparse()
@@ -101,7 +114,10 @@ def test_fischer_newton_takes_more_steps_as_its_map_is_scaled():
 
 
 def semismooth(A, b, lower, x, tolerance):
-    """TAO's SSILS: full Newton steps on the Fischer-Burmeister map, not projected, until ||J'f|| has fallen; returns x and norms of f."""
+    """Return x and the norms of f by TAO's SSILS.
+
+    Full Newton steps on the Fischer-Burmeister map, not projected, until ||J'f|| is small.
+    """
     norms, first = [], None
     while True:
         a, y = x - lower, A @ x + b
@@ -121,7 +137,7 @@ def semismooth(A, b, lower, x, tolerance):
 
 
 def test_semismooth_steps_on_the_put_are_those_printed():
-    """The norms of the first solve, and the number of steps of all nine."""
+    """Norms of the first solve, and the number of steps of all nine."""
     A, payoff, right_side = counts.put_problem()
     V, steps = payoff, []
     for k in range(9):
@@ -136,7 +152,10 @@ def test_semismooth_steps_on_the_put_are_those_printed():
 
 
 def num4lcp(A, b):
-    """Fischer-Newton as in Num4LCP: kinks do not move, a projected search; returns the number of the test that ends it."""
+    """Return the number of the test that ends Num4LCP's Fischer-Newton method.
+
+    Kinks are not moved; the search is projected.
+    """
     x, before = np.zeros(len(b)), np.inf
 
     def evaluate(x):
@@ -183,7 +202,10 @@ def test_four_tangents_take_fewer_steps_than_printed():
 
 
 def largest_eigenvalue(A):
-    """PERMON's power method from 1: at most 50 products, or a relative change below 1e-4."""
+    """Return the largest eigenvalue by PERMON's power method from 1.
+
+    At most 50 products, or a relative change below 1e-4.
+    """
     v, found = np.ones(len(A)), 0.0
     for _ in range(50):
         product = A @ v
@@ -195,11 +217,14 @@ def largest_eigenvalue(A):
 
 
 def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=False):
-    """MPRGP after Dostal and Schoeberl with Gamma = 1, as in PERMON; returns steps of conjugate gradients, expansions, proportionings.
+    """Return the numbers of CG steps, expansions and proportionings of MPRGP.
+
+    After Dostal and Schoeberl with Gamma = 1, as in PERMON.
 
     diagonal: preconditioned by A's diagonal D on the free unknowns, with the reduced free gradient
     min(phi, D (x - l)) in the test for proportioning. half_step: expansions go to the first bound
-    and then a step of 2 / ||A|| along the free gradient; without, the whole step is projected.
+    and then take a step of 2 / ||A|| along the free gradient; otherwise the whole step is
+    projected.
     """
     x, taken = np.maximum(0.0, lower), [0, 0, 0]
     M = A.diagonal() if diagonal else np.ones(len(b))
@@ -235,7 +260,7 @@ def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=Fal
 
 
 def half_string_problem():
-    """PERMON's ex2.c: the string above a bound on its first half only."""
+    """Return PERMON's ex2.c: the string above a bound on its first half only."""
     A, b, lower, tolerance = counts.string_problem()
     return A, b, np.where(np.arange(len(b)) < 49, lower, -np.inf), tolerance
 
@@ -252,7 +277,7 @@ def half_string_problem():
     ],
 )
 def test_plain_projected_gradients_take_the_printed_steps(problem, settings, printed):
-    """Of each kind: conjugate gradients, expansions, proportionings."""
+    """Numbers of CG steps, expansions and proportionings."""
     assert projected_gradients(*problem(), **settings) == printed
 
 

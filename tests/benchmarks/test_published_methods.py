@@ -1,4 +1,7 @@
-"""The methods of the suite `published` find the same solution, in 3-D and in 2-D; the page has the kept figures."""
+"""Equal solutions of the methods of the suite `published`, in 3-D and 2-D.
+
+The page has the stored figures.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from warp_lcp.benchmarks.problems import natural, plane, splash
 @pytest.mark.parametrize("make", [splash, plane])
 @pytest.mark.parametrize("entry", published.ENTRIES[:7], ids=lambda entry: entry.label)
 def test_published_methods_solve_the_splash(entry, make):
-    """The residual min(p, A p + b) is computed by no code of the solvers."""
+    """Residual min(p, A p + b), computed without code of the solvers."""
     scene = make(16)
     problem = wl.LCP(entry.operator(scene.cells, device="cpu"), scene.b, scene.lower("everywhere"))
     result = wl.solve(problem, entry.solver, stopping=wl.StoppingCriteria(rtol=1e-6))
@@ -25,7 +28,11 @@ def test_published_methods_solve_the_splash(entry, make):
 
 
 def test_cycles_without_coarse_levels_on_the_active_set_need_no_other_steps():
-    """Their number grows as a contact's boundary moves by a few layers of cells a step; projected cycles move it at once."""
+    """Number of cycles without coarse levels on the active set.
+
+    The boundary of a contact moves by a few layers of cells per step, so that their number grows;
+    projected cycles move it at once.
+    """
     scene = plane(128)
     counts = {}
     for method in (published.TruncatedMultigrid(monotone_cycles=0), wl.ProjectedMultigrid()):

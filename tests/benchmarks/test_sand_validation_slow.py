@@ -1,4 +1,7 @@
-"""What the checks of sand measure at more than the suite's resolutions: the suite itself runs in `test_validation_slow`."""
+"""Checks of sand at more resolutions than those of the suite.
+
+The suite itself runs in `test_validation_slow`.
+"""
 
 import pytest
 
@@ -14,7 +17,11 @@ def test_the_runout_hardly_depends_on_the_grid(aspect: float) -> None:
 
 @pytest.mark.slow
 def test_sand_runs_out_alike_on_a_finer_grid() -> None:
-    """A slot of 8 cells and one of 16 half as large: the law's delta, of a cell or so, is all that is between them."""
+    """Discharge of sand at two resolutions.
+
+    Slots of 8 cells and of 16 cells of half the size differ only by the law's delta, of about a
+    cell.
+    """
     coarse, fine = (sand_hourglass.sand(8 * n, n) for n in (1, 2))
     root = [float(d.rate.mean()) ** (2.0 / 3.0) for d in (coarse, fine)]
     # (16 - delta) / (16 - 2 delta) for delta from 0 to 2 cells

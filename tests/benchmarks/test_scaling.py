@@ -1,4 +1,4 @@
-"""The suite `scaling`: what fits, what grows how, and how far each precision gets."""
+"""Suite `scaling`: sizes that fit, growth, and the accuracy of each precision."""
 
 import json
 
@@ -29,9 +29,10 @@ def test_sizes_stop_where_memory_ends(monkeypatch):
     assert sizes == [32, 64]
     assert left_out == {128: "128^3 needs about 0.1 GiB on cuda:0, where 0.0 GiB are free"}
     free |= {"cuda:0": 1 << 50, "cpu": 100 * 64**3}
-    # the scene is made in the host's memory
+    # The scene is made in host memory.
     assert scaling.fitting([32, 64, 128], "cuda:0")[0] == [32, 64]
-    assert scaling.fitting([32, 64], "cpu")[0] == [32]  # which holds both, on the CPU
+    # On the CPU its memory holds scene and solve.
+    assert scaling.fitting([32, 64], "cpu")[0] == [32]
     monkeypatch.setattr(scaling, "free_memory", lambda device: None)
     assert scaling.fitting([1024], "cpu") == ([1024], {})
 
@@ -76,7 +77,7 @@ def test_scaling(tmp_path):
     assert (growth["from"], growth["to"]) == (16, 24)
     assert growth["figures"]["exponent_to_1e-06"]["samples"] == 2
     text = (tmp_path / "scaling.md").read_text()
-    # too small to be judged
+    # Too small to be judged.
     assert (
         "| exponent of the seconds to 1e-6, linear, 16^3 to 24^3 | <= 1.05 | not measured here |  |"
         in text
@@ -136,5 +137,5 @@ def test_the_residual_is_that_of_the_matrix(bounds):
     )
     solved = np.zeros(x.shape)
     solved[fluid] = scipy.sparse.linalg.spsolve(scene.matrix().tocsc(), -scene.b[fluid])
-    # a wrong sign is seen
+    # A wrong sign is detected.
     assert norm(solved, "linear") < 1e-12 * norm(0.0 * x, "linear") < norm(-solved, "linear")

@@ -1,4 +1,4 @@
-"""The suite of sparse matrices: its problems are what they say they are, all are solved, and PyAMG answers."""
+"""Suite of sparse matrices: properties of its problems, solutions, PyAMG."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_problems_of_a_kind(kind):
     assert np.abs(np.subtract(*A.nonzero())).mean() > 0.2 * A.shape[0]
     if made.near_null_space is not None:
         products = np.abs(A @ made.near_null_space).max(axis=1) / d
-        assert np.median(products) < 1e-13  # nodes beside the held side feel it
+        assert np.median(products) < 1e-13  # nodes beside the held side differ
     seconds, result = sparse.ours(made, "cpu")
     assert seconds > 0
     assert result

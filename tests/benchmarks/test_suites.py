@@ -90,7 +90,7 @@ def test_solvers(tmp_path):
         == records["fluid 12^3: psor"]["status"]
         == "CONVERGED"
     )
-    # which takes symmetric matrices only
+    # The method needs symmetric matrices.
     assert "contacts of 12 bodies: incremental-pivoting" not in records
     again = call("solvers", "--compare", tmp_path / "solvers.json", tmp_path / "solvers.json")
     assert again.exit_code == 0

@@ -1,4 +1,4 @@
-"""What accuracy costs: the settings, the Pareto front, and small suites."""
+"""Suite `tradeoff`: settings, Pareto front, and small runs."""
 
 import json
 from pathlib import Path
@@ -81,7 +81,7 @@ def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
         assert run.bytes > 16 * 8 * 50  # fields of the grid alone
     far, near = runs.figures(long), runs.figures(short)
     assert far["distance"].value > near["distance"].value > 0.0
-    assert near["distance_to_finest"].value > near["distance"].value  # the grid's own error
+    assert near["distance_to_finest"].value > near["distance"].value  # error of the grid itself
     assert far["steps"].value < near["steps"].value
     refused = runs.measure([Setting("c", ("time.cfl=1", "liquid.0.max=[9.0]"))])[0]
     assert refused.trial is None
@@ -120,7 +120,7 @@ def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> No
         )
         curves.setdefault((r["method"], r["precision"]), []).append(r["figures"]["error"]["value"])
     for errors in curves.values():
-        # sand is known to 2e-4 at once
+        # Sand is accurate to 2e-4 at once.
         assert errors[-1] < (0.1 if scene.startswith("dam") else 0.5) * errors[0]
     if scene.startswith("dam"):
         assert records[f"{scene} solve reference"]["figures"]["residual"]["value"] < 1e-11

@@ -1,4 +1,7 @@
-"""Random problems that no method was tuned on: the default method solves them within its iterations, the judge catches what is wrong."""
+"""Random problems on which no method was tuned.
+
+The default method solves them within its iterations; the judge catches faults.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -18,15 +21,15 @@ from warp_lcp.benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenC
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.suite import EXTREMES, SOLVERS
 
-SEEDS = (4217, 4218)  # of the second b changes, too
+SEEDS = (4217, 4218)  # b of the second changes, too
 MORE = range(4300, 4315)
-# of which methods take little time
+# Kinds that take little time with each method.
 FEW = ("handful", "rows", "cut-cells", "shifted", "linear-program", "skew")
 MUTATED = ("degenerate", "rough", "bearing", "shifted", "triangles", "elastic")
 
 
 def faults(cases: Iterable[UnseenCase | EveryMethodCase]) -> list[str]:
-    """What is not as it must be, a line each."""
+    """Return a line for each failure."""
     verdicts = [judge(c, "mixed", "cpu") for c in cases]
     assert verdicts
     return [f"{v.name}: {v.outcome}" for v in verdicts if v.wrong]
@@ -34,7 +37,11 @@ def faults(cases: Iterable[UnseenCase | EveryMethodCase]) -> list[str]:
 
 @pytest.mark.parametrize("kind", unseen.KINDS)
 def test_default_method(kind):
-    """At most 3 e + 6 iterations where equations take e, warm at most 2 c + 6 where cold takes c; honest where the matrix is hard."""
+    """Iteration limits of the default method on each kind.
+
+    At most 3 e + 6 iterations where equations take e; warm at most 2 c + 6 where cold takes c; an
+    honest status where the matrix is hard.
+    """
     assert faults(UnseenCase(kind, seed) for seed in SEEDS) == []
 
 
@@ -85,7 +92,7 @@ def test_problems_are_well_posed(kind):
 
 
 def test_small_grids_have_a_solution_by_enumeration():
-    """What `solvable` promises, found by trying every active set."""
+    """Existence of solutions that `solvable` promises, by enumeration of active sets."""
     found = 0
     for seed in range(5200, 5260):
         exact = unseen.problem("handful", seed, small=True).problem.exact()
@@ -104,11 +111,12 @@ def test_no_problem_is_lost_and_none_is_changed_without_need():
     cells = np.array([[FLUID, FLUID, SOLID, FLUID, FLUID, AIR]])
     made = GridProblem(cells=cells, b=np.array([[-1.0, -3.0, 9.0, -5.0, -7.0, 9.0]]))
     moved = solvable(made)
-    # inflow without an upper bound has no solution
+    # Inflow without an upper bound has no solution.
     assert moved.b[0, :2].sum() == pytest.approx(0.01 * 4)
     np.testing.assert_array_equal(moved.b[0, 2:], [0, -5, -7, 0])
     outflow = replace(made, b=-made.b)
-    np.testing.assert_array_equal(solvable(outflow).b[0, :2], [1, 3])  # x >= 0 takes it up
+    # The bound x >= 0 balances it.
+    np.testing.assert_array_equal(solvable(outflow).b[0, :2], [1, 3])
     assert solvable(replace(outflow, lower=-np.inf)).b[0, :2].sum() == pytest.approx(0.0, abs=1e-14)
     assert solvable(replace(made, lower=-np.inf, upper=2.0)).b[0, :2].sum() == -4
     assert equality(outflow) is None
@@ -200,7 +208,11 @@ def test_many_warm_starts_that_lose_a_little_are_caught():
 
 
 def test_a_warm_start_is_judged_by_iterations_on_the_finest_grid():
-    """50 cycles warm against 20 cycles and 7 Newton steps cold: the latter are 64 iterations, and take five times as long."""
+    """Judgement of warm starts by iterations on the finest grid.
+
+    50 warm cycles against 20 cycles and 7 Newton steps cold: the latter are 64 iterations and take
+    five times as long.
+    """
     verdict = judge(UnseenCase("lognormal", 1455629052), "mixed", "cpu")
     assert verdict.wrong == []
     assert verdict.attempt.facts["warm"] <= verdict.attempt.facts["cold"]
@@ -240,7 +252,7 @@ def test_a_method_that_breaks_is_caught():
 
 
 def verdict(kind, iterations, equations, *, status="CONVERGED"):
-    """What the judge would say of a grid."""
+    """Return the judge's verdict on a grid."""
     facts = {
         "kind": kind,
         "seed": 5,
@@ -278,12 +290,12 @@ def test_records_name_kind_and_seed(monkeypatch, tmp_path):
     counted = {r.name: r.value("attempts") for r in results.records}
     assert (counted["unseen"], counted["unseen, every method"]) == (judging.GRIDS_A_KIND, 1)
     assert results.tables[1].title == "Unseen problems"
-    assert results.tables[2].rows == []  # random problems have rows where something is wrong
+    assert results.tables[2].rows == []  # random problems have rows only for failures
     monkeypatch.setattr(judging, "limit", lambda equations, of, allowance: 0.0)
     results = extremes.measure(Options("cpu", (), 1, said.append, seed=4217), tmp_path)
     assert [row[1] for row in results.tables[2].rows][:2] == ["handful 4217", "handful 4218"]
     monkeypatch.setattr(unseen, "KINDS", {})
-    # draws a seed where none is given
+    # Draws a seed if none is given.
     extremes.measure(Options("cpu", (), 1, said.append), tmp_path)
 
 

@@ -1,4 +1,7 @@
-"""What the checks of the suite `validation` compute, on signals and particles whose answers are known; and the cheapest checks."""
+"""Computations of the suite `validation` on known signals and particles.
+
+And the cheapest checks.
+"""
 
 import json
 import math
@@ -133,10 +136,14 @@ def test_the_front_is_the_far_edge_of_the_last_floor_cell_half_full() -> None:
 
 
 def test_an_even_front_is_found_between_the_cells() -> None:
-    """The stair of an even advance lies half a cell ahead where it begins, half a cell behind where it ends: in the middle it is right."""
+    """Place of an evenly moving front between the cells.
+
+    The staircase of an even advance lies half a cell ahead where it begins and half a cell behind
+    where it ends; in the middle it is exact.
+    """
     t = np.linspace(0.0, 5.0, 501)
-    places = np.floor(2.0 * t + 0.5)  # a front at 2 t, as known to the cell
-    # one that falls back is forgotten
+    places = np.floor(2.0 * t + 0.5)  # a front at 2 t, resolved to a cell
+    # A front that falls back is ignored.
     middle, at = signals.stays(t, np.where(t > 4.0, 3.0, places))
     assert np.array_equal(at, np.arange(8))
     assert middle[1:] == pytest.approx(at[1:] / 2.0, abs=0.01)
@@ -175,7 +182,11 @@ def test_the_kernel_of_the_density_is_a_quadratic_spline() -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0])
 def test_the_volume_inside_a_surface_is_that_of_the_half_space(degrees: float) -> None:
-    """Nothing like particles x their volume: squeezed to 80 % of their distance, they enclose less."""
+    """Volume inside a surface: that of the half space.
+
+    It is not the number of particles times their volume: squeezed to 80 % of their distance, they
+    enclose less.
+    """
     n, m = 20, 8
     x, y = (
         a.ravel() for a in np.meshgrid((np.arange(n * m) + 0.5) / m, (np.arange(n * m) + 0.5) / m)
@@ -207,7 +218,11 @@ def test_the_bias_of_a_pressure() -> None:
 
 
 def test_angular_momentum_is_that_of_the_grid_around_the_particles() -> None:
-    """A rigid rotation has |x|^2 of each tent's nodes, not of the particles: that difference is the affine part."""
+    """Angular momentum on the grid around the particles.
+
+    A rigid rotation has |x|^2 of the nodes of each tent function, not of the particles. The
+    difference is the affine part.
+    """
     c = transfers.cloud(16, "float64", affine=True)
     expected = c.angular_momentum()
     c.round_trip()
@@ -215,7 +230,7 @@ def test_angular_momentum_is_that_of_the_grid_around_the_particles() -> None:
     j, i = np.meshgrid(np.arange(18), np.arange(18), indexing="ij")
     for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
         momentum = (field.numpy() * weight.numpy())[1]
-        # the coordinate across the component: x for v, y for u
+        # The coordinate across the component: x for v, y for u.
         arm = (i - 0.5 if axis else j - 0.5) / 16
         total += (1 if axis else -1) * float((arm * momentum).sum())
     assert total == pytest.approx(expected, rel=1e-12)

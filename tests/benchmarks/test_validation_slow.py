@@ -1,10 +1,10 @@
-"""Every check of the suite `validation`, as `warp-lcp bench validation` runs it."""
+"""All checks of the suite `validation`, as `warp-lcp bench validation` runs them."""
 
 import pytest
 
 from warp_lcp.benchmarks.validation import CHECKS
 
-ALWAYS = {"rest", "sand hourglass"}  # the others come close enough to hold on some machines
+ALWAYS = {"rest", "sand hourglass"}  # the others fail on some machines, by little
 UNMET = {
     name: pytest.mark.xfail(strict=name in ALWAYS, reason=check.known)
     for name, check in CHECKS.items()

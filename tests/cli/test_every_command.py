@@ -1,4 +1,7 @@
-"""Every command on every scene: on built-in ones, and on drawn ones that have every table, every shape, many sizes."""
+"""Every command on every scene.
+
+On built-in scenes, and on random ones that have every table, every shape and many sizes.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +30,13 @@ CELLS = {
     "river": 256,
     "waterfall": 32,
     "wave-maker": 30,
-}  # along the longest side, where 24 and 12 do not fit
-# of ten seeds liquid and sand have each size once, of twenty in 2-D and in 3-D
+}  # along the longest side, where 24 and 12 are too small
+# In ten seeds liquid and sand have each size once, in twenty in 2-D and in 3-D.
 FEW, MORE = range(20), range(20, 100)
 
 
 def done(*arguments: object) -> str:
-    """Return what a command says that ends well."""
+    """Return the output of a command that succeeds."""
     result = CliRunner().invoke(commands.app, [str(argument) for argument in arguments])
     assert result.exit_code == 0, f"{arguments}: {result.stderr}\n{result.exception!r}"
     return result.stdout
@@ -45,7 +48,7 @@ def small(name: str) -> str:
 
 
 def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
-    """Run every command on a scene and on its run folder, except those that open a window."""
+    """Run every command without a window on a scene and on its run folder."""
     out, problems = tmp_path / "out", tmp_path / "problems"
     sets = [word for override in overrides for word in ("--set", override)]
     loaded = load_scene(str(scene))
@@ -71,7 +74,7 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     assert "3 frames" in done("export", out, "--out", tmp_path / "run.usda")
     done("serve", out, "--port", 0)
     if recorded:
-        # a thread thinner than a cell has none
+        # A thread thinner than a cell has none.
         for problem in sorted(problems.glob("problem_*.npz"))[-1:]:
             done("solve", problem)
         done(
@@ -96,7 +99,7 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
 
 @pytest.fixture
 def nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End the server of the live page at once."""
+    """Stop the server of the live page at once."""
 
     def end(server: Any) -> None:
         raise KeyboardInterrupt
@@ -145,7 +148,7 @@ def test_every_command_on_every_built_in_scene(
 
 
 def test_drawn_scenes_have_every_table_shape_and_motion() -> None:
-    """A table that scenes get is one that the commands above must meet."""
+    """Tables of random scenes: each is one that the commands above meet."""
     drawn = [scene_of_every_table(seed) for seed in FEW]
     for simulator in ("fluids", "granular"):
         mine = [data for data in drawn if data["scene"]["simulator"] == simulator]

@@ -1,4 +1,7 @@
-"""Matrix Market files: what SciPy writes is read, and what harms SciPy's reader is refused."""
+"""Matrix Market files: SciPy's output, and files that crash SciPy's reader.
+
+The latter are refused.
+"""
 
 import bz2
 import gzip
@@ -73,7 +76,7 @@ def test_packed_files(tmp_path, suffix, pack):
         (REAL + b"\n" * 100_000, "must begin with %%MatrixMarket"),
         (REAL + b"2 2\n1 1\n", "the line with its size does not fit its form"),
         (REAL + b"1" + b"0" * 30 + b" 4 1\n1 1 1\n", "must begin"),
-        # these end SciPy 1.17 with a segmentation fault
+        # These crash SciPy 1.17 with a segmentation fault.
         (REAL + b"2 2 1\n1 1 1.9[[[[[", "an entry that is not a number"),
         (REAL + b"2 2 2\n1 1 1.5\n2 2 1\x00.5\n", "an entry that is not a number"),
         (REAL + b"2 2 2\n1 1 1.5\n2 ", "these take 11 bytes, and the file has 10"),
@@ -117,7 +120,7 @@ def test_the_shape_is_read_alone(tmp_path):
     path = tmp_path / "a.mtx"
     path.write_bytes(REAL + b"% " + b"long" * 40_000 + b"\n7 9 1\n" + b"no numbers")
     assert read_shape(path, lambda rows, columns: True, "") == (7, 9)
-    # the first bytes end in the size
+    # The first block ends within the size.
     cut = REAL + b"%" + b"x" * (HEAD - len(REAL) - len("%\n70")) + b"\n70"
     path.write_bytes(cut + b"0 900 1\n1 1 1\n")
     assert len(cut) == HEAD

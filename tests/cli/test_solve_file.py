@@ -1,4 +1,4 @@
-"""`warp-lcp solve`: Matrix Market files in, a table and x out, exit codes and messages."""
+"""`warp-lcp solve` on Matrix Market files: output, exit codes and messages."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def call(*arguments: object) -> Result:
 
 @pytest.fixture
 def problem(tmp_path):
-    """A 5-point stencil and a wave."""
+    """Write a problem: a 5-point stencil and a wave."""
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(6, 6))
     A = (
         scipy.sparse.kron(T, scipy.sparse.eye_array(6))
@@ -35,7 +35,7 @@ def problem(tmp_path):
 
 
 def write(path: Path, array) -> Path:
-    """Write as Matrix Market; vectors as one column."""
+    """Write an array as Matrix Market; vectors as one column."""
     scipy.io.mmwrite(
         path,
         array
@@ -125,7 +125,7 @@ def test_1e20_is_infinite_in_files(infinity, tmp_path):
 
 
 def test_the_files_symmetry_is_understood(problem, tmp_path):
-    """A symmetric file holds one triangle only."""
+    """Symmetric files, which hold one triangle only."""
     A, _ = problem
     scipy.io.mmwrite(tmp_path / "half.mtx", A, symmetry="symmetric")
     whole, half = (
@@ -151,7 +151,7 @@ def test_a_solve_that_fails_exits_with_1(problem, tmp_path):
     assert result.exit_code == 1
     assert result.stderr.startswith("MAX_ITERATIONS: ")
     assert "3 iterations, residual " in result.stderr
-    assert np.isfinite(scipy.io.mmread(out)).all()  # the best there is
+    assert np.isfinite(scipy.io.mmread(out)).all()  # the best iterate
 
 
 def test_a_solve_ends_in_time(problem, tmp_path):
@@ -269,7 +269,7 @@ def test_wrong_input_exits_with_2(problem, tmp_path, monkeypatch, arguments, exp
         "coordinate integer symmetric\n2 2 3\n1 1 2\n2 1 -1\n2 2 2\n",
         "array real symmetric\n2 2\n2.0\n-1.0\n2.0\n",
         "array integer general\n2 2\n2\n-1\n-1\n2\n",
-        # entries given twice are summed
+        # Repeated entries are summed.
         "coordinate real general\n2 2 5\n1 1 1.5\n1 1 0.5\n1 2 -1\n2 1 -1\n2 2 2\n",
     ],
 )
@@ -277,7 +277,10 @@ def test_wrong_input_exits_with_2(problem, tmp_path, monkeypatch, arguments, exp
     "right_side", ["array integer general\n2 1\n1\n-5\n", "array real general\n1 2\n1.0\n-5.0\n"]
 )
 def test_all_forms_of_a_file_mean_the_same(text, right_side, tmp_path):
-    """2 x1 - x2 + 1 and -x1 + 2 x2 - 5 vanish at x = (1, 3)."""
+    """Equivalent forms of a file.
+
+    2 x1 - x2 + 1 and -x1 + 2 x2 - 5 vanish at x = (1, 3).
+    """
     for name, content in (("A.mtx", text), ("b.mtx", right_side)):
         (tmp_path / name).write_text(f"%%MatrixMarket matrix {content}")
     result = call(
@@ -289,7 +292,7 @@ def test_all_forms_of_a_file_mean_the_same(text, right_side, tmp_path):
 
 @pytest.fixture
 def recorded_problem(tmp_path):
-    """A splash as a run records it."""
+    """Return a splash recorded by a run."""
     scene = cut_cells(splash(10))
     fields = {
         "cells": scene.cells,
@@ -320,7 +323,7 @@ def test_a_recorded_problem(recorded_problem, tmp_path):
     x, lower = np.load(out), np.where(recorded_problem.wall, 0.0, -np.inf)
     y = recorded_problem.matrix() @ x[fluid] + recorded_problem.b[fluid]
     assert np.abs(np.minimum(x[fluid] - lower[fluid], y)).max() < 1e-6
-    # some walls are let go of
+    # The liquid separates from some walls.
     assert 0 < (x[fluid][np.isfinite(lower[fluid])] == 0.0).sum() < np.isfinite(lower).sum()
     assert (x[~fluid] == 0.0).all()
     by_psor = call(file, "--method", "psor", "--out", out, "--max-iterations", 5)

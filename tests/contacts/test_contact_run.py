@@ -1,4 +1,4 @@
-"""Runs of rigid bodies alone: what stands, stands; energy does not grow; a run goes on bit for bit; every method says what it left."""
+"""Runs of rigid bodies alone: stability, energy, resuming, reported residuals."""
 
 import csv
 from pathlib import Path
@@ -68,7 +68,11 @@ def places(simulation: ContactSimulation) -> np.ndarray:
     "name", ["box-stack", "heavy-on-light", "leaning-wall", "sphere-stack", "wall"]
 )
 def test_what_stands_in_the_book_stands(name: str) -> None:
-    """After a second no body has moved by a hundredth of a side, and the residual is that of the scene."""
+    """Stability of the book's stacks.
+
+    After a second no body has moved by a hundredth of a side, and the residual is that of the
+    scene.
+    """
     simulation = made(built_in(name))
     before, residuals = places(simulation), []
     for _ in range(100):
@@ -80,7 +84,10 @@ def test_what_stands_in_the_book_stands(name: str) -> None:
 
 
 def test_bodies_slide_down_a_slope_as_friction_lets_them() -> None:
-    """Below tan(0.3) of friction by g (sin - mu cos) t^2 / 2 along the slope, above it not at all."""
+    """Sliding of bodies down a slope with friction.
+
+    Below tan(0.3) they slide by g (sin - mu cos) t^2 / 2 along the slope, above it not at all.
+    """
     simulation = made(built_in("incline"))
     before, steps, dt = places(simulation), 60, 0.01
     for _ in range(steps):
@@ -114,7 +121,10 @@ def test_a_body_falls_as_a_stone_does_and_hits_the_floor() -> None:
 
 @pytest.mark.parametrize("method", [DEFAULT, "psor", "lemke", "proximal-gauss-seidel"])
 def test_energy_does_not_grow_without_restitution(method: str) -> None:
-    """Bodies fall on each other, tilted and turning: kinetic and potential energy together never grow."""
+    """Energy of bodies that fall on each other, tilted and turning.
+
+    The sum of kinetic and potential energy never grows.
+    """
     turned = {
         "rotate": [20.0, 10.0, 30.0],
         "about": [1.4, 1.95, 1.25],
@@ -131,7 +141,7 @@ def test_energy_does_not_grow_without_restitution(method: str) -> None:
 
 
 def test_a_ball_bounces_as_its_restitution_says() -> None:
-    """After a fall by h it comes up by e^2 h."""
+    """Bounce of a ball after a fall by h: it rises by e^2 h."""
     ball = {
         "shape": "sphere",
         "center": [1.5, 1.25, 1.5],
@@ -148,7 +158,10 @@ def test_a_ball_bounces_as_its_restitution_says() -> None:
 
 @pytest.mark.parametrize("method", [DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE])
 def test_every_method_says_what_it_left(method: str) -> None:
-    """Three boxes rest by any method; the log has its name, status, iterations and residual."""
+    """Reported status of every method on three boxes at rest.
+
+    The log has its name, status, iterations and residual.
+    """
     scene = loaded(
         *(box(1.0 + 0.01 * n, SIDE * n) for n in range(3)),
         solver={"method": method, "tolerance": 1e-3},
@@ -177,7 +190,10 @@ def test_the_log_says_when_a_method_falls_short() -> None:
 
 
 def test_a_body_that_slides_along_a_diagonal_is_braked_by_mu_g() -> None:
-    """The circular cone brakes by mu g in every direction; the four sides of a pyramid, or boxes, need not."""
+    """Friction of a body that slides along a diagonal: mu g.
+
+    The circular cone brakes so in every direction; pyramids of four sides, or boxes, need not.
+    """
     speed, mu, steps, dt = 1.0, 0.4, 15, 0.01
     way = np.array([np.cos(0.6), 0.0, np.sin(0.6)])
     scene = loaded(
@@ -188,7 +204,7 @@ def test_a_body_that_slides_along_a_diagonal_is_braked_by_mu_g() -> None:
     for _ in range(steps):
         simulation.step(dt)
     velocity = simulation.bodies.bodies[0].velocity
-    braked = mu * 9.81 * (steps - 0.5) * dt  # the first step's gravity acts for half of it
+    braked = mu * 9.81 * (steps - 0.5) * dt  # gravity of the first step acts for half of it
     np.testing.assert_allclose(velocity, (speed - braked) * way, atol=1e-5)
 
 
@@ -229,7 +245,11 @@ def done(*arguments: object) -> str:
 
 
 def test_the_commands(tmp_path: Path) -> None:
-    """A run that was continued has the same log and frames as one in one go; frames are read by others; images are drawn."""
+    """Commands on a run of contacts.
+
+    A resumed run has the same log and frames as an uninterrupted one. Other programs read the
+    frames, and images are drawn.
+    """
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert "box-stack" in done("check", "box-stack", "--device", "cpu")
     done("run", "box-stack", "--device", "cpu", "--out", whole, "--frames", 4)

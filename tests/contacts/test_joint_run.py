@@ -1,4 +1,7 @@
-"""Scenes with joints and with targets: snakes, motors, gears; arms that reach; what is refused; resuming; frames and images."""
+"""Scenes with joints and targets.
+
+The tests cover snakes, motors, gears and reaching arms, refusals, resuming, frames and images.
+"""
 
 import csv
 from pathlib import Path
@@ -38,7 +41,7 @@ def hinge(*solids: int, at: float, **more: Any) -> dict[str, Any]:
 
 
 def tables(joints: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
-    """Return a scene of two bars and a post that stands."""
+    """Return a scene of two bars and a fixed post."""
     post = {"shape": "box", "min": [0.2, 0.0, 0.8], "max": [0.5, 2.0, 1.2]}
     time = {"duration": 1.0, "frames_per_second": 10, "dt_max": 0.01}
     own = {
@@ -70,7 +73,11 @@ def made(scene: ContactScene) -> Any:
 
 
 def test_a_chain_falls_and_stays_together() -> None:
-    """Its limit holds, and energy does not grow, but for what swings of second order in the step do: 3e-4 of the energy of motion."""
+    """Fall of a chain.
+
+    Its limit holds. Energy does not grow, except for oscillations of second order in the step: 3e-4
+    of the kinetic energy.
+    """
     scene = loaded(tables(JOINTS, solver={"tolerance": 1e-6}))
     assert scene.solver.method == JOINTED
     simulation, energies = made(scene), []
@@ -88,7 +95,10 @@ def test_a_chain_falls_and_stays_together() -> None:
 
 
 def test_a_scene_in_the_plane() -> None:
-    """Two bars on hinges fall as two that are fixed to each other where the second's limits are 0."""
+    """Planar scene of two bars on hinges.
+
+    They fall as if fixed to each other where the limits of the second are 0.
+    """
     solids = [
         {
             "shape": "box",
@@ -126,7 +136,10 @@ def test_a_run_goes_on_bit_for_bit_after_every_step(more: dict[str, Any]) -> Non
 
 @pytest.mark.parametrize("method", KINEMATIC)
 def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
-    """Within the limits and at the point that SciPy's bounded least squares finds; anchors stay together."""
+    """Reach of an arm within its joint limits.
+
+    It reaches the point that SciPy's bounded least squares finds; anchors stay together.
+    """
     simulation = made(
         loaded(tables(JOINTS, target=[REACH], solver={"method": method, "tolerance": 1e-6}))
     )
@@ -149,7 +162,7 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
         return at - goal
 
     limit = np.radians(20.0)
-    start = [1.0, 0.1 * np.sign(row["joint1_angle"])]  # the elbow bends either way
+    start = [1.0, 0.1 * np.sign(row["joint1_angle"])]  # the elbow may bend either way
     best = scipy.optimize.least_squares(
         off, start, bounds=([-np.inf, -limit], [np.inf, limit]), xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
@@ -238,7 +251,11 @@ def done(*arguments: object) -> str:
 
 @pytest.mark.parametrize("name", ["gear-pyramid", "gears", "motor-arm", "reach", "snake"])
 def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
-    """meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists them."""
+    """Frames of built-in scenes.
+
+    meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists
+    them.
+    """
     assert "joints" in done("check", name, "--device", "cpu")
     assert name in done("scenes")
     done("run", name, "--device", "cpu", "--out", tmp_path / "run", "--frames", 1)
@@ -257,7 +274,10 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("limit", [2.0, 60.0])
 def test_an_arch_is_held_up_by_the_limits_of_its_hinges(limit: float) -> None:
-    """It sags until six of them have reached them, then stands. Loose hinges let it fall."""
+    """Arch held up by the limits of its hinges.
+
+    It sags until six of them reach their limits, then stands. Loose hinges let it fall.
+    """
     scene = loaded("arched-snake")
     simulation = made(
         scene.model_copy(
@@ -278,7 +298,11 @@ def test_an_arch_is_held_up_by_the_limits_of_its_hinges(limit: float) -> None:
 
 @pytest.mark.slow
 def test_a_pyramid_of_gears_settles_between_its_posts() -> None:
-    """At rest, row on row, and as symmetric as it began: gears of a row push outward, those of the middle stay there."""
+    """Pyramid of gears between its posts.
+
+    It comes to rest, row on row, as symmetric as at the start. Gears of a row push outward; those
+    of the middle stay there.
+    """
     simulation = made(loaded("gear-pyramid"))
     for _ in range(60):
         row = simulation.step(0.01)
@@ -290,7 +314,11 @@ def test_a_pyramid_of_gears_settles_between_its_posts() -> None:
 
 @pytest.mark.slow
 def test_a_gear_turns_one_with_twice_its_teeth_half_as_fast() -> None:
-    """No tooth is skipped: the difference stays within the play between teeth, a third of their distance of 30 degrees."""
+    """Gear with half the teeth of the other, at twice its speed.
+
+    No tooth is skipped: the difference stays within the play between teeth, a third of their
+    distance of 30 degrees.
+    """
     scene = loaded("gears")
     simulation, turned = made(scene), np.zeros(2)
     before = np.zeros(2)

@@ -1,4 +1,7 @@
-"""Programs on ranks: tests here start them by mpiexec, and are skipped where MPI or PETSc is missing."""
+"""Fixtures that start programs on ranks by mpiexec.
+
+Tests are skipped where MPI or PETSc is missing.
+"""
 
 import subprocess
 import textwrap
@@ -7,23 +10,25 @@ import pytest
 
 from warp_lcp.distributed import launch
 
-SECONDS = 240.0  # a run that takes longer hangs; the first one compiles kernels
+SECONDS = 240.0  # limit of a run that may hang; the first one compiles kernels
 
 launch.find_petsc()
 
 
 @pytest.fixture
 def mpi(tmp_path):
-    """Run this interpreter on n ranks: `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with a program's text.
+    """Run this interpreter on n ranks.
 
-    Text is what has a line break in it; it is written into a file in `tmp_path`, which is the
+    `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with the text of a program.
+
+    A text has a line break. It is written into a file in `tmp_path`, which is the
     working folder of all runs.
 
     Args:
-        n: ranks.
-        arguments: of the interpreter, any type that `str` turns into text; or a program and its
-            arguments.
-        exit_code: what the run must end with; None for anything.
+        n: number of ranks.
+        arguments: arguments of the interpreter, of any type that `str` converts; or a program
+            and its arguments.
+        exit_code: required exit code; None for any.
         seconds: time limit.
         environment: variables to add.
 
@@ -53,7 +58,7 @@ def mpi(tmp_path):
         try:
             out, errors = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
-            process.terminate()  # mpiexec ends its ranks then
+            process.terminate()  # mpiexec then ends its ranks
             try:
                 out, errors = process.communicate(timeout=10.0)
             except subprocess.TimeoutExpired:

@@ -1,8 +1,9 @@
-"""The command line with a simulator of falling dots that several ranks share, NumPy only, and willing to fail on request.
+"""Command line with a simulator of falling dots on several ranks.
 
-Several commands may follow each other, with `then` between them; their exit codes go to the error
-stream, the last one's is the program's. A command may begin with DOTS_TROUBLE="step rank kind",
-what goes wrong, see `trouble`, and DOTS_REFUSE, why there is no simulation.
+NumPy only, with failures on request. Several commands may follow each other, with `then` between
+them. Their exit codes go to the error stream; that of the last is the program's. A command may
+begin with DOTS_TROUBLE="step rank kind", the failure (see `trouble`), and DOTS_REFUSE, the reason
+why there is no simulation.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ COUNT, CELLS = 200, 8
 
 
 class Dots:
-    """Dots that fall, bounce and drift; a rank has those in its columns of cells."""
+    """Dots that fall, bounce and drift; a rank owns those in its columns of cells."""
 
     def __init__(self, scene: Scene, ranks: Ranks) -> None:
         self.ranks, self.time, self.step_count = ranks, 0.0, 0
@@ -121,7 +122,7 @@ class Dots:
 
 
 class DotsSimulator:
-    """The plug-in."""
+    """Plug-in of the simulator."""
 
     name = "dots"
     summary = "dots that fall, on ranks too"
@@ -138,7 +139,7 @@ class DotsSimulator:
 
 
 def trouble(dots: Dots) -> None:
-    """Let a step go wrong on one rank, or on all ("-1")."""
+    """Let a step fail on one rank, or on all ("-1")."""
     step, rank, kind = (os.environ.get("DOTS_TROUBLE") or "0 0 nothing").split()
     if dots.step_count + 1 != int(step) or int(rank) not in (-1, dots.ranks.rank):
         return

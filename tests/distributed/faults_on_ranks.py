@@ -1,8 +1,9 @@
-"""The command line on ranks, of which one meets a fault: FAULT="rank kind place number", the number-th time that it comes to the place.
+"""Command line on ranks with an injected fault on one of them.
 
-Places: `file`, an operation on a file in the folder `out`; `wait`, the start of an operation of all
-ranks; `wait-end`, its end; `step`. Then the program writes the time into the file `fault`. The
-scene of dots is simulated by `dots_on_ranks`, others as everywhere.
+FAULT="rank kind place number": the fault occurs the number-th time at the place. Places: `file`, an
+operation on a file in the folder `out`; `wait`, the start of a collective operation; `wait-end`,
+its end; `step`. Then the program writes the time into the file `fault`. `dots_on_ranks` simulates
+the scene of dots; other scenes have their own simulator.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from warp_lcp.distributed import launch
 from warp_lcp.distributed.waiting import Waiting
 from warp_lcp.run import loop
 
-# audit events: raised before the system is asked
+# Audit events are raised before the system call.
 OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
 SIGNALS = {
     "killed": signal.SIGKILL,
@@ -32,7 +33,7 @@ SIGNALS = {
     "crashed": signal.SIGSEGV,
     "asked": signal.SIGTERM,
 }
-# to mpiexec
+# Signals to mpiexec.
 TO_ALL = {
     "Ctrl-C": signal.SIGINT,
     "ended": signal.SIGTERM,
@@ -45,11 +46,11 @@ HEARD = threading.Event()  # a signal that this process handles
 
 
 class Fault:
-    """What befalls this rank, once.
+    """Fault of this rank, which occurs once.
 
     Args:
-        kind: one of KINDS.
-        number: of the time at which it does.
+        kind: a name of KINDS.
+        number: visit of the place at which the fault occurs.
     """
 
     def __init__(self, kind: str, number: int) -> None:
@@ -66,7 +67,7 @@ class Fault:
             os.kill(os.getpid(), SIGNALS[self.kind])
         elif self.kind in TO_ALL:
             os.kill(os.getppid(), TO_ALL[self.kind])
-            HEARD.wait(5.0)  # mpiexec takes a while to hand it on
+            HEARD.wait(5.0)  # mpiexec takes a while to forward it
         elif self.kind == "late":
             time.sleep(1e4)
         elif self.kind == "bug":
@@ -78,7 +79,7 @@ class Fault:
 
 
 def listen() -> None:
-    """Note when handlers of signals are called that are set from here on."""
+    """Record when signal handlers are called that are set from here on."""
     real = signal.signal
 
     def hearing(number: int, handler: Any) -> Any:
@@ -92,7 +93,7 @@ def listen() -> None:
 
 
 def lay_in_wait(place: str, fault: Fault) -> None:
-    """Have a fault come at a place."""
+    """Install a fault at a place."""
     if place == "file":
         out = str(Path("out").resolve())
 

@@ -1,4 +1,7 @@
-"""Solves grid problems on the ranks and, on each, by itself; run by `test_grids_on_ranks`."""
+"""Grid problems solved on all ranks and, on each, by itself.
+
+`test_grids_on_ranks` runs this program.
+"""
 
 import sys
 from functools import partial
@@ -23,7 +26,7 @@ rng = np.random.default_rng(7301)
 
 
 def scene(shape, *, solids=0.08, air=True):
-    """Random solids in liquid, with air on top of its surface."""
+    """Return random solids in liquid, with air above its surface."""
     cells = np.where(rng.random(shape) < solids, wl.SOLID, wl.FLUID)
     if air:
         height = shape[-2] * (0.55 + 0.2 * np.sin(np.arange(shape[-1]) / 3.0))
@@ -32,7 +35,10 @@ def scene(shape, *, solids=0.08, air=True):
 
 
 def coefficients(shape):
-    """Faces over two decades, some closed, and a shift; float32 holds them."""
+    """Return face coefficients over two decades, some 0, and a shift.
+
+    float32 represents them exactly.
+    """
     found = {}
     for name, axis in zip(("face_x", "face_y", "face_z"), range(len(shape)), strict=False):
         size = list(shape)
@@ -44,7 +50,10 @@ def coefficients(shape):
 
 
 def part(values, box, shape, axis=None):
-    """This rank's part of a field, or of the faces along an axis, which include those at its upper sides."""
+    """Return this rank's part of a field, or of the faces along an axis.
+
+    Faces include those at its upper sides.
+    """
     if np.ndim(values) == 0:
         return values
     slices = [
@@ -54,7 +63,10 @@ def part(values, box, shape, axis=None):
 
 
 def columns(shape, count):
-    """Columns that are not 0 on a blob each, wherever the cuts are, and a matrix of weights over two decades."""
+    """Return columns that are nonzero on one blob each, and weights over two decades.
+
+    The blobs lie anywhere relative to the cuts.
+    """
     where, found = np.indices(shape), []
     for _ in range(count):
         center, radius = rng.random(len(shape)) * shape, rng.uniform(1.5, 0.3 * min(shape))
@@ -67,7 +79,7 @@ def columns(shape, count):
 
 
 def joined(A, columns, box):
-    """An operator, with a term of columns if there are some, of which a rank has its box of cells."""
+    """Return this rank's box of an operator, with a term of columns if there are any."""
     if columns is None:
         return A
     U, W = columns
@@ -92,7 +104,11 @@ def compare(
     others=(),
     **faces,
 ):
-    """Solve on all ranks and on one; statuses are the same (CONVERGED, INFEASIBLE or `others`), counts to one, x but for rounding."""
+    """Solve on all ranks and on one, and compare.
+
+    Statuses are equal (CONVERGED, INFEASIBLE or `others`), counts differ by at most one, and x by
+    rounding.
+    """
     shape = cells.shape
     counts = (*reversed(shape), 1)[:3]
     boxes = decomposition or Decomposition(counts, ranks)
@@ -114,11 +130,11 @@ def compare(
         found.iterations,
         expected.iterations,
     )
-    # both start from the same residual, and take the same steps on their way: lengths and
-    # directions are from sums over all ranks
+    # Both start from the same residual and take the same steps at first. Step lengths and
+    # directions come from sums over all ranks.
     ours, theirs = (np.array([r.residual for r in result.history]) for result in (found, expected))
     assert np.isclose(ours[0], theirs[0], rtol=1e-12), name
-    way = min(len(ours), len(theirs), 4)  # later, rounding may have moved cells between sets
+    way = min(len(ours), len(theirs), 4)  # later, rounding may move cells between the sets
     assert np.allclose(ours[:way], theirs[:way], rtol=1e-3, atol=1e-300), (
         name,
         ours[:way],
@@ -139,7 +155,7 @@ PM, NEWTON = wl.ProjectedMultigrid(), wl.MinimumMapNewton()
 
 
 def shapes(ranks):
-    """Shapes, methods, bounds and coefficients."""
+    """Compare shapes, methods, bounds and coefficients."""
     for shape in ((34, 21, 40), (17, 13, 11), (48, 37), (65, 64)):
         cells = scene(shape)
         b = rng.standard_normal(shape)
@@ -159,13 +175,13 @@ def shapes(ranks):
                 face_x=1.0,
                 face_y=3.0,
             )
-            # of one finite value on some ranks only
+            # One finite value on some ranks only.
             alike = np.where(np.indices(shape)[0] < shape[0] // 2, walls, -rng.random(shape))
             compare(ranks, f"bounds alike on some ranks {shape}", cells, b, alike, method=method)
 
 
 def rounded_on_one_rank(ranks):
-    """A coefficient that float32 does not hold, in the box of one rank, gives all ranks the same status."""
+    """Status of all ranks if one has a coefficient that float32 rounds."""
     shape = (34, 21, 40)
     face = np.ones((34, 21, 41))
     face[3, 4, 5] = 0.3
@@ -185,7 +201,7 @@ def rounded_on_one_rank(ranks):
 
 
 def low_rank(ranks):
-    """Terms of low rank, whose columns reach over cuts or are another rank's."""
+    """Compare low-rank terms whose columns cross cuts or belong to another rank."""
     for shape in ((17, 13, 24), (48, 37)):
         cells = scene(shape)
         b = rng.standard_normal(shape)
@@ -213,7 +229,10 @@ def low_rank(ranks):
 
 
 def other_cuts(ranks):
-    """Cuts along x and y, and at odd cells: then the finest level is gathered."""
+    """Compare cuts along x and y, and at odd cells.
+
+    The finest level is then gathered.
+    """
     if ranks.size > 1:
         shape, cells = (20, 20, 20), scene((20, 20, 20))
         b = rng.standard_normal(shape)
@@ -242,7 +261,10 @@ def other_cuts(ranks):
 
 
 def closed_pools(ranks):
-    """Closed pools: one that reaches over all ranks, and small ones; b sums to 0 on each or not."""
+    """Compare closed pools: one on all ranks, and small ones.
+
+    b sums to 0 on each or not.
+    """
     cells = np.full((24, 10, 12), wl.FLUID)
     cells[:, 6, :] = wl.SOLID
     cells[:, 7:, 6] = wl.SOLID
@@ -258,7 +280,7 @@ def closed_pools(ranks):
         assert A.floating_components().count == 2
         compare(ranks, "closed pools, bounded", cells, b + 0.1, 0.0, method=method, same=1e-8)
         piston = np.zeros((*cells.shape, 1))
-        piston[:, 5, :] = 1.0 / 288.0  # what it feels of the pool beneath it is no null space
+        piston[:, 5, :] = 1.0 / 288.0  # its product with the pool beneath it is no null space
         found, A = compare(
             ranks, "a piston", cells, b, -np.inf, method=method, columns=(piston, np.ones((1, 1)))
         )
@@ -268,7 +290,7 @@ def closed_pools(ranks):
 
 
 def memory_in_place(ranks):
-    """The same memory while cells and b change in place."""
+    """Solve with the same memory while cells and b change in place."""
     shape = (32, 18, 18)
     boxes = Decomposition((18, 18, 32), ranks)
     full = [scene(shape) for _ in range(4)]
@@ -303,7 +325,7 @@ def memory_in_place(ranks):
 
 
 def as_on_devices(ranks):
-    """Ghost cells that go through the host's memory, and no leg of a cycle in one pass."""
+    """Compare with ghost cells through host memory and unfused cycles."""
     fill, filling, fuses = Halo.fill, Halo.filling, StencilLevel.fuses
     Halo.filling = lambda self, field: Task(partial(self.fill, field))
     Halo.fill = lambda self, field: (
@@ -320,7 +342,10 @@ def as_on_devices(ranks):
 
 
 def legs(ranks):
-    """Legs that go through memory once are those that do not, linear and projected, on any cuts and by any number of threads."""
+    """Compare fused legs of cycles with unfused ones, linear and projected.
+
+    On any cuts and with any number of threads.
+    """
     shape, gathered = (32, 40, 48), halo_levels.GATHERED
     cells, faces = scene(shape), coefficients(shape)
     free, b, gaps = rng.random(shape) < 0.9, rng.standard_normal(shape), rng.random((2, *shape))
@@ -369,7 +394,7 @@ def legs(ranks):
 
 
 def wrong_input(ranks):
-    """What is wrong is refused on all ranks."""
+    """Refuse wrong input on all ranks."""
     shape = (32, 18, 18)
     boxes = Decomposition((18, 18, 32), ranks)
     cells, b = (
@@ -406,7 +431,7 @@ def wrong_input(ranks):
 
 
 def halos(ranks):
-    """Ghost cells of every type are what their owners have."""
+    """Compare ghost cells of every type with the owners' values."""
     for counts in ((13, 11, 9), (40, 30, 1)):
         for width in (1, 3):
             boxes = Decomposition(counts, ranks)
@@ -440,7 +465,11 @@ def halos(ranks):
 
 
 def messages_in_tables(ranks):
-    """Sums are those of all ranks, in their order; an error of MPI's is raised when the table is done, and nothing is sent after it."""
+    """Check sums over all ranks in tables of messages, and errors of MPI.
+
+    Sums are in the order of the ranks. An error of MPI is raised when the table is done, and
+    nothing is sent after it.
+    """
     sums = np.array([0.1, 10.0**ranks.rank])
     run_table(Table([ranks.adding(sums)]))
     expected = ranks.sum(np.array([0.1, 10.0**ranks.rank]))

@@ -1,4 +1,7 @@
-"""Liquids and sands on ranks, which `test_liquid_on_ranks` starts: `liquids_on_ranks.py WHAT,MORE FOLDER`; logs go into the folder."""
+"""Liquids and sands on ranks; `test_liquid_on_ranks` starts this program.
+
+`liquids_on_ranks.py WHAT,MORE FOLDER`; logs go into the folder.
+"""
 
 import json
 import sys
@@ -27,8 +30,8 @@ from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
-viscosity_multigrid.GATHERED = 1024  # cells of a level that is not shared, so that others are
-EAGER = Balance(every=2, bound=1.0, fixed=0.0)  # cuts boxes anew whenever others are better
+viscosity_multigrid.GATHERED = 1024  # small enough that some levels stay distributed
+EAGER = Balance(every=2, bound=1.0, fixed=0.0)  # repartitions whenever other boxes are better
 DT = 0.01  # the longest step [s]
 STEPS = 10
 DAM_STEPS = 20
@@ -56,7 +59,7 @@ PROBES = [
     for what in ("pressure", "velocity", "level")
 ]
 PROBES_2D = [dict(probe, position=probe["position"][:2]) for probe in PROBES]
-THROWN = [  # a body that turns, in the boxes of up to four ranks, and one that it meets
+THROWN = [  # a rotating body in the boxes of up to four ranks, and another that it meets
     box([0.35, 0.2, 0.1], [0.5, 0.4, 0.3], velocity=[1.0, 2.0, 0.0]),
     box([0.5, 0.2, 0.1], [0.65, 0.4, 0.3], velocity=[1.0, 0.5, 1.0]),
     {"shape": "sphere", "center": [0.85, 0.3, 0.3], "radius": 0.1, "velocity": [-2.0, 0.0, -0.5]},
@@ -68,7 +71,7 @@ CAPILLARY = {
 TILTED = {"physics": {"gravity": [3.0, -8.0, 2.0]}}
 RIVER = {
     "domain": OPEN,
-    # out of the open side, along the floor
+    # Out of the open side, along the floor.
     "liquid": [*FLAT["liquid"], box([0.85, 0.0], [1.0, 0.3], velocity=[1.0, 0.0])],
     "source": [box([0.0, 0.2], [0.1, 0.4], velocity=[1.5, 0.2], stop=0.08)],
     "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.02)],
@@ -119,7 +122,7 @@ SLOPE = {
     "periodic": [True, False],
     "sand": [box([0.6, 0.0], [1.0, 0.3], velocity=[1.0, 0.0])],
 }
-ROUND = {  # along x and z, over a step that goes on at the other sides, around a wheel
+ROUND = {  # along x and z, over a periodic step, around a wheel
     "periodic": [True, False, True],
     "sand": [box([0.0, 0.0, 0.0], [1.0, 0.2, 0.5], velocity=[-0.8, 0.0, 0.6])],
     "solid": [box([-1.0, -1.0, -1.0], [2.0, 0.05, 2.0]), BLADE],
@@ -211,14 +214,14 @@ SCENES |= {
     | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},
 }
 
-# all ranks but one have nothing at the start
+# All ranks except one are empty at the start.
 CORNER = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.2, 0.2])]}
 PILE = {"size": [1.0, 0.5], "resolution": 32, "sand": CORNER["liquid"]}
 AWAY = DISC | {"center": [0.7, 0.25]}  # a solid in the box of a rank without material
 SHOWN = {"surface": True}
-# brings material to a rank that had none
+# Brings material to an empty rank.
 LATE = box([0.7, 0.3], [0.8, 0.4], velocity=[0.5, 0.0], start=0.02)
-BARE = {  # every stage of a step, with a rank that has no material
+BARE = {  # every stage of a step, with an empty rank
     "viscous": CORNER
     | {
         "viscosity": {"value": 5.0},
@@ -320,7 +323,7 @@ def on_ranks(ranks: Ranks, given: ParticleScene) -> ParticleSimulation:
 
 
 def run(ranks: Ranks, folder: Path) -> None:
-    """Run all scenes, on four ranks in boxes that are cut anew."""
+    """Run all scenes, on four ranks with repartitions."""
     moved = []
     for name in SCENES:
         simulation = start(ranks, name)
@@ -333,7 +336,7 @@ def run(ranks: Ranks, folder: Path) -> None:
         everyone = ranks.comm.allgather(list(simulation.frame()))
         assert sum(len(points.points) for points, *_ in everyone) == rows[-1]["particles"]
         bodies = [part for _, _, *parts in everyone for part in parts]
-        # of one rank
+        # Of one rank.
         assert [part.name for part in bodies] == ["bodies"] * (simulation.bodies is not None)
         cells = np.concatenate([cells.index for _, cells, *_ in everyone])
         assert len(np.unique(cells, axis=0)) == len(cells)
@@ -354,7 +357,10 @@ def run(ranks: Ranks, folder: Path) -> None:
 
 
 def bare(ranks: Ranks, folder: Path) -> None:
-    """Take every stage of a step and of a frame, and go on in other boxes, where a rank has no material."""
+    """Run every stage of a step and of a frame with a rank without material.
+
+    Continue in other boxes.
+    """
     for name, tables in BARE.items():
         simulation = on_ranks(ranks, scene(**tables))
         assert ranks.size == 1 or ranks.any(simulation.particles.count == 0), name
@@ -369,7 +375,10 @@ def bare(ranks: Ranks, folder: Path) -> None:
 
 
 def own_model(ranks: Ranks, folder: Path) -> None:
-    """Run the documentation's model, unchanged, where rank 0 has all of the sponge, or all ranks have some."""
+    """Run the documentation's model unchanged.
+
+    Rank 0 has all of the sponge, or all ranks have some.
+    """
     for name, tables in {"corner": CORNER, "flat": FLAT}.items():
         simulation = SIMULATOR.create(
             scene(**tables), device="cpu", folder=Path(), ranks=ranks, models=[sponge()(20.0, 0.1)]
@@ -383,7 +392,7 @@ def own_model(ranks: Ranks, folder: Path) -> None:
 
 
 def sponge() -> type:
-    """Return the model of the documentation's page, without what it runs at the end."""
+    """Return the model of the documentation's page, without its final run."""
     page = Path(__file__).parents[2] / "docs/own-model.md"
     names: dict[str, type] = {}
     exec(
@@ -402,7 +411,7 @@ WRAPPED = {
 
 
 def wrap(ranks: Ranks, folder: Path) -> None:
-    """Keep surfaces and volumes, at the start and later."""
+    """Write surfaces and volumes, at the start and later."""
     for name, tables in WRAPPED.items():
         simulation = on_ranks(ranks, scene(**tables))
         for step in range(2):
@@ -439,7 +448,7 @@ RESUMED = (
 
 
 def keep(ranks: Ranks, folder: Path) -> None:
-    """Run in two halves, and keep the pieces of the state between."""
+    """Run in two halves, and write the parts of the state between."""
     for name in RESUMED:
         simulation = start(ranks, name)
         simulation.grid.part.balance = EAGER
@@ -448,11 +457,11 @@ def keep(ranks: Ranks, folder: Path) -> None:
         rows = first + advance(simulation, 5)
         if ranks.is_root:
             (folder / f"{name}_whole.json").write_text(json.dumps(rows))
-    ranks.comm.Barrier()  # all pieces are there
+    ranks.comm.Barrier()  # all parts exist
 
 
 def go_on(ranks: Ranks, folder: Path) -> None:
-    """Go on from pieces."""
+    """Continue from parts."""
     for name in reversed(RESUMED):
         pieces = [dict(np.load(file)) for file in sorted(folder.glob(f"{name}_piece_*.npz"))]
         simulation = start(ranks, name)
@@ -468,7 +477,7 @@ def go_on(ranks: Ranks, folder: Path) -> None:
 
 
 def fail(ranks: Ranks, folder: Path) -> None:
-    """Fail on all ranks alike, with the state as it was, and go on after it."""
+    """Fail on all ranks alike, with the state unchanged, and continue."""
     simulation = start(ranks, "cut", solver={"tolerance": 1e-9, "max_iterations": 1})
     before = simulation.state()
     with pytest.raises(StepFailed, match="MAX_ITERATIONS"):
@@ -490,7 +499,7 @@ def fail(ranks: Ranks, folder: Path) -> None:
         simulation.step(0.3)
     reference = advance(start(ranks, "cut"), 2)
     for row, expected in zip(advance(simulation, 2), reference, strict=True):
-        # the solve starts from another guess
+        # The solve starts from another guess.
         assert row["kinetic_energy"] == pytest.approx(expected["kinetic_energy"], rel=1e-3)
     if ranks.rank == ranks.size - 1 and simulation.particles.count:
         velocity = simulation.particles.velocity.numpy()
@@ -504,11 +513,14 @@ def fail(ranks: Ranks, folder: Path) -> None:
 
 
 def launches(ranks: Ranks, folder: Path) -> None:
-    """Count what a step of sand has launched and exchanged from Python: as much with four times the steps of the stresses."""
+    """Count launches and exchanges of a step of sand from Python.
+
+    There are as many with four times the iterations of the stress solve.
+    """
     for name in ("trickling sand", "ball on sand"):
         found = []
         for least in (100, 400):
-            # met whenever the residual is due
+            # Met whenever the residual is tested.
             simulation = start(ranks, name, solver={"tolerance": 0.9})
             advance(simulation, 3)
             simulation.method = HeavyBallProjectedGradient(least=least, cold=least)
@@ -526,7 +538,7 @@ def launches(ranks: Ranks, folder: Path) -> None:
 
 
 def dam(ranks: Ranks, folder: Path) -> None:
-    """Run the scene that comes with the package."""
+    """Run the built-in scene."""
     simulation = on_ranks(ranks, load_scene("dam-break"))
     rows = advance(simulation, DAM_STEPS)
     if ranks.is_root:
@@ -534,7 +546,7 @@ def dam(ranks: Ranks, folder: Path) -> None:
 
 
 def differ(ranks: Ranks, folder: Path) -> None:
-    """Refuse scenes that are not the same."""
+    """Refuse scenes that differ between ranks."""
     with pytest.raises(ValueError, match="the scene on rank 1 differs from rank 0"):
         start(ranks, "flat", time={"duration": 1.0 + ranks.rank})
 

@@ -1,4 +1,4 @@
-"""Small problems whose matrix is assembled cell by cell from the definition, for solvers that are not ours."""
+"""Small problems with matrices assembled from the definition, for oracles."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,10 @@ BOUNDS = ("walls", "everywhere", "boxed")
 
 @dataclass
 class Small:
-    """A grid problem as arrays: cells and fields (nz, ny, nx) or (ny, nx), faces and shift as GridPoisson takes them."""
+    """Grid problem as arrays.
+
+    Cells and fields (nz, ny, nx) or (ny, nx); faces and shift as in GridPoisson.
+    """
 
     cells: np.ndarray
     coefficients: dict
@@ -24,7 +27,7 @@ class Small:
         return self.cells == FLUID
 
     def matrix(self):
-        """A on the FLUID cells in their order: a row a cell, from its faces one by one."""
+        """Return A on the FLUID cells in their order, assembled face by face."""
         cells, number = self.cells, np.cumsum(self.fluid).reshape(self.cells.shape) - 1
         shift, rows = self.coefficients.get("shift"), []
         for cell in zip(*np.nonzero(self.fluid), strict=True):
@@ -46,24 +49,24 @@ class Small:
         return scipy.sparse.csr_array((values, (i.astype(int), j.astype(int))))
 
     def natural_residual(self, A, x):
-        """The natural residual of x, a vector of the unknowns, by SciPy's product."""
+        """Return the natural residual of x, a vector of the unknowns, by SciPy."""
         d, y = A.diagonal(), A @ x + self.b[self.fluid]
         return d * (x - np.clip(x - y / d, self.lower[self.fluid], self.upper[self.fluid]))
 
     def places(self, A, x):
-        """-1 where an unknown is held at its lower bound, 1 at the upper one, 0 where it is free."""
+        """Return -1 where an unknown is at its lower bound, 1 at the upper, 0 if free."""
         v = x - (A @ x + self.b[self.fluid]) / A.diagonal()
         return (v > self.upper[self.fluid]).astype(int) - (v < self.lower[self.fluid]).astype(int)
 
 
 def small(name: str, bounds: str) -> Small:
-    """Liquid below air with a solid ball in it, in a closed box.
+    """Return liquid below air with a solid ball in it, in a closed box.
 
     Args:
-        name: cube (16^3, unit coefficients), brick (17 x 13 x 11 cells, a coefficient a face, a
-            shift) or plane (64^2, c_y = 1/2).
-        bounds: walls (x >= 0 beside solids), everywhere (x >= 0) or boxed (both bounds, other ones
-            in each cell).
+        name: cube (16^3, unit coefficients), brick (17 x 13 x 11 cells, a coefficient for each
+            face, a shift) or plane (64^2, c_y = 1/2).
+        bounds: walls (x >= 0 beside solids), everywhere (x >= 0) or boxed (both bounds,
+            different in each cell).
     """
     shape = {"cube": (16, 16, 16), "brick": (11, 13, 17), "plane": (64, 64)}[name]
     rng = np.random.default_rng(20261122 + len(name))

@@ -1,4 +1,4 @@
-"""A program for ranks: the grid operator and its cycle as PETSc's objects do what their definitions say.
+"""Program for ranks: the grid operator and its cycle as PETSc objects.
 
 Usage: petsc_objects.py CHECK... with names of functions here. Fails by an assertion.
 """
@@ -19,7 +19,10 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 
 
 def on_all_cells(problem, free):
-    """The matrix on all cells, from the definition: A on the free ones, the identity on the others."""
+    """Return the matrix on all cells from the definition.
+
+    It is A on the free cells and the identity on the others.
+    """
     A = problem.matrix().tocoo()
     cells, mask = np.flatnonzero(problem.fluid), free.ravel()
     rows, columns = cells[A.coords[0]], cells[A.coords[1]]
@@ -30,13 +33,16 @@ def on_all_cells(problem, free):
 
 
 def random_vector(grid, boxes, shape, seed):
-    """A random field of the whole grid, and its vector."""
+    """Return a random field of the whole grid, and its vector."""
     field = np.random.default_rng(seed).standard_normal(shape)
     return field, grid.vector(field.reshape(boxes.counts[::-1])[boxes.box.slices])
 
 
 def products():
-    """Products and diagonals on all unknowns and on a free set, with unit coefficients and others, in 3-D and 2-D."""
+    """Compare products and diagonals on all unknowns and on a free set.
+
+    They have unit coefficients and others, in 3-D and 2-D.
+    """
     for name, dtype, accuracy in (
         ("brick", wp.float64, 1e-14),
         ("brick", wp.float32, 1e-6),
@@ -65,13 +71,16 @@ def products():
             matrix.getDiagonal(held)
             diagonal = whole_field(grid.field(held), boxes, shape).ravel()
             assert np.abs(diagonal - expected.diagonal()).max() < accuracy * np.abs(y).max()
-        w = boxes.dmda.createGlobalVec()  # the numbering is the DMDA's
+        w = boxes.dmda.createGlobalVec()  # it has the numbering of the DMDA
         grid.operator.mult(w, w.duplicate())
         assert w.getOwnershipRange() == held.getOwnershipRange()
 
 
 def preconditioner():
-    """The cycle is symmetric and positive definite, linear over 40 orders of magnitude, and the identity on held cells."""
+    """Test that the cycle is symmetric, positive definite and linear.
+
+    Linear over 40 orders of magnitude; on held cells it is the identity.
+    """
     problem = small("brick", "walls")
     boxes, lcp = shared_problem(problem, Ranks.world())
     grid, shape = PetscGrid(lcp.A), problem.cells.shape
@@ -97,7 +106,10 @@ def preconditioner():
 
 
 def linear_solves():
-    """KSP reaches a direct solution, from PETSc's options too; a free set that changes is another matrix."""
+    """Compare KSP with a direct solution, also with PETSc options.
+
+    A free set that changes is another matrix.
+    """
     problem = small("cube", "walls")
     boxes, lcp = shared_problem(problem, Ranks.world())
     grid, shape = PetscGrid(lcp.A, real=wp.float64), problem.cells.shape
@@ -129,7 +141,10 @@ def linear_solves():
 
 
 def bounded_methods():
-    """Methods of SNES and TAO for bounds take free sets out of the operator themselves, without a matrix."""
+    """Solve by SNES and TAO methods for bounds, without a matrix.
+
+    They take free sets out of the operator.
+    """
     problem = small("cube", "walls")
     boxes, lcp = shared_problem(problem, Ranks.world())
     expected, _ = solve_ours(problem, wl.ProjectedMultigrid(), Ranks.world())
@@ -183,7 +198,10 @@ def bounded_methods():
 
 
 class Sums:
-    """Sums over aggregates of the next finer level's cells, and its transpose times a factor, by NumPy."""
+    """Sums over aggregates of the next finer level's cells, by NumPy.
+
+    The transpose, times a factor, is included.
+    """
 
     def __init__(self, fine, coarse, factor):
         self.shapes = [level.stencil.padding.counts for level in (fine, coarse)]
@@ -208,12 +226,15 @@ class Sums:
 
 
 def inner(stencil, field):
-    """A stored field without its ghost cells."""
+    """Return a stored field without its ghost cells."""
     return field.numpy().reshape(stencil.padding.shape)[1:-1, 1:-1, 1:-1]
 
 
 def cycles_of_pcmg():
-    """A cycle is that of PETSc's PCMG with Chebyshev smoothing on matrices assembled from the levels, W and V; one rank."""
+    """Compare a cycle with that of PETSc's PCMG, on one rank.
+
+    It has Chebyshev smoothing and matrices assembled from the levels, W and V.
+    """
     problem, PETSc, options = small("brick", "walls"), petsc(), petsc().Options()
     for gamma in (2, 1):
         _, lcp = shared_problem(problem, Ranks.world())

@@ -1,7 +1,7 @@
-"""A program for ranks: solve a small problem by PETSc's own methods on an assembled matrix and by ours; tell how they differ.
+"""Program for ranks: compare PETSc's own methods with ours on a small problem.
 
-Usage: petsc_oracles.py NAME with a name of `oracle_problems.small`. Rank 0 prints one JSON object:
-what each method tells, for all bounds.
+Usage: petsc_oracles.py NAME with a name of `oracle_problems.small`. PETSc has an assembled matrix.
+Rank 0 prints one JSON object: the results of each method for all bounds.
 """
 
 import json
@@ -22,7 +22,7 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10)
 
 
 def shared_matrix(A):
-    """Return a SciPy matrix as PETSc's, its rows shared in their order."""
+    """Return a SciPy matrix as PETSc's, its rows distributed in their order."""
     matrix = petsc().Mat().createAIJ(A.shape, nnz=7)
     first, last = matrix.getOwnershipRange()
     mine = A[first:last]
@@ -45,13 +45,16 @@ def gathered(v):
 
 
 def direct(ksp):
-    """Every rank factors the whole matrix: what is left of a matrix on a free set may have no row on some rank."""
+    """Solve by a factorization of the whole matrix on every rank.
+
+    On some rank the matrix of a free set may have no row.
+    """
     ksp.setType("preonly")
     ksp.getPC().setType("redundant")
 
 
 def iterative(ksp):
-    """Conjugate gradients with Jacobi."""
+    """Solve by conjugate gradients with Jacobi."""
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
     ksp.setTolerances(rtol=1e-10, max_it=2000)
@@ -65,12 +68,12 @@ def snes(problem, A, kind, prepare):
         shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper)
     )
     options = petsc().Options()
-    # an absolute one, 1e-8 unless set: bounds would count as touched that are not
+    # Absolute tolerance, 1e-8 by default: it would count bounds as active that are not.
     options["snes_vi_zero_tolerance"] = 1e-13
     solver = petsc().SNES().create()
     solver.setType(kind)
     solver.setFunction(lambda snes, x, f: matrix.multAdd(x, b, f), b.duplicate())
-    # vinewtonssls scales the rows in place
+    # vinewtonssls scales the rows in place.
     solver.setJacobian(lambda snes, x, J, P: matrix.copy(P), matrix.duplicate(copy=True))
     solver.setVariableBounds(lower, upper)
     solver.setTolerances(rtol=1e-11, atol=1e-11 * b.norm(), stol=0.0, max_it=100)
@@ -82,7 +85,7 @@ def snes(problem, A, kind, prepare):
 
 
 def tao(problem, A, kind):
-    """Solve by PETSc's TAO, as the quadratic program of which the LCP is the condition of optimality."""
+    """Solve by PETSc's TAO, as the quadratic program whose optimality is the LCP."""
     matrix = shared_matrix(A)
     fluid = problem.fluid
     b, lower, upper = (
@@ -119,7 +122,7 @@ THEIRS = {
 
 
 def shared_problem(problem, ranks, dtype=wp.float64):
-    """Return the boxes of the ranks and the problem that they share."""
+    """Return the boxes of the ranks and their distributed problem."""
     counts = (*reversed(problem.cells.shape), 1)[:3]
     boxes = Decomposition(counts, ranks)
 
@@ -139,7 +142,7 @@ def shared_problem(problem, ranks, dtype=wp.float64):
 
 
 def whole_field(mine, boxes, shape):
-    """Return a field of the whole grid on every rank from the ranks' boxes of it."""
+    """Return a field of the whole grid on every rank, from the boxes of the ranks."""
     whole = np.zeros(tuple(reversed(boxes.counts)))
     for box, part in boxes.ranks.comm.allgather((boxes.box.slices, mine)):
         whole[box] = part.reshape(whole[box].shape)
@@ -147,14 +150,20 @@ def whole_field(mine, boxes, shape):
 
 
 def solve_ours(problem, solver, ranks):
-    """Solve by one of our methods on the ranks; return x on all unknowns, in their order, and the result."""
+    """Solve by one of our methods on the ranks.
+
+    Return x on all unknowns, in their order, and the result.
+    """
     boxes, lcp = shared_problem(problem, ranks)
     result = wl.solve(lcp, solver, stopping=TIGHT)
     return whole_field(result.x.numpy(), boxes, problem.cells.shape)[problem.fluid], result
 
 
 def level_matrix(stencil):
-    """Return a level's stencil of one rank as an assembled matrix on all cells, the identity on those that are no unknowns."""
+    """Return a level's stencil of one rank as an assembled matrix on all cells.
+
+    It is the identity on cells that are no unknowns.
+    """
     counts, grid = (
         stencil.padding.counts,
         np.arange(np.prod(stencil.padding.counts)).reshape(stencil.padding.counts),
@@ -175,7 +184,10 @@ def level_matrix(stencil):
 
 
 def compare(problem):
-    """Solve by all methods; return what each tells, and how its x and its active set differ from those of our first one."""
+    """Solve by all methods and compare with our first one.
+
+    Return the reports of each, and the differences of x and of the active set.
+    """
     A, told, reference = problem.matrix(), {}, None
     for name, solver in OURS.items():
         x, result = solve_ours(problem, solver, Ranks.world())
@@ -200,7 +212,7 @@ def compare(problem):
 
 
 def differences(x, places, other_x, other_places):
-    """Return how a solution differs from another one, the largest error relative to the largest x."""
+    """Return the difference of two solutions, the error relative to the largest x."""
     held = [int((places < 0).sum()), int((places > 0).sum())]
     error = float(np.abs(x - other_x).max() / np.abs(other_x).max())
     return {"error": error, "held": held, "held_otherwise": int((places != other_places).sum())}

@@ -1,4 +1,7 @@
-"""Solutions on ranks are those that PETSc's own methods find on a matrix assembled from the definition."""
+"""Solutions on ranks against PETSc's own methods.
+
+PETSc's matrix is assembled from the definition.
+"""
 
 import json
 from pathlib import Path
@@ -25,7 +28,7 @@ def test_petscs_own_methods_find_the_same_solution_and_active_set(mpi, ranks):
             assert told["converged"], (bounds, method, told)
             assert told["error"] < 1e-8, (bounds, method, told)
             assert told["held_otherwise"] == 0, (bounds, method, told)
-        for method in OURS:  # the residual that a result tells is that of its x
+        for method in OURS:  # the reported residual is that of its x
             told = methods[method]
             assert told["residual_by_scipy"] == pytest.approx(told["residual"], rel=1e-3), (
                 bounds,

@@ -1,4 +1,4 @@
-"""How grids are cut so that ranks have about as much to do."""
+"""Load balance of the ranks' boxes."""
 
 import itertools
 import math
@@ -68,7 +68,7 @@ def test_the_page_of_large_runs_has_the_boxes_of_the_dam(resolution, ranks):
 
 
 def busiest(load, cut):
-    """Return what the busiest rank has to do, by a sum over its blocks."""
+    """Return the load of the busiest rank, by a sum over its blocks."""
     ends = [[0, *-(-np.cumsum(part) // load.edge)] for part in cut]
     boxes = itertools.product(*(list(itertools.pairwise(end)) for end in ends))
     full = [load.material[tuple(slice(a, b) for a, b in box)].sum() for box in boxes]
@@ -77,7 +77,11 @@ def busiest(load, cut):
 
 @pytest.mark.parametrize(("least", "pays"), [(560.0, True), (780.0, False)])
 def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least, pays, monkeypatch):
-    """What a step takes besides, as much as all work of the busiest rank, gets no shorter: 2000 is 1.28 times 1560 and 1.12 times 1780."""
+    """Repartition only if the whole step becomes shorter by a quarter.
+
+    The rest of a step, as much as all work of the busiest rank, does not become shorter: 2000 is
+    1.28 times 1560 and 1.12 times 1780.
+    """
     cuts = [[3, 5], [8], [8]]
     now = SimpleNamespace(counts=(8, 8, 8), parts=[[4, 4], [8], [8]], repartition=lambda cut: cut)
     ranks = SimpleNamespace(size=2, rank=0, collect=lambda mine: [mine, None])
@@ -93,7 +97,7 @@ def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least,
 
 
 def every_cut(blocks, p, least):
-    """Yield all cuts of blocks into p parts that have so many at least."""
+    """Yield all cuts of blocks into p parts of at least `least` blocks."""
     for inner in itertools.combinations(range(1, blocks), p - 1):
         sizes = np.diff([0, *inner, blocks])
         if p == 1 or sizes.min() >= least:

@@ -1,4 +1,4 @@
-"""Blocks that ranks end alike: what fails on one fails on all, with its name."""
+"""Collective blocks: an error on one rank is raised on all, with its rank."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Ranks of one machine take its devices in turns."""
+"""Assignment of a machine's devices to its ranks, in turns."""
 
 import pytest
 

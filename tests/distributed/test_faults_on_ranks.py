@@ -1,4 +1,7 @@
-"""Whatever befalls a rank, all end soon, with a message that names it, and any number of ranks goes on from what was written."""
+"""Faults of one rank: all ranks end soon, with a message that names it.
+
+Any number of ranks can continue from what was written.
+"""
 
 import fcntl
 import json
@@ -14,13 +17,16 @@ from test_run_on_ranks import assert_same_run, log, record, run
 
 PROGRAM = Path(__file__).with_name("faults_on_ranks.py")
 SOON = 10.0  # seconds that all ranks may take to end
-LIMIT = 6.0  # that a rank may be late, in seconds
+LIMIT = 6.0  # [s] by which a rank may be late
 __all__ = ["run"]
 
 
 @pytest.fixture
 def befall(mpi, tmp_path):
-    """Run dots on ranks of which one meets a fault, see `faults_on_ranks`; return what was said and the seconds that the end took."""
+    """Run dots on ranks with a fault on one, see `faults_on_ranks`.
+
+    Return the output and the seconds until the end.
+    """
 
     def go(ranks, fault, *more):
         (tmp_path / "dots.toml").write_text(SCENE)
@@ -53,13 +59,12 @@ def befall(mpi, tmp_path):
 
 
 def wait_for_ranks(folder):
-    """Wait until nobody holds a folder: mpiexec may end before the last of its ranks."""
+    """Wait until no process holds a folder: mpiexec may end before its last rank."""
     with suppress(FileNotFoundError), open(folder / "run.lock") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
 
 
-# on two ranks, with how run.json says that it ended, what is said, and the step that others go on
-# from
+# On two ranks: the status in run.json, the message, and the step from which others continue.
 FAULTS = {
     "1 killed step 70": ("running", "", "noticed that process rank 1", 68),
     "1 late wait 300": (
@@ -80,7 +85,7 @@ def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
     text, seconds = befall(2, fault)
     assert seconds < SOON + LIMIT * fault.count("late")
     found = record(tmp_path / "out")
-    # by mpiexec, a second later, before the step's end
+    # By mpiexec, a second later, before the end of the step.
     killed = "Ctrl-C" in fault and found["status"] == "running"
     assert killed or (found["status"], found["reason"][: len(reason)]) == (status, reason)
     assert said in text

@@ -1,4 +1,4 @@
-"""Grid problems that ranks share have the solutions, the statuses and the counts of one process."""
+"""Grid problems on ranks: solutions, statuses and counts of one process."""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Ranks on hosts of their own, network namespaces of this machine, run what ranks of one host run."""
+"""Ranks on separate hosts: same results as ranks of one host.
+
+The hosts are network namespaces of this machine.
+"""
 
 import shutil
 import subprocess
@@ -34,7 +37,10 @@ WHERE = """
 
 @pytest.fixture
 def hosts(tmp_path):
-    """Run this interpreter on ranks of which each has a host: `hosts(3, *arguments)`, in `tmp_path`; what it prints comes back."""
+    """Run this interpreter on ranks with a host each and return the output.
+
+    Call it as `hosts(3, *arguments)`; it runs in `tmp_path`.
+    """
     if why := launch.missing():
         pytest.skip(why)
     if (
@@ -71,7 +77,7 @@ def test_each_rank_has_a_host(hosts, tmp_path):
 
 @pytest.mark.slow
 def test_runs_have_the_same_bits(hosts, mpi, tmp_path):
-    """In the log, but for seconds, and in all frames."""
+    """Equal bits in the log, except seconds, and in all frames."""
     mpi(3, "-c", RUN, *WORDS, "--out", "one")
     hosts(3, "-c", RUN, *WORDS, "--out", "three")
     logs = [

@@ -1,4 +1,4 @@
-"""Programs on ranks start, end and are ended."""
+"""Start and end of programs on ranks."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def test_ranks_know_each_other(mpi):
 
 
 def test_modules_run_on_ranks(mpi):
-    # ranks' lines may run into each other
+    # Lines of ranks may be interleaved.
     text = "from warp_lcp.distributed import launch; print(f'{launch.rank_here()} ', end='')"
     assert sorted(mpi(2, "-c", text).stdout.split()) == ["0", "1"]
 

@@ -1,4 +1,4 @@
-"""Objects of PETSc that Python ends on one rank earlier than on another do no harm."""
+"""PETSc objects that Python frees on one rank earlier than on another."""
 
 PROGRAM = """
     import gc

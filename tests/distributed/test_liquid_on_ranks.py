@@ -1,4 +1,4 @@
-"""Liquids and sands that ranks share have the log, the frames and the failures of one process."""
+"""Liquids and sands on ranks: log, frames and failures of one process."""
 
 import json
 from pathlib import Path
@@ -48,8 +48,8 @@ SANDS = (
     "endless sand",
     "endless sand, stirred",
 )
-# What is left of the residual is as large as the rounding of the solve: it is compared with what it
-# is a small part of.
+# The remaining residual is as small as the rounding of the solve. It is compared with the quantity
+# of which it is a small part.
 NOISE = {
     **dict.fromkeys(
         ("solve_residual", "viscous_residual", "coupled_residual", "predicted_excess"),
@@ -59,12 +59,12 @@ NOISE = {
 }
 
 
-# With a solver in double precision the order of its sums differs alone; now and then that is the
-# last bit of a velocity. What rests on others makes more of it: the last bit of a thousandth of all
-# velocities, changed in one process, turns the box on the floor by 4e-6 of 90 degrees a second.
-# Beside a periodic side that is cut, particles are added up in another order, and seen from the
-# other side with other last bits: such bits, changed after each step in one process, make 4e-6 of
-# the dissipation.
+# With a solver in double precision only the order of its sums differs; sometimes that changes the
+# last bit of a velocity. Bodies in contact amplify it: the last bit of a thousandth of all
+# velocities, changed in one process, turns the box on the floor by 4e-6 of 90 degrees per second.
+# Beside a periodic side that is cut, particles are summed in another order, and from the other side
+# with other last bits. Such bits, changed after each step in one process, make 4e-6 of the
+# dissipation.
 CLOSE = {
     "cut": 1e-8,
     "floating": 1e-5,
@@ -75,11 +75,14 @@ CLOSE = {
 
 
 def same(rows, expected, rel):
-    """Assert that two logs are the same: numbers of all kinds but for what rounding changes."""
+    """Assert that two logs are equal up to rounding.
+
+    Numbers of all kinds are compared.
+    """
     assert len(rows) == len(expected)
     for row, other in zip(rows, expected, strict=True):
         assert row.keys() == other.keys()
-        # components may be next to nothing
+        # Components may be almost 0.
         scales = {"forces ": 9.81 * other["mass"], "probes velocity": other["max_speed"]}
         scales |= {f"body{n}_{turn}": 90.0 for n in range(3) for turn in ("w", "spin", "angle")}
         scales |= {f"body{n}_v": other["max_speed"] for n in range(3)}
@@ -90,7 +93,7 @@ def same(rows, expected, rel):
             elif scale is not None and isinstance(value, float) and value == value:
                 assert abs(row[name] - value) <= max(rel, 1e-7) * scale, name
             elif name in NOISE:
-                last_bit = 1e-7 if rel else 0.0  # of a velocity, in float32
+                last_bit = 1e-7 if rel else 0.0  # last bit of a velocity, in float32
                 assert abs(row[name] - value) <= max(rel, last_bit) * NOISE[name](other), name
             elif isinstance(value, float):
                 assert row[name] == pytest.approx(value, rel=rel, abs=1e-12, nan_ok=True), name
@@ -104,7 +107,7 @@ def single(model_) -> ParticleSimulation:
 
 
 def alone(model_, **options):
-    """Return a simulation on one rank, for which no MPI is needed."""
+    """Return a simulation on one rank, which needs no MPI."""
     return simulators()[model_.scene.simulator].create(
         model_, device="cpu", folder=Path(), ranks=Ranks(Seat(0, 1)), **options
     )
@@ -149,7 +152,7 @@ def test_one_rank_is_one_process_bit_for_bit(name):
 
 @pytest.fixture(scope="module")
 def logs():
-    """The logs of one process, and the pressures in its last frames."""
+    """Logs of one process, and the pressures in its last frames."""
     found = {}
     for name in SCENES:
         simulation = single(model(name))
@@ -204,7 +207,10 @@ def test_a_rank_without_material_takes_every_stage(mpi, tmp_path, ranks):
 
 @pytest.mark.parametrize("ranks", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ranks):
-    """Where nothing has been rounded otherwise yet bit for bit: the same triangles, with points on cuts once."""
+    """Surface and volumes on ranks against one process.
+
+    Bit for bit before rounding differs: the same triangles, with points on cuts once.
+    """
     mpi(ranks, PROGRAM, "wrap", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
     for name, tables in WRAPPED.items():
         simulation = single(scene(**tables))
@@ -237,7 +243,7 @@ def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ra
 
 
 def rolled(corners):
-    """Return triangles or segments in one order, each triangle from its lowest corner on."""
+    """Return triangles or segments in one order, from their lowest corners on."""
     turn = corners.argmin(axis=1) if corners.shape[1] == 3 else np.zeros(len(corners), dtype=int)
     turned = np.take_along_axis(
         corners, (turn[:, None] + np.arange(corners.shape[1])) % corners.shape[1], axis=1
@@ -247,7 +253,11 @@ def rolled(corners):
 
 @pytest.mark.slow
 def test_a_dam_break_has_the_log_of_one_process(mpi, tmp_path):
-    """The last bit of a thousandth of all velocities, changed once in one process, makes up to 1.7e-6 of a column in these steps."""
+    """Log of a dam break on ranks against one process.
+
+    The last bit of a thousandth of all velocities, changed once in one process, makes up to 1.7e-6
+    of a column in these steps.
+    """
     assert (
         mpi(
             2,
@@ -289,7 +299,7 @@ def test_pieces_of_any_boxes_can_be_read():
     whole = simulation.state()
     pieces = []
     for low, high in ((0, 13), (13, 32)):
-        # some have not moved on yet
+        # Some have not moved to another rank yet.
         mine = (whole["position"][:, 0] < 0.55) if low == 0 else (whole["position"][:, 0] >= 0.55)
         part = {
             name: values[mine]
@@ -325,7 +335,7 @@ def test_velocities_that_ranks_cannot_follow_are_seen_near_cuts_and_along_them()
         layers=5,
     )
     for axis, place, cells, expected in (
-        (0, 21, 3.9, 0.0),  # as far as the layers go but for one
+        (0, 21, 3.9, 0.0),  # as far as the layers reach, except one
         (0, 21, -4.2, 4.2),
         (0, 25, 4.2, 4.2),  # in a ghost layer
         (0, 8, 4.2, 0.0),  # deep in the box
@@ -340,7 +350,7 @@ def test_velocities_that_ranks_cannot_follow_are_seen_near_cuts_and_along_them()
 
 
 def damaged(name, change):
-    """Return a piece of which something is changed."""
+    """Return a part of the state with one change."""
     simulation = alone(model(name))
     advance(simulation, 1)
     piece = dict(simulation.state())

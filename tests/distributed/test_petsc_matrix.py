@@ -1,4 +1,4 @@
-"""The operator and its multigrid as PETSc's objects."""
+"""Operator and multigrid as PETSc objects."""
 
 from pathlib import Path
 
@@ -7,8 +7,8 @@ import pytest
 PROGRAM = Path(__file__).with_name("petsc_objects.py")
 
 
-# products and diagonals beside the definition's, and PETSc's solvers with them: starts cost more
-# than most checks
+# Products and diagonals against the definition, and PETSc's solvers with them. A start takes longer
+# than most checks.
 CHECKS = ("products", "preconditioner", "linear_solves", "bounded_methods")
 
 
@@ -18,5 +18,5 @@ def test_they_are_what_the_definition_says_and_petscs_solvers_work_with_them(mpi
 
 
 def test_a_cycle_is_that_of_pcmg(mpi):
-    # which asserts that they agree to 1e-12
+    # It asserts agreement to 1e-12.
     assert mpi(1, PROGRAM, "cycles_of_pcmg").stdout == "cycles_of_pcmg "

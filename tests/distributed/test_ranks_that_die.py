@@ -1,4 +1,7 @@
-"""A rank that is killed or interrupted ends all; ranks that were given different things say so; ranks that nothing befalls end, too."""
+"""Ranks that are killed, interrupted or given different input end all ranks.
+
+Ranks without a fault end, too.
+"""
 
 import pytest
 
@@ -59,7 +62,7 @@ SHORT = ("--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=32"
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", range(200))
 def test_short_runs_end(mpi, turn):
-    """One after the other, as ranks that wait for each other for ever may do so now and then."""
+    """Short runs one after the other, which may reveal rare deadlocks."""
     done = mpi(
         2 + turn % 3,
         "-c",

@@ -1,4 +1,4 @@
-"""`warp-lcp run --engine petsc` on ranks: one folder, one log, one end, whatever happens to whom."""
+"""`warp-lcp run --engine petsc` on ranks: one folder, one log, one exit code."""
 
 import csv
 import json
@@ -26,10 +26,10 @@ PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 
 @pytest.fixture
 def run(mpi, tmp_path, monkeypatch):
-    """Run commands on the scene of dots, each a text, one after the other on the same ranks, or without MPI on 0 ranks.
+    """Run commands on the scene of dots on ranks, or on 0 ranks without MPI.
 
-    A command's text is completed by the scene and `--device cpu`, its exit code by that of the
-    last.
+    The commands run one after the other on the same ranks. Each text is completed by the scene and
+    `--device cpu`; the exit code is that of the last.
     """
     scene = tmp_path / "dots.toml"
     scene.write_text(SCENE)
@@ -63,7 +63,7 @@ def record(folder: Path) -> dict[str, Any]:
 
 
 def particles(folder: Path, index: int) -> dict[str, np.ndarray]:
-    """Return the dots of a frame by their numbers, whether it is in pieces or not."""
+    """Return the dots of a frame by their numbers, from one file or from parts."""
     whole = folder / "frames" / f"particles_{index:06d}.pvtu"
     files = piece_files(whole) if whole.is_file() else [whole.with_suffix(".vtu")]
     mesh = one_mesh([read_vtu(file) for file in files])
@@ -117,7 +117,10 @@ def test_ranks_write_the_run_of_one_process(run, tmp_path):
 
 
 def test_a_rank_is_killed_and_other_ranks_go_on(run, tmp_path):
-    """Without a message from the program, whose rank cannot say anything; what was written goes on on another number of ranks."""
+    """Continue on another number of ranks after a rank was killed.
+
+    The killed rank gives no message.
+    """
     run(0, "run dots.toml --out one")
     killed = run(3, "DOTS_TROUBLE='70 1 killed' run dots.toml --out out", exit_code=None)
     assert killed.returncode != 0
@@ -131,7 +134,10 @@ def test_a_rank_is_killed_and_other_ranks_go_on(run, tmp_path):
 
 
 def test_damaged_pieces_are_found(run, tmp_path):
-    """The checkpoint before is taken; and a file without its pieces is none."""
+    """Fall back to the checkpoint before a damaged one.
+
+    A file without its parts is no checkpoint.
+    """
     run(0, "run dots.toml --out one")
     run(2, "run dots.toml --out out --frames 3")
     checkpoints = tmp_path / "out" / "checkpoints"
@@ -155,7 +161,7 @@ def test_damaged_pieces_are_found(run, tmp_path):
     assert "rank_0002" in refused.stderr
 
 
-TROUBLES = {  # with how the run ends, and what it says
+TROUBLES = {  # with the status of the run and its message
     "40 -1 failed": ("failed", "failed: step 40: velocity is not finite"),
     "40 -1 missed": ("failed", "retries 6: the solve missed its criteria"),
     "40 1 interrupted": ("stopped", "stopped: interrupted"),
@@ -195,7 +201,10 @@ def test_troubles_end_the_run_with_a_message(run, tmp_path):
     ],
 )
 def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expected):
-    """They wait for it inside MPI: it says what happened, writes that into run.json and ends them."""
+    """End of all ranks after one fails alone.
+
+    The others wait for it inside MPI. It reports the error, writes it into run.json and ends them.
+    """
     done = run(2, f"DOTS_TROUBLE='{trouble}' run dots.toml --out out", exit_code=1)
     assert f"{expected}\nall ranks are aborted" in done.stderr
     found = record(tmp_path / "out")
@@ -204,7 +213,7 @@ def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expecte
     assert found["reason"].endswith(expected)
 
 
-WRONG = {  # commands, with what is said of each
+WRONG = {  # commands, with the message of each
     "run dots.toml --out out": "holds a run already",
     "run dots.toml --out out --resume --force": "exclude each other",
     "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be at least 0.001",
@@ -224,11 +233,11 @@ def test_wrong_input_is_said_once(run, tmp_path):
     for expected in WRONG.values():
         assert done.stderr.count(expected) == 1
     assert "Traceback" not in done.stderr
-    assert record(tmp_path / "out")["status"] == "finished"  # as it was
+    assert record(tmp_path / "out")["status"] == "finished"  # unchanged
 
 
 def test_engines_continue_each_other(run, tmp_path):
-    """One process goes on where two ranks ended, and two ranks where that ended."""
+    """Continue a run of two ranks by one process, and by two ranks again."""
     run(0, "run dots.toml --out one")
     run(2, "run dots.toml --out out --frames 3")
     run(0, "run dots.toml --out out --frames 7 --resume")
@@ -274,7 +283,10 @@ def test_without_mpi_one_message_says_how_to_install(run, monkeypatch, variable)
 
 
 def test_ranks_of_another_mpi_are_refused(mpi, tmp_path):
-    """As srun starts them whose --mpi this MPI does not know; `mpi` skips where there is none."""
+    """Refuse ranks started by another MPI.
+
+    As by srun, whose --mpi this MPI does not know. `mpi` skips where there is none.
+    """
     words = [
         sys.executable,
         "-c",
@@ -307,7 +319,11 @@ COLUMNS = ("time", "dt", "particles", "mass", "kinetic_energy", "potential_energ
     ],
 )
 def test_a_material_goes_on_on_other_numbers_of_ranks(mpi, tmp_path, scene, columns):
-    """From two ranks to three, and on in one process: one log, and frames with the particles and cells of a run in one process."""
+    """Continue material on other numbers of ranks.
+
+    From two ranks to three, and to one process: one log, and frames with the particles and cells of
+    a run in one process.
+    """
     one, out = tmp_path / "one", tmp_path / "out"
     words = shlex.split(f"run {scene} --device cpu {SMALL}")
     go = ["-c", "from warp_lcp.cli.commands import main; main()", *words]

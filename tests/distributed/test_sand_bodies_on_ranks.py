@@ -1,4 +1,4 @@
-"""What the stresses of all ranks do to bodies in sand is what those of one process do."""
+"""Forces of sand on bodies, on ranks and in one process."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,10 @@ COUNTS = {2: (16, 16, 1), 3: (16, 16, 8)}
 def answers(
     bodies: SandBodies, packing: Packing, index: np.ndarray, centers: np.ndarray, fields: dict
 ) -> list[np.ndarray]:
-    """Return what bodies of random numbers have to do with random stresses: sums of all kinds, the velocities that they leave."""
+    """Return the coupling of random bodies with random stresses.
+
+    It consists of sums of all kinds, and the resulting velocities.
+    """
     grid, count, k = packing.grid, len(centers), bodies.freedoms
     walls = Walls(grid, index, [0.5] * (1 + count), counted=packing.counted)
     bodies.place(index, centers, walls)
@@ -67,7 +70,7 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
         ((slice(5, 9), slice(3, 11)), (slice(9, 12), slice(7, 9)), (slice(12, 14), slice(13, 15))),
         1,
     ):
-        # across cuts, beside it and the cuts, and in one rank's box
+        # Across cuts, beside the body and the cuts, and in one rank's box.
         index[deep, rows, columns] = number
     open_ = index < 0
     fields = {

@@ -1,4 +1,4 @@
-"""`warp-lcp bench scaling --engine petsc`: what ranks measure, and the tables of several numbers of ranks."""
+"""`warp-lcp bench scaling --engine petsc`: figures of ranks, and their tables."""
 
 import json
 import re
@@ -42,7 +42,7 @@ def test_ranks_measure_what_one_process_does(mpi, tmp_path):
     for bounds in ("linear", "walls", "everywhere"):
         here = found[f"24^3 {bounds}, ranks: 2"]
         assert here["converged"] == 1
-        assert here["residual"] <= 1e-8  # computed by other code than the solve's
+        assert here["residual"] <= 1e-8  # computed independently of the solve
         assert here["residual"] == pytest.approx(here["told"], rel=1e-3)
         assert abs(here["iterations_to_1e-06"] - here["single_iterations"]) <= 1
         assert here["setup"] < here["to_1e-04"] <= here["to_1e-06"] <= here["to_1e-08"]
@@ -130,10 +130,11 @@ def test_figures_to_reach(monkeypatch):
 
 
 def test_what_a_liquid_costs_a_rank_is_counted(mpi):
-    """Ghost cells of 28 bytes and more of fields, in 5 layers at the one cut, are filled several times a step.
+    """Count the exchanges of a liquid on ranks.
 
-    Solves begin, and multigrid is built again, without Python between exchanges: it fills no halo
-    of an operator itself.
+    Ghost cells of at least 28 bytes of fields, in 5 layers at the one cut, are filled several times
+    a step. Solves begin, and multigrid is rebuilt, without Python between exchanges, so that no
+    halo of an operator is filled from Python.
     """
     said = mpi(
         2, "-m", "warp_lcp.benchmarks.rank_costs", "dam-break-2d", "domain.resolution=32"
@@ -146,6 +147,6 @@ def test_what_a_liquid_costs_a_rank_is_counted(mpi):
     assert found["cells of the box"] < found["cells stored"] < 32 * 16 * 3
     assert found["Subdomain.fill: bytes a step"] > 28 * 5 * found["cells at cuts"]
     assert 8 < found["Ranks.gather: times a step"] <= 12
-    # particles that move on, and ghosts of a density correction
+    # Particles that migrate, and ghosts of a density correction.
     assert found["MpiMailbox.swap: times a step"] <= 2
     assert not {name for name in found if re.match(r"(Halo|Gathering)\.", name)}

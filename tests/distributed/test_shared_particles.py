@@ -1,4 +1,7 @@
-"""Particles that move from rank to rank, with ranks that take turns in one process: no MPI is needed."""
+"""Migration of particles between ranks, without MPI.
+
+The ranks take turns in one process.
+"""
 
 from typing import Any
 
@@ -46,7 +49,10 @@ def scattered(counts: tuple[int, int, int], n: int) -> tuple[np.ndarray, np.ndar
 
 
 def moved(position: np.ndarray, counts: tuple[int, int, int], step: int) -> np.ndarray:
-    """Return positions up to two cells away, in the domain, that depend on the position alone."""
+    """Return positions up to two cells away, in the domain.
+
+    They depend on the old position alone.
+    """
     axes = 2 if counts[2] == 1 else 3
     hashed = np.abs(np.sin(position[:, :axes].astype(np.float64) * 9137.0 + step))
     way = np.floor(hashed * 5.0).astype(int) - 2
@@ -57,7 +63,7 @@ def moved(position: np.ndarray, counts: tuple[int, int, int], step: int) -> np.n
 
 
 def in_order(particles: Particles) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities in the order in which sums take them."""
+    """Return positions and velocities in the order of deterministic sums."""
     order = np.argsort(particles.exchange.place)
     return particles.position.numpy()[order], particles.velocity.numpy()[order]
 
@@ -113,7 +119,10 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
     [((24, 12, 1), 2, (0,)), ((13, 12, 14), 4, (0, 2)), ((13, 12, 14), 8, (0,))],
 )
 def test_particles_go_around(counts, size, periodic):
-    """What is near a box, also through sides that are one, is seen there once, where it continues the box."""
+    """Ghost particles: everything near a box, also through periodic sides.
+
+    Each appears once, where it continues the box.
+    """
     position, velocity = scattered(counts, 900)
     position[:4, 0] = 0.0, 1e-9, (counts[0] - 1e-3) * SPACING, SPACING
     domain = np.array(
@@ -156,7 +165,7 @@ def test_particles_go_around(counts, size, periodic):
 
 
 def within(x, low, high):
-    """Tell which points lie in a box; in 2-D none has a z."""
+    """Return which points lie in a box; in 2-D points have no z."""
     return ((x >= low) & (x < high))[..., :2].all(axis=-1) & (
         (x[..., 2] == 0.0) | ((x[..., 2] >= low[2]) & (x[..., 2] < high[2]))
     )
@@ -200,14 +209,14 @@ def test_sums_are_of_all_ranks_and_count_each_particle_once():
             if seat.rank
             else np.zeros(len(position), dtype=bool)
         )
-        if seat.rank == 1:  # that of rank 0 has not moved on yet
+        if seat.rank == 1:  # that of rank 0 has not migrated yet
             mine |= part.owners(cells_of(position)) == 0
         particles = Particles(part.grid, position[mine], velocity[mine], affine=False)
         return particles.totals()
 
     for totals in on_ranks(8, work):
         assert (totals.count, totals.bad_positions, totals.bad_velocities) == (500, 0, 0)
-        # squares of float32, rounded in blocks
+        # Squares in float32, rounded in blocks.
         assert totals.mean_square_speed == pytest.approx(alone.mean_square_speed, rel=1e-8)
         np.testing.assert_allclose(totals.center, alone.center, rtol=1e-13)
         np.testing.assert_array_equal([totals.low, totals.high], [alone.low, alone.high])

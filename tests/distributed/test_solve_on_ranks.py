@@ -1,4 +1,7 @@
-"""`mpiexec -n N warp-lcp solve PROBLEM.npz --engine petsc`: each rank reads and solves its box, the first one tells and writes."""
+"""`mpiexec -n N warp-lcp solve PROBLEM.npz --engine petsc`.
+
+Each rank reads and solves its box; the first one prints and writes.
+"""
 
 import numpy as np
 import pytest
@@ -54,13 +57,16 @@ def test_ranks_solve_what_one_process_solves(mpi, problem, tmp_path):
             f"{ranks}, "
         )
         assert lines[-1].startswith("CONVERGED: ")
-        assert done.stdout.count("CONVERGED") == 1  # one rank speaks
+        assert done.stdout.count("CONVERGED") == 1  # one rank prints
         iterations = int(lines[-2].split()[0])
         assert abs(iterations - alone.result.iterations) <= 1
 
 
 def test_two_dimensions_and_boxes(mpi, tmp_path):
-    """Numbers as bounds, a file in Fortran's order, ranks along the longer side."""
+    """Solve a 2-D problem and boxes.
+
+    Numbers as bounds, a file in Fortran order, ranks along the longer side.
+    """
     cells = np.full((12, 30), wl.FLUID, dtype=np.int8)
     cells[-3:] = wl.AIR
     cells[:4, 11:14] = wl.SOLID
@@ -87,7 +93,7 @@ def test_two_dimensions_and_boxes(mpi, tmp_path):
     assert (x.min(), x.max()) == (-0.5, 0.75)
 
 
-WRONG = {  # commands, with what is said of each
+WRONG = {  # commands, with the message of each
     "none.npz": "none.npz: is not a recorded problem",
     "A.mtx b.mtx": "A.mtx: --engine petsc solves only grid problems",
     "problem_000004.npz --method psor": "--method psor: does not work on several ranks; choose "

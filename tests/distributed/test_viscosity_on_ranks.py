@@ -1,4 +1,4 @@
-"""The viscous equations that ranks share are one process's, and so is the cycle that preconditions them."""
+"""Viscous equations on ranks against one process, with their preconditioner."""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Ranks that wait for one that does not come end, and say which one that is and where it is."""
+"""Deadlock watchdog: ranks that wait for a missing one end and name it.
+
+They also say where it is.
+"""
 
 import re
 import sys
@@ -72,7 +75,7 @@ def test_the_late_one_is_named(posts, expected):
     said = verdict(dict(enumerate(posts)))
     assert said.startswith(expected)
     assert bool(said) == bool(expected)
-    assert verdict(dict(reversed(list(enumerate(posts))))) == said  # whichever rank says it
+    assert verdict(dict(reversed(list(enumerate(posts))))) == said  # whichever rank reports it
 
 
 def test_a_post_is_there_whole_or_not_at_all(tmp_path):
@@ -128,7 +131,7 @@ ENDS = {
 
 @pytest.mark.parametrize("what", ENDS)
 def test_waiting_ends(mpi, what):
-    """Where the program makes no folder known, ranks of one machine still hear of each other."""
+    """Heartbeats between ranks of one machine without a known folder."""
     done = mpi(3, WAIT, what, exit_code=None, seconds=60.0)
     assert done.returncode != 0
     assert "done" not in done.stdout
@@ -137,7 +140,7 @@ def test_waiting_ends(mpi, what):
 
 
 def test_no_operation_goes_unwatched():
-    """What waits for other ranks does so inside `waiting`, in the few places that call MPI."""
+    """Collective calls only inside `waiting`, in the few places that call MPI."""
     calls = re.compile(
         r"\.(I?([Aa]ll|[Bb]arrier|[Bb]cast|[Gg]ather|[Ss]catter|[Rr]educe|[Ss]can)\w*|[Ss]end|[Rr]ecv|Wait\w*|Split\w*)\("
     )

@@ -1,4 +1,4 @@
-"""Ranks that take turns in one process, a thread each: no MPI is needed."""
+"""Ranks that take turns in one process, a thread each, without MPI."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-WAIT = 60.0  # seconds for the others
+WAIT = 60.0  # [s] limit of a wait
 
 
 class Table:
-    """What threads that take turns lay down for each other."""
+    """Exchange of values between threads that take turns."""
 
     def __init__(self, size: int) -> None:
         self.turn, self.barrier, self.laid = threading.Lock(), threading.Barrier(size), {}
 
     def exchange(self, rank: int, value: Any) -> dict[int, Any]:
-        """Return what every rank has laid down."""
+        """Return the values of all ranks."""
         self.laid[rank] = value
         self._meet()
         found = dict(self.laid)
@@ -34,7 +34,7 @@ class Table:
 
 
 class Seat:
-    """A rank's place at the table: a communicator, as far as `Ranks` needs one, and a post."""
+    """Communicator and mailbox of a rank, as far as `Ranks` needs them."""
 
     def __init__(self, rank: int, size: int, table: Table | None = None) -> None:
         self.rank, self.size, self._table = rank, size, table or Table(size)
@@ -57,7 +57,10 @@ class Seat:
 
 
 def on_ranks(size: int, work: Callable[[Seat], Any]) -> list[Any]:
-    """Return what some work gives on each rank; only one of them computes at a time."""
+    """Return the results of some work on each rank.
+
+    Only one rank computes at a time.
+    """
     table, found, errors = Table(size), [None] * size, []
 
     def run(rank: int) -> None:

@@ -1,4 +1,7 @@
-"""The viscous equations on ranks, which `test_viscosity_on_ranks` starts: a cycle and a product of all ranks against one process's."""
+"""Viscous equations on ranks; `test_viscosity_on_ranks` starts this program.
+
+A cycle and a product of all ranks are compared with those of one process.
+"""
 
 from pathlib import Path
 
@@ -11,15 +14,18 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.fluids import viscosity_multigrid
 from warp_lcp.fluids.simulator import FluidsSimulator, LiquidSimulation
 
-# 3-D and 2-D, cut along rows and across, with two to four shared levels and cores that lie in one
-# box or in both
+# 3-D and 2-D, cut along rows and across, with two to four distributed levels. Cores lie in one box
+# or in both.
 SEEDS = (10, 21, 27)
-ROUNDING = 1e-6  # where a cut lies in a row, other cells of it are computed together
+ROUNDING = 1e-6  # where a cut lies in a row, cells of the row are grouped differently
 STIFF = {"value": 300.0}
 
 
 def applied(simulation: LiquidSimulation, whole: np.ndarray) -> list[np.ndarray]:
-    """Return z = M r and A z on the cells of a simulation, shape (d, nz, ny, nx), of r as it is on the whole grid."""
+    """Return z = M r and A z on the cells of a simulation, shape (d, nz, ny, nx).
+
+    r is that of the whole grid.
+    """
     multigrid, grid = simulation.viscosity.multigrid, simulation.grid
     own = grid.part.owned
     inside = tuple(slice(low, high) for low, high in zip(own.low, own.high, strict=True))
@@ -40,7 +46,7 @@ def applied(simulation: LiquidSimulation, whole: np.ndarray) -> list[np.ndarray]
 
 
 def main() -> None:
-    """Share all levels that boxes allow."""
+    """Distribute all levels that boxes allow, and compare."""
     ranks = Ranks.world()
     viscosity_multigrid.GATHERED = 8
     for seed in SEEDS:

@@ -1,4 +1,7 @@
-"""A tolerance that follows the time step: what a solve leaves is small beside what the step's length does, and no smaller."""
+"""Automatic tolerance of the pressure from the time step.
+
+The error of a solve is small beside that of the time step, and no smaller than necessary.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ AUTO = {"tolerance": "auto"}
 
 
 def velocity_errors(simulation: Any, steps: int, patch: pytest.MonkeyPatch) -> np.ndarray:
-    """Return the error in the velocity that each step's solve left, against one that goes on, root mean square [m/s]."""
+    """Return the velocity error of each step's solve, root mean square [m/s].
+
+    Relative to a solve that continues further.
+    """
     solve, errors = wl.solve, []
 
     def solving(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
@@ -90,7 +96,10 @@ def test_free_fall_is_not_iterated_on() -> None:
 
 
 def test_the_run_is_that_of_an_exact_solver_as_far_as_its_steps_allow() -> None:
-    """Front and energy: nearer to the exact solver's run than that is to one of half the time step."""
+    """Front and energy of a run with automatic tolerance.
+
+    They are nearer to those of an exact solver than those are to a run of half the time step.
+    """
     runs: dict[str, tuple[float, float]] = {}
     for name, tolerance, dt in (
         ("auto", "auto", 8e-3),

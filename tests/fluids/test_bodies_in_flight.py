@@ -1,4 +1,7 @@
-"""What touches no wall keeps its momentum and its angular momentum, and its center of mass goes along a parabola."""
+"""Momentum and angular momentum of airborne material.
+
+The center of mass moves along a parabola.
+"""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -12,7 +15,7 @@ import small_sands
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
-RIM = 2.0  # [m/s] of drops that spin: three quarters of a turn of a drop of .17 m in .4 s
+RIM = 2.0  # [m/s] of spinning drops: three quarters of a turn of a drop of 0.17 m in 0.4 s
 FLIGHT = 0.4  # [s]
 
 Chosen = Callable[[np.ndarray], np.ndarray]
@@ -23,7 +26,7 @@ def ball(center: list[float], radius: float) -> dict[str, Any]:
 
 
 def in_order(simulation: LiquidSimulation) -> LiquidSimulation:
-    """Keep the particles in their places, so that the test knows which is which."""
+    """Keep the particles in their order, so that the test can identify them."""
     simulation.particles.arrange = lambda step: simulation.particles.number()  # type: ignore[method-assign]
     return simulation
 
@@ -31,7 +34,7 @@ def in_order(simulation: LiquidSimulation) -> LiquidSimulation:
 def launch(
     simulation: LiquidSimulation, chosen: Chosen, velocity: list[float], spin: float
 ) -> np.ndarray:
-    """Give the chosen particles a rigid motion, gradients included; return which they are."""
+    """Set the chosen particles to a rigid motion, gradients included; return them."""
     particles = simulation.particles
     x = particles.position.numpy().astype(np.float64)
     which = chosen(x)
@@ -47,7 +50,10 @@ def launch(
 
 
 def turning(simulation: LiquidSimulation, which: np.ndarray, *, gradients: bool = False) -> float:
-    """Return the angular momentum of particles about their center, per particle, also with what gradients carry [m^2/s]."""
+    """Return the angular momentum of particles about their center [m^2/s].
+
+    It is divided by the number of particles. The part of the gradients is optional.
+    """
     dx, x = simulation.grid.spacing, simulation.particles.position.numpy().astype(np.float64)[which]
     v = simulation.particles.velocity.numpy().astype(np.float64)[which]
     arm = x - x.mean(axis=0)
@@ -77,7 +83,11 @@ def everything(x: np.ndarray) -> np.ndarray:
 def test_a_spinning_drop_keeps_its_angular_momentum_and_its_energy(
     transfer: str, cfl: float
 ) -> None:
-    """Without gravity; it lost 18 % at CFL 2 (APIC), 30 % (PIC). What APIC's gradients carry hangs on where in cells particles are."""
+    """Angular momentum and energy of a spinning drop without gravity.
+
+    Without conservation 18 % were lost at CFL 2 (APIC), 30 % (PIC). The part of APIC's gradients
+    depends on the places of particles in cells.
+    """
     weightless = {"physics": {"gravity": [0.0, 0.0]}, "particles": {"transfer": transfer}}
     drop = create(
         scene(
@@ -106,7 +116,10 @@ def test_a_spinning_drop_keeps_its_angular_momentum_and_its_energy(
 def test_what_spins_in_flight_goes_along_its_parabola(
     model: str, cfl: float, dimension: int
 ) -> None:
-    """A block that turns, where it is not round; it was 2 % of the way off."""
+    """Parabola of a spinning block, which is not round.
+
+    Without conservation it was 2 % of the way off.
+    """
     low, high = np.array([0.6, 1.0, 0.9]), np.array([1.0, 1.3, 1.2])
     cells = 40 if dimension == 2 else 20
     liquid = [box(low[:dimension].tolist(), high[:dimension].tolist())]
@@ -126,7 +139,7 @@ def test_what_spins_in_flight_goes_along_its_parabola(
     np.testing.assert_allclose(
         center(block, which), expected, atol=1e-4 * float(np.linalg.norm(expected - before))
     )
-    # the other kind flies apart, into particles that turn about nothing but themselves
+    # The other model separates it into particles that turn about nothing but themselves.
     if model == "incompressible":
         assert turning(block, which) == pytest.approx(turned, rel=1e-3)
 
@@ -153,7 +166,10 @@ def test_drops_that_collide_in_flight_keep_their_common_parabola() -> None:
 
 @pytest.mark.cpu_form("particles are sorted in every step on CUDA")
 def test_a_drop_flies_over_a_pool_that_rests() -> None:
-    """Each is a body of its own; the pool touches walls and is left alone."""
+    """Flight of a drop over a resting pool.
+
+    Each is a separate body; the pool touches walls and is left alone.
+    """
     pool = in_order(
         create(
             scene(
@@ -173,13 +189,16 @@ def test_a_drop_flies_over_a_pool_that_rests() -> None:
     assert turning(pool, drop) == pytest.approx(turned, rel=1e-4)
     assert pool.flights is not None
     assert np.abs(pool.particles.velocity.numpy()[~drop]).max() < 0.1
-    advance(pool, 0.5)  # the drop has come down: now nothing flies but what it throws up
+    advance(pool, 0.5)  # the drop has landed: only splashes are airborne now
     assert center(pool, drop)[1] < 0.6
 
 
 @pytest.mark.parametrize(("key", "materials"), [("liquid", small_liquids), ("sand", small_sands)])
 def test_a_small_drop_does_not_fly_through_a_plate(key: str, materials: ModuleType) -> None:
-    """A plate of a cell, a step of six: the drop's cells are far from it before the step and after."""
+    """Small drop against a plate of one cell, with steps of six cells.
+
+    The drop's cells are far from the plate before the step and after.
+    """
     width = 1.0 / 32.0
     for offset in range(4):
         low = 0.1 + offset * width
@@ -195,12 +214,15 @@ def test_a_small_drop_does_not_fly_through_a_plate(key: str, materials: ModuleTy
 
 
 def test_a_drop_that_meets_a_wall_in_the_step_is_left_to_it() -> None:
-    """The step that ends at a wall, as near as its cells are, gives no body a velocity through it."""
+    """Drop that meets a wall within the step.
+
+    The step ends at a wall, as near as the cells are; no body gets a velocity through it.
+    """
     drop = create(scene(size=[1.0, 1.0], resolution=32, liquid=[ball([0.5, 0.4], 0.15)], cfl=8.0))
     which = launch(drop, everything, [0.0, -3.0], 10.0)
     rows = advance(drop, 0.3)
     energy = [row["kinetic_energy"] + row["potential_energy"] for row in rows]
-    assert np.diff(energy).max() < 1e-2 * energy[0]  # as of an impact on so few cells
+    assert np.diff(energy).max() < 1e-2 * energy[0]  # loss of an impact on so few cells
     x = drop.particles.position.numpy()[which]
     assert (x[:, :2] > 0.0).all() and (x[:, :2] < 1.0).all()
     assert energy[-1] < 0.7 * energy[0]

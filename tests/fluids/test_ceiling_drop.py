@@ -1,4 +1,7 @@
-"""Letting go of the ceiling, validation.md 3: the mean falls even when the last particle hangs, so the last one counts."""
+"""Separation from the ceiling, validation.md 3: the last particle counts.
+
+The mean falls even if the last particle hangs.
+"""
 
 from typing import Any
 
@@ -23,10 +26,10 @@ def block(dimension: int, **tables: Any) -> LiquidSimulation:
 def drop(
     simulation: LiquidSimulation, until: float
 ) -> tuple[np.ndarray, float, list[dict[str, Any]]]:
-    """Let it fall; return how far each particle did and should have [cells], and the log.
+    """Let the block fall; return ways, expected ways [cells] and the log.
 
-    Particles are matched by their order from the floor up, which a rigid fall keeps and a straggler
-    can only lose places in.
+    Particles are matched by their order from the floor up. A rigid fall keeps it, and a straggler
+    can only lose places in it.
     """
     start = np.sort(simulation.particles.position.numpy()[:, 1])
     rows = []
@@ -48,7 +51,7 @@ def test_every_particle_falls_freely(dimension: int, transfer: str) -> None:
     simulation = block(dimension, particles={"transfer": transfer})
     fallen, expected, rows = drop(simulation, 0.25)
     assert expected > {2: 8, 3: 4}[dimension]
-    assert np.abs(fallen - expected).max() < 0.01  # validation.md asks for half a cell
+    assert np.abs(fallen - expected).max() < 0.01  # validation.md requires half a cell
     assert (simulation.projection.pressure.numpy() == 0.0).all()
     assert rows[0]["active"] > 0
     assert rows[-1]["active"] == 0
@@ -57,12 +60,15 @@ def test_every_particle_falls_freely(dimension: int, transfer: str) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_free_slip_walls_hold_it_by_suction(dimension: int) -> None:
-    """The negative control of the walls: liquid that may not leave hangs, with a negative pressure."""
+    """Suction of free-slip walls: the negative control of the walls.
+
+    Liquid that may not separate hangs, with a negative pressure.
+    """
     simulation = block(dimension, wall="free-slip")
     fallen, expected, rows = drop(simulation, 0.25)
     assert expected > {2: 8, 3: 4}[dimension]
     assert abs(fallen.mean()) < 0.1
-    assert np.abs(fallen).max() < 1.0  # a few drops let go of the free surface
+    assert np.abs(fallen).max() < 1.0  # a few drops separate from the free surface
     assert simulation.projection.pressures(1000.0).min() == pytest.approx(
         -1000.0 * GRAVITY * 0.2, rel=0.15
     )
@@ -72,7 +78,10 @@ def test_free_slip_walls_hold_it_by_suction(dimension: int) -> None:
 def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The negative control of the release: the mean looks right, the last particle lags."""
+    """Wall velocity kept at released cells: the negative control of the release.
+
+    The mean looks right, but the last particle lags.
+    """
     extend = boundary.extend_velocity
 
     def hold(

@@ -1,4 +1,4 @@
-"""Liquid on solids that cut cells: which kernels a scene gets, and the pressure on a slope."""
+"""Liquid on solids that cut cells: choice of kernels, pressure on a slope."""
 
 import math
 from typing import Any
@@ -45,7 +45,11 @@ def test_only_solids_that_cut_cells_cost_face_coefficients(
 
 
 def test_whole_cells_keep_the_unit_weights_of_the_operator() -> None:
-    """A free surface between cells is in the diagonal alone, so that the kernels for unit weights serve."""
+    """Unit weights of the operator on whole cells.
+
+    A free surface between cells affects the diagonal alone, so that the kernels for unit weights
+    apply.
+    """
     cells = np.full((4, 5), wl.FLUID)
     cells[-1] = wl.AIR
     A = wl.GridPoisson(cells, shift=0.5, device="cpu")
@@ -54,7 +58,11 @@ def test_whole_cells_keep_the_unit_weights_of_the_operator() -> None:
 
 @pytest.mark.parametrize("resolution", [16, 32])
 def test_the_pressure_over_slopes_is_that_of_the_depth(resolution: int) -> None:
-    """p = rho g (h - y) at every liquid cell's center, cut or not: with stairs or a clamped surface it is off by half a cell."""
+    """Hydrostatic pressure over slopes.
+
+    p = rho g (h - y) at every liquid cell's center, cut or not. With stairs or a clamped surface it
+    is off by half a cell.
+    """
     simulation = pool(resolution, solid=V)
     advance(simulation, 0.2)
     dx = simulation.grid.spacing
@@ -76,7 +84,7 @@ def test_no_particle_enters_a_solid() -> None:
     position = simulation.particles.position.numpy()
     far = np.hypot(position[:, 0] - 0.55, position[:, 1] - 0.15)
     assert max(row["stopped"] for row in rows) > 0
-    # the chord of a cell
+    # Chord of a cell.
     assert (
         far.min()
         > 0.17 - 0.01 * simulation.grid.spacing - 0.125 * simulation.grid.spacing**2 / 0.17

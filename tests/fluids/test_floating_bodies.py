@@ -1,4 +1,7 @@
-"""Bodies and liquid in one pressure problem: its columns, momentum and energy between them, and which way bodies go."""
+"""Bodies and liquid in one pressure problem.
+
+The tests cover its columns, exchange of momentum and energy, and the direction of motion of bodies.
+"""
 
 import numpy as np
 import pytest
@@ -17,7 +20,10 @@ def disc(center, radius, **more):
 
 
 def crowded(dimension, model="incompressible"):
-    """Two bodies that share cells, one beside a standing solid and the wall, in a tank almost full of liquid."""
+    """Return two bodies that share cells, in a tank almost full of liquid.
+
+    One is beside a standing solid and the wall.
+    """
     if dimension == 2:
         bodies = [
             disc([0.3, 0.41], 0.13, density=700.0),
@@ -43,7 +49,7 @@ def crowded(dimension, model="incompressible"):
 
 
 def dense_columns(simulation):
-    """U as a dense matrix on stored cells."""
+    """Return U as a dense matrix on stored cells."""
     columns = simulation.projection.coupling.columns
     rows, blocks, values = columns.entries()
     U = np.zeros((columns.size, columns.rank))
@@ -55,7 +61,10 @@ def dense_columns(simulation):
 @pytest.mark.parametrize("model", ["incompressible", "unilateral"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, model):
-    """Else the pressure would give bodies another momentum than it takes from the liquid."""
+    """Columns against the change of the right-hand side by velocities.
+
+    Otherwise the pressure would give bodies another momentum than it takes from the liquid.
+    """
     simulation = crowded(dimension, model)
     simulation.step(1e-4)
     projection, rng = simulation.projection, np.random.default_rng(67)
@@ -84,7 +93,10 @@ def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, m
 
 
 def projected(simulation, dt):
-    """Project once; return velocities before and after, and the bodies' velocities (6 each) before and after."""
+    """Project once; return velocities before and after.
+
+    The velocities of the bodies (6 each) are returned too.
+    """
     before, taken = simulation.begin_step(dt), {}
     window = simulation.window(before)
     simulation.particles_to_grid(window)
@@ -111,7 +123,10 @@ def projected(simulation, dt):
 
 
 def drop_that_meets_a_body(dimension, ratio, wall):
-    """Liquid around most of a body flies against it, far from all walls."""
+    """Return liquid that flies against a body, far from all walls.
+
+    It surrounds most of the body.
+    """
     weightless = {"physics": {"gravity": [0.0] * dimension}}
     body = box(
         [0.46, 0.4, 0.4][:dimension],
@@ -143,7 +158,11 @@ def drop_that_meets_a_body(dimension, ratio, wall):
 @pytest.mark.parametrize("ratio", [0.01, 1.0, 100.0])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_momentum_is_exchanged_without_loss_and_energy_without_gain(dimension, ratio, wall):
-    """Where no wall is near and the surface lies on faces, the pressure's impulses add up to nothing, whatever the solve left."""
+    """Momentum exchange without loss, and energy without gain.
+
+    Where no wall is near and the surface lies on faces, the pressure's impulses sum to 0, whatever
+    the residual of the solve.
+    """
     simulation = drop_that_meets_a_body(dimension, ratio, wall)
     before, after, V, W = projected(simulation, 0.01)
     mass, scale = simulation.bodies.bodies[0].properties.mass, 1000.0 * simulation.grid.cell_volume
@@ -161,14 +180,18 @@ def test_momentum_is_exchanged_without_loss_and_energy_without_gain(dimension, r
         total[n] += mass * v[:3]
         energy[n] += 0.5 * mass * v[:3] @ v[:3] + 0.5 * v[3:] @ inertia @ v[3:]
     np.testing.assert_allclose(total[1], total[0], atol=2e-6 * np.abs(total[0]).max())
-    assert np.abs(mass * (W[0] - V[0])[0]) > 1e-3 * np.abs(total[0]).max()  # there was an exchange
+    # Some momentum was exchanged.
+    assert np.abs(mass * (W[0] - V[0])[0]) > 1e-3 * np.abs(total[0]).max()
     assert W[0][0] > 0.0
     assert energy[1] < energy[0]
 
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_jet_turns_what_it_hits_off_center(above):
-    """A force along x above the center turns clockwise: the torque about z is -r_y F_x."""
+    """Torque of a jet that hits off center.
+
+    A force along x above the center turns clockwise: the torque about z is -r_y F_x.
+    """
     low = 0.5 if above else 0.3
     liquid = [box([0.1, low], [0.4, low + 0.2], velocity=[2.0, 0.0])]
     body = box([0.42, 0.3], [0.5, 0.7], density=500.0)
@@ -212,7 +235,11 @@ def test_light_bodies_rise_and_heavy_ones_sink(density, sign, model):
 
 
 def test_liquid_lets_go_of_a_body_that_leaves_it():
-    """A separating body that is thrown up out of the water is not held back; a free-slip one pulls the water up behind it."""
+    """Separation of liquid from a body that leaves it.
+
+    A separating body that is thrown up out of the water is not held back; a free-slip one pulls the
+    water up behind it.
+    """
     speeds = {}
     for wall in ("separating", "free-slip"):
         body = box([0.4, 0.3], [0.6, 0.5], density=300.0, velocity=[0.0, 3.0], wall=wall)
@@ -232,7 +259,10 @@ def test_liquid_lets_go_of_a_body_that_leaves_it():
 
 
 def test_bodies_of_all_weights_in_one_tank():
-    """The columns of one problem reach from 1e-3 to 1e3 times the liquid's density."""
+    """Bodies of all weights in one tank.
+
+    The columns of one problem reach from 1e-3 to 1e3 times the liquid's density.
+    """
     densities = (1.0, 30.0, 1000.0, 3e4, 1e6)
     bodies = [
         disc([0.2 + 0.3 * n, 0.3], 0.1, density=density) for n, density in enumerate(densities)
@@ -281,7 +311,7 @@ def test_a_failed_step_leaves_the_bodies_as_they_were():
 
 
 def light_raft():
-    """A body that the preconditioner is corrected for."""
+    """Return a light body, for which the preconditioner is corrected."""
     raft = box([0.3, 0.42], [0.7, 0.55], density=20.0)
     return create(
         scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[raft])
@@ -340,7 +370,11 @@ def test_methods_agree_on_where_bodies_go(method):
 
 
 def test_what_a_body_buries_does_not_fall_for_ever():
-    """Particles between a body and the floor it has sunk to have no open face near: gravity alone would act on them."""
+    """Particles buried by a body.
+
+    Particles between a body and the floor to which it has sunk have no open face near; gravity
+    alone would act on them.
+    """
     body = box([0.3, 0.05], [0.7, 0.2], density=4000.0)
     simulation = create(
         scene(size=[1.0, 0.75], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.4])], solid=[body])

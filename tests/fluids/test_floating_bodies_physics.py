@@ -1,4 +1,4 @@
-"""Rigid bodies in a liquid against answers that are known: added mass, displacement at rest."""
+"""Rigid bodies in a liquid against known results: added mass, displacement."""
 
 import pytest
 
@@ -6,11 +6,11 @@ from small_liquids import GRAVITY, box, create, scene
 from warp_lcp.benchmarks.validation.floating import displacement
 
 STEP = 1e-3  # [s]
-WIDE = 6  # diameters of the body that the tank has
+WIDE = 6  # diameters of the body in the tank's width
 
 
 def first_acceleration(dimension, cells, ratio, wall="free-slip"):
-    """The acceleration from rest of a disc or a sphere in a closed tank full of liquid."""
+    """Return the acceleration from rest of a disc or sphere in a full closed tank."""
     ball = {
         "shape": "sphere",
         "center": [0.5] * dimension,
@@ -30,12 +30,16 @@ def first_acceleration(dimension, cells, ratio, wall="free-slip"):
     row = simulation.step(STEP)
     assert row["solve_status"] == "CONVERGED"
     assert abs(row["body0_vx"]) < 1e-3 * abs(row["body0_vy"])
-    return row["body0_vy"] / (0.5 * STEP)  # in the middle of the step
+    return row["body0_vy"] / (0.5 * STEP)  # velocity of the middle of the step
 
 
 @pytest.mark.parametrize("ratio", [0.01, 0.5, 3.0])
 def test_a_disc_sets_off_with_its_added_mass(ratio):
-    """That of its own displacement, (1 + q^2) / (1 - q^2) times as much in a round tank of 1/q diameters; the square one is like it."""
+    """Added mass of a disc.
+
+    (1 + q^2) / (1 - q^2) times its displacement in a round tank of 1/q diameters; that of the
+    square one is close to it.
+    """
     q = 1.0 / WIDE
     added = (1.0 + q**2) / (1.0 - q**2)
     assert first_acceleration(2, 16, ratio) == pytest.approx(
@@ -51,7 +55,11 @@ def test_walls_that_let_go_of_liquid_do_not_change_how_a_disc_sets_off():
 
 @pytest.mark.parametrize("ratio", [0.1, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_a_sphere_sets_off_with_its_added_mass(ratio):
-    """Half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q diameters."""
+    """Added mass of a sphere.
+
+    It is half of its displacement, (1 + 2 q^3) / (1 - q^3) times as much in a round tank of 1/q
+    diameters.
+    """
     q = 1.0 / WIDE
     added = 0.5 * (1.0 + 2.0 * q**3) / (1.0 - q**3)
     assert first_acceleration(3, 10, ratio) == pytest.approx(
@@ -62,7 +70,10 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio):
 @pytest.mark.slow
 @pytest.mark.parametrize(("dimension", "cells"), [(2, 48), (3, 32)])
 def test_a_box_floats_at_its_displacement(dimension, cells):
-    """The mean over its bobbing, measured from the free surface around it."""
+    """Displacement of a floating box.
+
+    It is the mean over its bobbing, measured from the free surface around it.
+    """
     trial = displacement(dimension, cells, 0.6)
     assert trial.failures() == []
     assert trial.findings[0].value == pytest.approx(1.0, abs=0.02)

@@ -1,4 +1,7 @@
-"""Frames of runs in each format: cells as VTU and VTI show the same, and volumes lie where the particles are."""
+"""Frames of runs in each format.
+
+Cells as VTU and VTI are equal, and volumes lie where the particles are.
+"""
 
 from pathlib import Path
 
@@ -24,7 +27,10 @@ def run(out: Path, scene: str, *overrides: str) -> Path:
 
 
 def dense(path: Path, outside: float, shape: tuple[int, int, int]) -> np.ndarray:
-    """Return the voxels of a file's leaves, x first, found by their size alone: they end the file."""
+    """Return the voxels of a file's leaves, x first.
+
+    They are found by their size alone: they end the file.
+    """
     data, tree = path.read_bytes(), 16 + 176 + len(path.stem.rpartition("_")[0]) + 1 + 672
     leaves = np.frombuffer(
         data[-int(np.frombuffer(data, "<u4", 1, tree + 32)[0]) * LEAF_NODE.itemsize :], LEAF_NODE
@@ -49,7 +55,7 @@ def test_volumes_lie_where_the_particles_are(tmp_path, scene):
         density = dense(out / "frames" / f"density_{index:06d}.nvdb", 0.0, model.cell_counts)
         distance = dense(out / "frames" / f"level_set_{index:06d}.nvdb", 9.0, model.cell_counts)
         at_rest = model.particles.per_axis**3
-        # of kernels at walls a part lies outside
+        # A part of kernels at walls lies outside.
         np.testing.assert_allclose(density.sum() * at_rest, len(particles), rtol=0.12)
         cells = tuple(np.floor(particles / model.spacing).astype(int).T)
         assert (density[cells] > 0.1).all()
@@ -63,10 +69,10 @@ def test_volumes_lie_where_the_particles_are(tmp_path, scene):
         filled[cells] = True
         assert (distance[~filled] > -0.5 * model.spacing).all()
 
-    def columns(folder: Path) -> list[list[str]]:  # but the last, the seconds
+    def columns(folder: Path) -> list[list[str]]:  # except the last one, the seconds
         return [line.split(",")[:-1] for line in (folder / "log.csv").read_text().splitlines()]
 
-    assert columns(plain) == columns(out)  # the volume leaves the run as it is
+    assert columns(plain) == columns(out)  # the volume does not change the run
     assert not list(plain.glob("frames/*.nvdb"))
 
 

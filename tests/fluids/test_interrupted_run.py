@@ -1,4 +1,4 @@
-"""A liquid's run that is interrupted and resumed writes the same bytes as one that is not."""
+"""Interrupted and resumed runs of a liquid: same bytes as uninterrupted ones."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from warp_lcp.scene.scene_file import load_scene
 
 
 class Silent:
-    """An observer that counts steps."""
+    """Observer that counts steps."""
 
     def __init__(self):
         self.steps = 0
@@ -87,7 +87,7 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
     [
         (2, {}),
         (2, {"solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
-        # a level set that reaches farther than a step
+        # A level set that reaches farther than a step.
         (2, {"pressure": {"smoothing": 8}, "cfl": 0.5}),
         (2, {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}}),
         (3, {"pressure": {"smoothing": 1}}),
@@ -105,7 +105,10 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
     ],
 )
 def test_nothing_but_the_state_is_remembered(dimension: int, tables: dict[str, Any]) -> None:
-    """A fresh simulation takes the same step from any state: fields hold nothing of where the liquid was before."""
+    """Equal steps of a fresh simulation from any state.
+
+    Fields hold nothing of earlier positions of the liquid.
+    """
 
     def cut_down(solid: dict[str, Any]) -> dict[str, Any]:
         motion = solid.get("motion")
@@ -124,7 +127,7 @@ def test_nothing_but_the_state_is_remembered(dimension: int, tables: dict[str, A
         )
     )
     for number in range(12):
-        if number == 8:  # the window jumps and shrinks
+        if number == 8:  # the window moves and shrinks
             position = old.particles.position.numpy().copy()
             position[:, 1] = 0.6 * position[:, 1] + 0.01
             old.particles.position.assign(position)

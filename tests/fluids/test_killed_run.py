@@ -1,4 +1,7 @@
-"""The command line, killed with SIGKILL at random moments and resumed: every file is that of a run that nothing happened to."""
+"""Command line killed by SIGKILL at random moments and resumed.
+
+Every file is that of an uninterrupted run.
+"""
 
 import json
 import multiprocessing
@@ -40,7 +43,7 @@ motion = { kind = "sinusoid", period = 0.7, amplitude = [0.1, 0.0] }
 checkpoint_every = 7
 """
 PROGRAM = "from warp_lcp.cli.commands import main; main()"
-LIMIT = 120  # [s] that a process may take
+LIMIT = 120  # [s] limit of a process
 
 pytestmark = [
     pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL"),
@@ -58,7 +61,10 @@ def start(scene: Path, out: Path, *more: str) -> subprocess.Popen:
 
 
 class Fork:
-    """The command line in a fork of this process, which has imported everything: starts in no time, and dies as any other."""
+    """Command line in a fork of this process.
+
+    The fork has imported everything, so that it starts at once. It dies as any other process.
+    """
 
     def __init__(self, scene: Path, out: Path, *more: str) -> None:
         self.printed = out.with_suffix(".txt")
@@ -89,13 +95,13 @@ class Fork:
 
 
 def call(scene: Path, out: Path, *more: str) -> tuple[int, str]:
-    """Run in this process; return the exit code and what was printed."""
+    """Run in this process; return the exit code and the output."""
     result = CliRunner().invoke(cli.app, arguments(scene, out, *more))
     return result.exit_code, result.output
 
 
 def wait_until_it_holds(process: subprocess.Popen | Fork, out: Path) -> None:
-    """Wait until the process has the folder, or is over."""
+    """Wait until the process holds the folder, or has ended."""
     until = time.monotonic() + LIMIT
     while process.poll() is None and time.monotonic() < until:
         try:
@@ -112,7 +118,10 @@ def record(out: Path) -> dict:
 
 
 def results(out: Path) -> dict[str, bytes]:
-    """Return the bytes of every frame, collection and checkpoint, and the log's rows without their seconds."""
+    """Return the bytes of every output file, and the log without seconds.
+
+    The files are frames, collections and checkpoints.
+    """
     files = [*out.glob("frames/*"), *out.glob("*.pvd"), *out.glob("checkpoints/*")]
     found = {str(path.relative_to(out)): path.read_bytes() for path in files}
     rows = (out / "log.csv").read_text().splitlines()
@@ -127,7 +136,7 @@ def newest_step(out: Path) -> int:
 
 
 class Before:
-    """What lies in the folder of a killed run, to be compared with what its continuation made of it."""
+    """Contents of a killed run's folder, to compare with its continuation."""
 
     def __init__(self, out: Path) -> None:
         self.out, self.step = out, newest_step(out)
@@ -152,9 +161,13 @@ class Before:
         return status.st_ino, status.st_mtime_ns, status.st_size
 
     def check(self) -> int:
-        """Compare with what is there now: nothing up to the checkpoint was written again. Return the steps that were not repeated."""
+        """Compare with the present contents.
+
+        Nothing up to the checkpoint may have been written again. Return the steps that were not
+        repeated.
+        """
         assert record(self.out)["resumed_from_step"] == self.step
-        if self.step:  # a row keeps the seconds of the process that computed it
+        if self.step:  # a row has the seconds of the process that computed it
             assert (self.out / "log.csv").read_text().splitlines()[: self.step + 1] == self.rows
         assert {path: self.stamp(path) for path in self.frames} == self.frames
         return self.step
@@ -163,11 +176,14 @@ class Before:
 def kill_and_resume(
     folder: Path, kills: int, seed: int, begin: Callable[..., Any], duration: float
 ) -> list[int]:
-    """Run, kill, resume and kill again, until `kills` processes died at random moments; return the steps resumed from."""
+    """Run, kill, resume and kill again, until `kills` processes died.
+
+    They die at random moments. Return the steps resumed from.
+    """
     scene = folder / "scene.toml"
     scene.write_text(SCENE.replace("duration = 1.5", f"duration = {duration}"))
     whole = folder / "whole"
-    # the first loads, and compiles what is not compiled yet
+    # The first run loads and compiles kernels.
     for option in (["--set", "time.duration=0.1"], ["--force"]):
         code, text = call(scene, whole, *option)
         assert code == 0, text
@@ -212,7 +228,7 @@ def test_twenty_kills(tmp_path):
     steps = kill_and_resume(tmp_path, 20, 80317, start, 1.5)
     print(f"resumed from steps {steps}")
     assert len(steps) >= 15
-    # killed all along the run: how far each got is the machine's business
+    # Killed all along the run: the progress of each depends on the machine.
     assert len(set(steps)) >= 5
 
 
@@ -224,7 +240,7 @@ def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
         wait_until_it_holds(process, out)
         for option in ("--resume", "--force"):
             code, text = call(scene, out, option)
-            # it held the folder, and had not written yet
+            # It held the folder and had not written yet.
             if option == "--resume" and "no run to resume" in text:
                 continue
             assert code == 2, text

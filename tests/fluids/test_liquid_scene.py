@@ -88,7 +88,7 @@ def test_the_plan_says_what_moves_particles_apart() -> None:
 def test_the_estimate_of_memory_counts_what_the_options_add(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(coverage, "LEAST_CELLS", 1 << 30)  # of all of the domain
+    monkeypatch.setattr(coverage, "LEAST_CELLS", 1 << 30)  # grid of the whole domain
     ball = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.1}
     moving = ball | {"motion": {"kind": "translation", "velocity": [1.0, 0.0]}}
     voxel = {"solids": "voxel", "pressure": {"surface": "voxel"}}
@@ -109,7 +109,7 @@ def test_the_estimate_of_memory_counts_what_the_options_add(
         scene(**size, **({"solid": [ball]} | off | tables)).memory_estimate() for tables in options
     ]
     assert sizes == sorted(set(sizes))
-    assert scene(**size, solid=[moving]).memory_estimate() == sizes[-2]  # it may act by itself
+    assert scene(**size, solid=[moving]).memory_estimate() == sizes[-2]  # default of a moving solid
     assert 100 * 2**20 < sizes[0] < 400 * 2**20  # measured: about 160 MB
 
 

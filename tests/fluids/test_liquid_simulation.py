@@ -36,7 +36,7 @@ def test_a_dam_breaks(dimension: int) -> None:
     assert all(tuple(row)[1:] == simulation.columns() for row in rows)
     assert first["mass"] == pytest.approx(1000.0 * 0.375**2 * (0.25 if dimension == 3 else 1.0))
     assert last["mass"] == first["mass"]
-    # the level set rounds the corners
+    # The level set rounds the corners.
     assert first["volume"] == pytest.approx(first["mass"] / 1000.0, rel=0.015)
     assert last["center_of_mass_y"] < 0.75 * first["center_of_mass_y"]
     energies = [row["kinetic_energy"] + row["potential_energy"] for row in rows]
@@ -62,7 +62,7 @@ def test_the_log_holds_what_the_particles_have() -> None:
     mass = row["mass"] / len(x)
     assert row["particles"] == len(x) == 6 * 6 * 4
     dt, fall = row["dt"], -v[:, 1].mean()
-    # of gravity in half a step
+    # Work of gravity in half a step.
     work = 0.5 * dt * GRAVITY * (fall + 0.25 * dt * (fall + before) / simulation.kick_dt)
     assert row["kinetic_energy"] == pytest.approx(
         mass * (0.5 * (v**2).sum() + len(v) * work), rel=1e-5
@@ -179,7 +179,7 @@ def test_a_failed_solve_leaves_the_state_as_it_was(steps: int) -> None:
     for _ in range(steps):
         simulation.step(0.02)
         twin.step(0.02)
-    twin.particles.arrange(steps)  # the one thing that a failed step may do
+    twin.particles.arrange(steps)  # the only effect that a failed step may have
     before, frame = twin.state(), twin.frame()
     simulation.projection.max_iterations = 0
     for _ in range(2):
@@ -315,7 +315,7 @@ def test_the_simple_solver_gives_the_same_liquid() -> None:
 
 @pytest.mark.parametrize("dimension", DIMENSIONS)
 def test_gathering_transfers_give_the_same_liquid(dimension: int) -> None:
-    """What a GPU does, on the CPU."""
+    """Gathering transfers, as on a GPU, on the CPU."""
     scattered, gathered = dam(dimension), dam(dimension)
     p = gathered.particles
     gathered.particles = Particles(
@@ -369,7 +369,10 @@ def test_a_step_marks_its_stages() -> None:
 
 
 def test_a_piston_drives_the_liquid_of_a_scene() -> None:
-    """A solid with a velocity of its own, in the simulator: its cells stay, its face pushes."""
+    """Piston of a scene that drives the liquid.
+
+    A solid with a velocity of its own: its cells stay, its face pushes.
+    """
     solid = [box([0.0, 0.0], [0.0625, 0.5])]
     tables = {
         "physics": {"gravity": [0.0, 0.0]},

@@ -1,4 +1,7 @@
-"""Solids that move through liquid, against answers that are known: plugs of liquid in front of pistons, waves of linear theory."""
+"""Moving solids in liquid against known results.
+
+Plugs of liquid in front of pistons, waves of linear theory.
+"""
 
 import math
 
@@ -16,7 +19,7 @@ DEEP = {"physics": {"gravity": [0.0, 0.0, 0.0]}}
 
 
 def distance(simulation, points):
-    """The exact distance of points to the nearest solid at the simulation's time."""
+    """Return the exact distance of points to the nearest solid at the current time."""
     nearest = np.full(len(points), np.inf)
     for solid in simulation.scene.solid:
         motion = solid.motion.to_motion(simulation.grid.dimension) if solid.motion else None
@@ -30,11 +33,14 @@ def distance(simulation, points):
 
 
 def piston(*, wall, speed, surface, dimension=2, floor=None):
-    """A plug of liquid across a channel without weight, a piston at its left end; it slides over a solid floor if that has a height."""
+    """Return a plug of liquid in a channel without gravity, a piston at its left end.
+
+    It slides over a solid floor if that has a height.
+    """
     deep = dimension == 3
     size = [1.0, 0.25, 0.25][:dimension]
     high = [0.6, 0.25, 0.25][:dimension]
-    # its face lies within cells
+    # The face of the piston lies within cells.
     body = box([-1.0, -0.5, -0.5][:dimension], [0.43, 0.5, 0.5][:dimension], wall=wall)
     body["motion"] = {"kind": "translation", "velocity": [speed, 0.0, 0.0][:dimension]}
     solids = (
@@ -57,20 +63,24 @@ def piston(*, wall, speed, surface, dimension=2, floor=None):
 @pytest.mark.parametrize(
     ("wall", "speed", "expected"),
     [
-        ("separating", SPEED, SPEED),  # it pushes the plug,
+        ("separating", SPEED, SPEED),  # the piston pushes the plug,
         ("free-slip", SPEED, SPEED),
         ("free-slip", -SPEED, -SPEED),  # pulls it,
-        ("separating", -SPEED, 0.0),  # or leaves it behind
+        ("separating", -SPEED, 0.0),  # or leaves the plug behind
     ],
 )
 def test_a_piston_moves_a_plug_of_liquid(wall, speed, expected, surface, dimension):
-    """Without the solid's velocity in the divergence the plug would stay; without it in the condition to separate it would be pulled."""
+    """Motion of a plug of liquid by a piston.
+
+    Without the solid's velocity in the divergence the plug would stay; without it in the separation
+    condition it would be pulled.
+    """
     simulation = piston(wall=wall, speed=speed, surface=surface, dimension=dimension)
     start = simulation.particles.position.numpy()[:, 0].mean()
     rows = advance(simulation, 0.2)
     deviation = simulation.particles.velocity.numpy() - [expected, 0.0, 0.0]
     np.testing.assert_allclose(deviation.mean(axis=0), 0.0, atol=0.004 * SPEED)
-    # by a few particles in the corners of piston and channel
+    # By a few particles in the corners of piston and channel.
     assert np.sqrt((deviation**2).mean(axis=0)).max() < 0.04 * SPEED
     moved = simulation.particles.position.numpy()[:, 0].mean() - start
     assert moved == pytest.approx(expected * 0.2, abs=0.05 * simulation.grid.spacing)
@@ -82,8 +92,11 @@ def test_a_piston_moves_a_plug_of_liquid(wall, speed, expected, surface, dimensi
 @pytest.mark.parametrize("height", [None, 0.037])
 @pytest.mark.parametrize("speed", [SPEED, -SPEED])
 def test_the_corner_between_a_piston_and_a_floor_turns_nothing_upwards(speed, height):
-    """With the normal of the nearest of both walls, or with the piston's speed on all of a face that both close, particles in the corner
-    rose at a quarter and a half of its speed."""
+    """Corner between a piston and a floor: no upward velocity.
+
+    With the normal of the nearest wall, or with the piston's speed on all of a face that both
+    close, particles in the corner rose at a quarter and a half of its speed.
+    """
     simulation = piston(wall="free-slip", speed=speed, surface="voxel", floor=height)
     most = 0.0
     while simulation.time < 0.2:
@@ -119,7 +132,11 @@ def test_a_solid_crosses_the_domain_from_outside_to_outside(surface):
 
 
 def test_a_disc_that_turns_in_place_leaves_the_liquid_alone():
-    """Its wall moves along itself only: a velocity that were not taken relative along the normal would stir the liquid."""
+    """Disc that turns in place, without effect on the liquid.
+
+    Its wall moves along itself only: a velocity not relative along the normal would stir the
+    liquid.
+    """
     disc = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
     disc["motion"] = {"kind": "rotation", "rate": 360.0, "center": [0.5, 0.5]}
     rim = 2.0 * math.pi * 0.23
@@ -148,7 +165,7 @@ def test_particles_stay_out_of_a_cross_that_turns():
     rows = advance(simulation, 1.0)
     points = simulation.particles.position.numpy()
     inside = distance(simulation, points)
-    # at corners, which distances at nodes round off
+    # At corners, which distances at nodes round off.
     assert inside.min() > -0.25 * simulation.grid.spacing
     assert (inside < -0.05 * simulation.grid.spacing).mean() < 0.005
     assert sum(row["pushed"] for row in rows) > 0
@@ -157,7 +174,11 @@ def test_particles_stay_out_of_a_cross_that_turns():
 
 
 def test_waves_of_a_flap_are_as_long_and_high_as_linear_theory_says():
-    """Dean & Dalrymple's flap hinged at the bottom: H/S = 4 sinh(kh)/(kh) (kh sinh(kh) - cosh(kh) + 1) / (sinh(2kh) + 2kh)."""
+    """Waves of a flap against linear theory.
+
+    For Dean & Dalrymple's flap, hinged at the bottom, H/S = 4 sinh(kh)/(kh) (kh sinh(kh) - cosh(kh)
+    + 1) / (sinh(2kh) + 2kh).
+    """
     depth, period, angle = 0.35, 1.2, 6.0
     omega = 2.0 * math.pi / period
     k = omega**2 / GRAVITY
@@ -184,7 +205,7 @@ def test_waves_of_a_flap_are_as_long_and_high_as_linear_theory_says():
         scene(size=[6.0, 0.6], resolution=200, liquid=[box([0.0, 0.0], [6.0, depth])], solid=[flap])
     )
     places, times, levels = np.array([1.5, 1.8]), [], []
-    advance(simulation, 2.4)  # until waves have passed; what they reflect comes back after 5 s
+    advance(simulation, 2.4)  # until waves have passed; their reflections return after 5 s
     while simulation.time < 4.0 * period - 0.01:
         advance(simulation, simulation.time + period / 16)
         points = simulation.particles.position.numpy()
@@ -202,7 +223,10 @@ def test_waves_of_a_flap_are_as_long_and_high_as_linear_theory_says():
 
 
 def test_the_step_is_shortened_before_a_solid_sets_off():
-    """At rest gravity alone would allow 0.06 s, in which the piston crosses 19 cells."""
+    """Shorter step before a solid starts to move.
+
+    At rest gravity alone would allow 0.06 s, in which the piston crosses 19 cells.
+    """
     ram = box([-2.0, -0.5], [0.6, 1.5])
     ram["motion"] = {"kind": "translation", "velocity": [6.0, 0.0], "start": 0.05}
     simulation = create(
@@ -220,7 +244,10 @@ def test_the_step_is_shortened_before_a_solid_sets_off():
     [("free-slip", 0.5, True), ("free-slip", -0.5, True), ("separating", -0.5, False)],
 )
 def test_a_piston_in_a_box_full_of_liquid(wall, speed, fails):
-    """What cannot be compressed can only let go of a wall that separates; a shorter step would not help."""
+    """Piston in a box full of liquid.
+
+    Incompressible liquid can only separate from a separating wall; a shorter step would not help.
+    """
     piston = box([-1.0, -1.0], [0.3, 1.0], motion={"kind": "translation", "velocity": [speed, 0.0]})
     simulation = create(
         scene(
@@ -237,7 +264,7 @@ def test_a_piston_in_a_box_full_of_liquid(wall, speed, fails):
         return
     rows = advance(simulation, 0.1)
     assert sum(row["active"] for row in rows) > 0
-    # of the liquid as the step finds it, not after the wall has moved
+    # Of the liquid before the step, not after the wall has moved.
     assert rows[0]["volume"] == pytest.approx(0.35, rel=0.01)
     assert sum(row["stuck"] for row in rows) == 0
 

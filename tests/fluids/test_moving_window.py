@@ -1,4 +1,7 @@
-"""A step visits the box that the liquid moves through, and leaves what one that visits the whole domain would."""
+"""Moving window: a step visits only the box that the liquid moves through.
+
+The result is that of a step that visits the whole domain.
+"""
 
 from collections import Counter
 from typing import Any
@@ -32,7 +35,7 @@ TABLES: dict[str, dict[str, Any]] = {
 
 
 def thrown(tables: dict[str, Any], resolution: int = 64, width: float = 2.0) -> LiquidSimulation:
-    """A block of liquid that flies through a wide domain."""
+    """Return a block of liquid that flies through a wide domain."""
     block = {**box([0.1, 0.5], [0.3, 0.7]), "velocity": [6.0, 0.0]}
     return create(scene(size=[width, 1.0], resolution=resolution, liquid=[block], **tables))
 
@@ -58,10 +61,10 @@ def test_windows_leave_what_passes_over_all_do(tables, monkeypatch):
 
 
 def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
-    """Cells that passes visit in a domain eight times as wide."""
+    """Visited cells of passes in a domain eight times as wide."""
     visited = [Counter[str]()]
     run, take = Window.run, WindowTally.take
-    # launches at once, of which each says what it visits
+    # Launches at once, each of which reports the cells that it visits.
     monkeypatch.setattr(
         LaunchGraph, "run", lambda graph, *arguments, variant=None: graph._record(*arguments)
     )
@@ -102,7 +105,7 @@ def test_a_trail_leads_through_the_last_window():
         grid.window((5, 3, 1), (6, 5, 1)),
     ]
     through = [trail.through(window) for window in boxes]
-    # nobody knows what was there
+    # The former contents are unknown.
     assert (through[0].low, through[0].high) == (grid.domain.low, grid.domain.high)
     assert (through[1].low, through[1].high) == ((1, 2, 2), (2, 9, 8))
     assert (through[2].low, through[2].high) == ((1, 3, 5), (2, 9, 8))

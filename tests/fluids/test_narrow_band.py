@@ -1,4 +1,4 @@
-"""A liquid whose particles are near its surface only."""
+"""Narrow band: liquid whose particles are near its surface only."""
 
 import math
 from typing import Any
@@ -32,7 +32,7 @@ def tank(
 
 
 def without(simulation: LiquidSimulation) -> NarrowBand:
-    """Return the band, which must be there."""
+    """Return the band, which must exist."""
     assert simulation.band is not None
     return simulation.band
 
@@ -48,7 +48,11 @@ def counts(simulation: LiquidSimulation) -> np.ndarray:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_particles_are_near_the_surface_only(dimension):
-    """24 rows of liquid, the surface between two rows: four hold all their particles, twenty none, and nothing is missing."""
+    """Particles near the surface only.
+
+    24 rows of liquid, the surface between two rows: four hold all their particles, twenty none, and
+    nothing is missing.
+    """
     simulation, everywhere = tank(dimension), tank(dimension, particles={})
     band = without(simulation)
     rows = counts(simulation).sum(axis=(0, 2))
@@ -62,7 +66,10 @@ def test_particles_are_near_the_surface_only(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_particles_below_the_band_are_around_solids_inside_only(dimension):
-    """And not along the domain's walls, whichever side they are on."""
+    """Particles below the band around inner solids, not along the domain's walls.
+
+    Whichever side of the walls they are on.
+    """
     center, radius = np.array([0.5, 0.3, 0.25])[:dimension], 0.08
     simulation = tank(
         dimension, solid=[{"shape": "sphere", "center": center.tolist(), "radius": radius}]
@@ -74,14 +81,17 @@ def test_particles_below_the_band_are_around_solids_inside_only(dimension):
 
 
 def test_nothing_is_there_without_the_table():
-    """No field, no column, no entry of the state."""
+    """Without the table no field, no column, no entry of the state."""
     simulation = tank(particles={})
     assert simulation.band is None
     assert not {"depth", "interior", "interior_velocity_0"} & simulation.state().keys()
 
 
 def test_the_depth_is_a_distance():
-    """Below a plane exactly; below a corner of air within 8 %; through solids as through liquid."""
+    """Depth as a distance.
+
+    It is exact below a plane, and within 8 % below a corner of air. Solids do not change it.
+    """
     grid = StaggeredGrid((24, 24, 1), 1.0, 2, "cpu")
     simulation = tank(2, 24, 1.0, solid=[box([0.25, 0.25], [0.5, 0.5])], solids="voxel")
     band = NarrowBand(
@@ -103,7 +113,10 @@ def test_the_depth_is_a_distance():
 
 
 def test_rest_stays_rest():
-    """Particles come and go at the band's inner edge; nothing else moves, and mass and volume stay."""
+    """Liquid at rest.
+
+    Particles come and go at the band's inner edge; nothing else moves, and mass and volume stay.
+    """
     simulation = tank()
     start = simulation.checked_totals("at").count
     rows = advance(simulation, 1.0)
@@ -116,7 +129,11 @@ def test_rest_stays_rest():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_block_in_free_flight_keeps_its_shape(dimension):
-    """Uniform translation across cells: depth and velocity go along, the volume stays, no hole opens inside."""
+    """Shape of a block in free flight.
+
+    Uniform translation across cells: depth and velocity move along, the volume stays, and no hole
+    opens.
+    """
     low, high = [0.08, 0.3, 0.05][:dimension], [0.58, 0.8, 0.45][:dimension]
     speed = [0.7, 0.9, 0.1][:dimension]
     start = {
@@ -151,7 +168,10 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_ceiling_lets_go(dimension):
-    """Under a separating ceiling a new surface opens where there were no particles: the block falls as one, and keeps its volume."""
+    """Separation of a block from a ceiling.
+
+    A new surface opens where there were no particles: the block falls as one and keeps its volume.
+    """
     low, high = [0.2, 0.5, 0.05][:dimension], [0.8, 1.0, 0.45][:dimension]
     simulation = tank(dimension, 40, liquid=[box(low, high)])
     volume = simulation.surface.volume(0)
@@ -165,14 +185,17 @@ def test_a_ceiling_lets_go(dimension):
     )
     assert rows[-1]["volume"] == pytest.approx(volume, rel=0.01)
     reference = advance(tank(dimension, 40, liquid=[box(low, high)], particles={}), 0.2)
-    # of whole cells
+    # Of whole cells.
     assert rows[-1]["center_of_mass_y"] == pytest.approx(
         reference[-1]["center_of_mass_y"], abs=0.25 / 40
     )
 
 
 def test_a_body_dives_into_the_interior():
-    """Particles are around a solid before it gets there; none is lost, and the liquid keeps its volume."""
+    """Body that dives into the interior.
+
+    Particles are around a solid before it arrives; none is lost, and the liquid keeps its volume.
+    """
     plunge = {"kind": "translation", "velocity": [0.0, -1.0]}
     particles = {"transfer": "apic", **BAND}
     disk = {"shape": "sphere", "center": [0.5, 0.92], "radius": 0.06, "motion": plunge}
@@ -193,7 +216,10 @@ def test_a_body_dives_into_the_interior():
 
 
 def sloshing(particles: dict[str, Any], end: float) -> list[dict[str, Any]]:
-    """Return the log of a standing wave, half a wavelength in a tank 1 m wide and 0.5 m deep."""
+    """Return the log of a standing wave.
+
+    The wave is half a wavelength in a tank 1 m wide and 0.5 m deep.
+    """
     n = 64
     columns = [
         box([i / n, 0.0], [(i + 1) / n, 0.5 + 0.04 * math.cos(math.pi * (i + 0.5) / n)])
@@ -206,7 +232,10 @@ def sloshing(particles: dict[str, Any], end: float) -> list[dict[str, Any]]:
 
 
 def wave(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Return a standing wave's period [s] and decay [1/s], from the peaks of its kinetic energy."""
+    """Return a standing wave's period [s] and decay [1/s].
+
+    They follow from the peaks of its kinetic energy.
+    """
     time, energy = (
         np.cumsum([row["dt"] for row in rows]),
         np.array([row["kinetic_energy"] for row in rows]),
@@ -223,7 +252,11 @@ def wave(rows: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 def test_a_wave_is_as_fast_and_damped_as_without():
-    """The period is that of linear theory within 1 %, and that of particles everywhere within 0.2 %; no damping comes in."""
+    """Speed and damping of a wave.
+
+    The period is that of linear theory within 1 %, and that of particles everywhere within 0.2 %,
+    without additional damping.
+    """
     period, decay = wave(sloshing(BAND, 3.5))
     reference, other = wave(sloshing({}, 3.5))
     assert period == pytest.approx(
@@ -256,7 +289,11 @@ def volumes(rows: list[dict[str, Any]], times: np.ndarray) -> np.ndarray:
 
 
 def test_a_splash_keeps_mass_and_volume():
-    """Waves break and swallow air: the mass is exact, the volume that of particles everywhere, with a third of them."""
+    """Mass and volume of a splash.
+
+    Waves break and enclose air: the mass is exact, the volume that of particles everywhere, with a
+    third of them.
+    """
     simulation, rows = dams(BAND, 1.5)
     other, reference = dams({}, 1.5)
     assert {row["mass"] for row in rows} == {reference[0]["mass"]}
@@ -270,7 +307,10 @@ def test_a_splash_keeps_mass_and_volume():
 
 @pytest.mark.slow
 def test_volume_stays_for_long():
-    """Thirty seconds of two dams: within 1.5 % of particles everywhere, and nearer to the volume at the start."""
+    """Volume of two dams over thirty seconds.
+
+    Within 1.5 % of particles everywhere, and nearer to the volume at the start.
+    """
     _, rows = dams(BAND, 30.0, 100)
     _, reference = dams({}, 30.0, 100)
     times = np.linspace(0.05, 29.9, 2000)
@@ -303,7 +343,7 @@ MODELS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("tables", MODELS, ids=["apic", "flip", "pic", "moving", "sources"])
 def test_a_run_goes_on_as_if_it_had_not_stopped(tables):
-    """Bit for bit, the carried fields included."""
+    """Resumed runs, equal bit for bit, including the carried fields."""
     tables = dict(tables)
     particles = tables.pop("particles", BAND)
     simulation, rows = dams(particles, 0.5, **tables)
@@ -321,7 +361,10 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tables):
 
 
 def test_a_state_belongs_to_its_band():
-    """A band of another width, or none, would find no particles where it needs them."""
+    """Refusal of a state for another band.
+
+    A band of another width, or none, would lack particles.
+    """
     state = tank().state()
     with pytest.raises(ValueError, match=r"narrow band is 4 cells wide: this scene's is 6"):
         tank(particles={"narrow_band": {"width": 6.0}}).restore(state)
@@ -334,7 +377,11 @@ def test_a_state_belongs_to_its_band():
 @pytest.mark.parametrize("resolution", [24, 40])
 @pytest.mark.parametrize("particles", [BAND, {}], ids=["band", "everywhere"])
 def test_another_resolution(resolution, particles):
-    """The interior gets its particles back first, so that nothing is lost on the way, whatever the new grid wants of them."""
+    """Transfer to another resolution.
+
+    The interior gets its particles back first, so that nothing is lost, whatever the band of the
+    new grid.
+    """
     start, _ = dams(BAND, 0.4)
     mass, energy = (
         start.checked_totals("at").count * start.particle_mass,
@@ -353,7 +400,7 @@ def test_another_resolution(resolution, particles):
 
 
 def test_refusals():
-    """Each says what would do instead."""
+    """Refusals, each with an alternative."""
     with pytest.raises(ValidationError, match=r"greater than or equal to 3"):
         tank(particles={"narrow_band": {"width": 2.99}})
     assert without(tank(particles={"narrow_band": {"width": 3.0}})).width == 3.0

@@ -1,4 +1,4 @@
-"""Sides of the domain without a wall: no pressure beyond, and nothing that leaves comes back."""
+"""Open sides of the domain: no pressure beyond them, and no return flow."""
 
 from typing import Any
 
@@ -26,8 +26,8 @@ def opened(model: LiquidScene, sides: list[str]) -> LiquidScene:
 def test_the_pressure_is_that_of_the_depth_below_an_open_side(
     side: str, surface: str, cut: bool
 ) -> None:
-    # gravity points away from the open side of a full box: a side taken for another, a face not
-    # open or p = 0 at the wrong place show
+    # Gravity points away from the open side of a full box. A confused side, a closed face or p = 0
+    # at a wrong place would show.
     dimension = 3 if side in ("front", "back") else 2
     axis, high = SIDES.index(side) >> 1, SIDES.index(side) & 1
     size = [1.0, 1.0, 1.0][:dimension]
@@ -55,7 +55,7 @@ def test_the_pressure_is_that_of_the_depth_below_an_open_side(
     depth = (np.arange(10) + 0.5) * 0.1
     if high:
         depth = depth[::-1]
-    # p = 0 at the centers of the cells beyond, or on the side itself
+    # p = 0 at the centers of the cells beyond, or on the side itself.
     depth = depth + (0.05 if surface == "voxel" else 0.0)
     shape = [1, 1, 1]
     shape[2 - axis] = 10
@@ -87,7 +87,7 @@ def test_a_block_leaves_as_if_there_were_no_side(side: str, solids: str, cut: bo
     simulation = create(opened(model, [side]))
     count = simulation.particles.count
     rows = advance(simulation, 0.25, 0.01)
-    # the front has 0.125 to go, the rest is 0.25 long
+    # The front has 0.125 to go, the rest is 0.25 long.
     assert simulation.particles.count == pytest.approx(0.5 * count, rel=0.1)
     np.testing.assert_allclose(simulation.particles.velocity.numpy()[:, axis], sign, atol=1e-5)
     rows += advance(simulation, 0.45, 0.01)
@@ -103,8 +103,8 @@ def test_a_block_leaves_as_if_there_were_no_side(side: str, solids: str, cut: bo
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bool) -> None:
-    # Ritter's solution: the discharge through the place of a broken dam is 8/27 sqrt(g) h^(3/2) as
-    # long as the wave has not come back
+    # Ritter's solution: the discharge at the place of a broken dam is 8/27 sqrt(g) h^(3/2) until
+    # the wave returns.
     size, top = [2.0, 0.5, 0.125][:dimension], [2.0, 0.25, 0.125][:dimension]
     ball = (
         {"solid": [{**BALL, "center": [0.1, 0.45, 0.06][:dimension], "radius": 0.04}]}
@@ -117,7 +117,7 @@ def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bo
     advance(simulation, 0.6)
     lost = 0.5 * (1.0 - simulation.particles.count / mass)
     expected = 8.0 / 27.0 * GRAVITY**0.5 * 0.25**1.5 * 0.6
-    # shallow water has no vertical motion at the start
+    # Shallow water has no vertical motion at the start.
     assert lost == pytest.approx(expected, rel=0.25)
 
 

@@ -1,4 +1,4 @@
-"""A liquid model of your own, as the documentation has it: it does what its equation says."""
+"""The documentation's user-defined model of a liquid, against its equation."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ PAGE = Path(__file__).parents[2] / "docs/own-model.md"
 
 
 def sponge() -> type:
-    """Return the class of the page, without what it runs at the end."""
+    """Return the class of the page, without its final run."""
     code = blocks(PAGE, "python")[0].split("scene = load_scene")[0]
     names: dict[str, type] = {}
     exec(compile(code, PAGE.name, "exec"), names)
@@ -21,7 +21,11 @@ def sponge() -> type:
 
 
 def test_a_sponge_slows_liquid_by_its_rate_and_tells_the_energy():
-    """A block in flight without gravity, all of it in the sponge: u is divided by 1 + k dt in each step, and so is its momentum."""
+    """Velocity and energy in a sponge.
+
+    A block in flight without gravity, all of it in the sponge: u is divided by 1 + k dt in each
+    step, and so is its momentum.
+    """
     block = box([0.3, 0.2], [0.5, 0.4], velocity=[0.4, 0.1])
     model = scene(
         size=[1.0, 0.5],
@@ -38,7 +42,7 @@ def test_a_sponge_slows_liquid_by_its_rate_and_tells_the_energy():
     assert "sponge_work" in liquid.columns()
     for dt in (0.01, 0.02, 0.005):
         row = liquid.step(dt)
-        # forces act for half of the last step and half of this one
+        # Forces act for half of the last step and half of this one.
         velocity /= 1.0 + rate * 0.5 * (last + dt)
         last = dt
         np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""The signs of the pressure problem, on liquids whose answer is known."""
+"""Signs of the pressure problem on liquids with known results."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ NX, NY = 6, 7
 
 
 class Tank:
-    """A 2-D tank with liquid in given cells; the column i = 0 can be a piston (solid 1)."""
+    """Tank in 2-D with liquid in given cells; column i = 0 can be a piston (solid 1)."""
 
     def __init__(
         self,
@@ -77,7 +77,10 @@ def liquid(rows: slice, columns: slice = slice(None)) -> np.ndarray:
 def test_a_pool_that_falls_onto_the_floor_is_stopped_by_a_positive_pressure(
     separating: bool,
 ) -> None:
-    """The sign of b: flip it and x is negative with free-slip walls, zero with separating ones."""
+    """Positive pressure that stops a falling pool: the sign of b.
+
+    With the wrong sign x is negative with free-slip walls, zero with separating ones.
+    """
     tank = Tank(liquid(slice(0, 4)), separating=separating)
     tank.velocity[1].fill_(-0.5)
     projected = tank.project()
@@ -162,7 +165,7 @@ def test_a_full_box_with_a_retracting_piston_needs_a_separating_wall() -> None:
 
 
 def test_a_wall_cell_is_judged_by_each_of_its_walls() -> None:
-    """A separating piston beside a free-slip floor: the corner cell is bounded."""
+    """Bound of a corner cell with a separating piston beside a free-slip floor."""
     cell = liquid(slice(0, 1), slice(1, 2))
     tank = Tank(cell, separating=(False, True), piston=-0.3)
     assert tank.project().released == 1

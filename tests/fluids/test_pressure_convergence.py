@@ -1,9 +1,10 @@
-"""The sub-cell pressure problem is accurate to second order, on smooth solutions in discs and balls that cut the cells anywhere.
+"""Second-order convergence of the sub-cell pressure problem.
 
--lap p = f with p = 0 on a free surface that lies a share theta of the way from a FLUID cell to an
-AIR cell, and with the flux through walls given: sum over faces of a_f (p_i - p_neighbor) / theta_f
-= the source within the open part of the cell plus what enters through its wall. Unit weights or the
-open fractions a_f are the operator's faces, what theta adds to the diagonal is its shift.
+On smooth solutions in discs and balls that cut the cells anywhere: -lap p = f with p = 0 on a free
+surface that lies a share theta of the way from a FLUID cell to an AIR cell, and with a given flux
+through walls. The discrete equation is sum over faces of a_f (p_i - p_neighbor) / theta_f = the
+source within the open part of the cell plus the inflow through its wall. Unit weights or the open
+fractions a_f are the operator's faces; the contribution of theta to the diagonal is its shift.
 """
 
 from collections.abc import Callable
@@ -19,13 +20,16 @@ import warp_lcp as wl
 
 THETA_MIN, FRACTION_MIN = 1e-3, 1e-3  # as the liquid has them
 SECOND_ORDER = 1.8
-# of walls and surfaces, in a box [0, 1]: no cells are alike
+# Center of walls and surfaces in a box [0, 1]: no two cells are alike.
 CENTER = np.array([0.513, 0.489, 0.507])
 
 
 @dataclass
 class Field:
-    """A smooth p = q e, with q = sign (|x - c|^2 - r^2) and e = exp(a . x): 0 on a sphere, positive in the liquid, not symmetric."""
+    """Smooth field p = q e with q = sign (|x - c|^2 - r^2) and e = exp(a . x).
+
+    It is 0 on a sphere, positive in the liquid, and not symmetric.
+    """
 
     center: np.ndarray
     radius: float
@@ -61,7 +65,10 @@ class Field:
 
 
 def cell_centers(n: int, dimension: int) -> np.ndarray:
-    """Return the centers of n cells an axis, shape (n, ..., n, dimension), coordinates x, y(, z)."""
+    """Return the centers of n cells along each axis.
+
+    The shape is (n, ..., n, dimension), with coordinates x, y(, z).
+    """
     axis = (np.arange(n) + 0.5) / n
     return np.stack(np.meshgrid(*[axis] * dimension, indexing="ij")[::-1], axis=-1)
 
@@ -80,7 +87,10 @@ def solve(
     rhs: np.ndarray,
     theta_min: float,
 ) -> tuple[wl.GridPoisson, np.ndarray]:
-    """Return the operator and the solution of sum a_f (p_i - p_neighbor) / theta = rhs."""
+    """Solve sum a_f (p_i - p_neighbor) / theta = rhs.
+
+    Return the operator and the solution.
+    """
     dimension = cells.ndim
     shift = np.zeros(cells.shape)
     for axis in range(dimension):
@@ -108,7 +118,7 @@ def solve(
 
 
 def order(errors: dict[int, float]) -> float:
-    """Return the slope of the least-squares line through log error over log cell size."""
+    """Return the slope of log error over log cell size, by least squares."""
     n = np.array(list(errors), dtype=np.float64)
     return float(-np.polyfit(np.log(n), np.log(list(errors.values())), 1)[0])
 
@@ -127,7 +137,11 @@ def dirichlet_error(n: int, dimension: int, theta_min: float = THETA_MIN) -> flo
 def test_a_disc_or_a_ball_of_liquid_in_air_converges_with_second_order(
     dimension: int, sizes: tuple[int, ...]
 ) -> None:
-    """In the largest error; with whole cells (theta = 1) the same solution converges with first order only."""
+    """Second-order convergence in a disc or ball of liquid in air.
+
+    The order is that of the largest error. With whole cells (theta = 1) the same solution converges
+    with first order only.
+    """
     assert order({n: dirichlet_error(n, dimension) for n in sizes}) >= SECOND_ORDER
     assert order({n: dirichlet_error(n, dimension, theta_min=1.0) for n in sizes}) < 1.4
 
@@ -137,13 +151,16 @@ Part = tuple[np.ndarray, np.ndarray]
 
 @dataclass
 class Disc:
-    """A wall: the open region lies within a circle."""
+    """Wall whose open region lies within a circle."""
 
     center: np.ndarray
     radius: float
 
     def exact(self, n: int, axis: int) -> Part:
-        """Return where the open part of each lower face begins and ends along the face [0, 1], shape (n, n) each, empty ones equal."""
+        """Return begin and end of the open part of each lower face.
+
+        Along the face [0, 1], shape (n, n) each; empty parts have equal ends.
+        """
         cells = np.arange(n) / n
         across, along = (
             (cells[None, :], cells[:, None]) if axis == 0 else (cells[:, None], cells[None, :])
@@ -158,7 +175,10 @@ class Disc:
         return begin, np.maximum(begin, end)
 
     def from_nodes(self, n: int, axis: int) -> Part:
-        """Return the same as signed distances at nodes tell, linear along each edge: what a liquid knows of its solids."""
+        """Return the same from signed distances at nodes, linear along each edge.
+
+        That is how a liquid represents its solids.
+        """
         nodes = np.arange(n + 1) / n
         s = self.radius - np.hypot(nodes[None, :] - self.center[0], nodes[:, None] - self.center[1])
         low, high = s[:-1, :-1], s[1:, :-1] if axis == 0 else s[:-1, 1:]
@@ -168,7 +188,7 @@ class Disc:
         return np.where(low > 0, along, np.where(high > 0, crossing, along)), end
 
     def whole(self, n: int, axis: int) -> Part:
-        """Return faces that are open or closed, as their exact fraction is nearer to."""
+        """Return open or closed faces, whichever is nearer to their exact fraction."""
         begin, end = self.exact(n, axis)
         nodes = np.arange(n) / n
         along = np.broadcast_to(nodes[:, None] if axis == 0 else nodes[None, :], (n, n))
@@ -179,10 +199,10 @@ Opening = Callable[[Disc, int, int], Part]
 
 
 def outward_flux(field: Field, n: int, wall: Disc, opening: Opening) -> np.ndarray:
-    """Return -integral of grad p . s over the open part of each cell's faces, s outward; shape (n, n).
+    """Return -integral of grad p . s over the open part of each cell's faces.
 
-    By the divergence theorem that is the source in the open part of the cell plus what enters
-    through the wall.
+    s points outward; shape (n, n). By the divergence theorem it is the source in the open part of
+    the cell plus the inflow through the wall.
     """
     nodes, weights = np.polynomial.legendre.leggauss(6)
     through = []
@@ -200,7 +220,11 @@ def outward_flux(field: Field, n: int, wall: Disc, opening: Opening) -> np.ndarr
 
 
 def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_wall() -> None:
-    """The right-hand side by another way: the source at many points of each cell, the wall's flux at many points of the circle."""
+    """Flux through open faces against source and inflow through the wall.
+
+    The right-hand side is computed in another way: from the source at many points of each cell, and
+    the wall's flux at many points of the circle.
+    """
     n, m = 8, 300
     wall, field = Disc(CENTER[:2], 0.43), Field(np.array([0.62, 0.4]), 0.2, 1.0)
     x = cell_centers(n * m, 2)
@@ -220,10 +244,10 @@ def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_w
 
 @dataclass
 class Tank:
-    """A solved problem in a disc-shaped tank.
+    """Solved problem in a disc-shaped tank.
 
-    `opening` tells how faces are open, `source` the region whose source and wall flux the
-    right-hand side holds.
+    `opening` defines the open parts of faces, `source` the region whose source and wall flux the
+    right-hand side contains.
     """
 
     n: int
@@ -255,12 +279,12 @@ class Tank:
 
     @property
     def error(self) -> float:
-        """The largest error at the centers of FLUID cells, those that lie within the wall included."""
+        """Largest error at the centers of FLUID cells, including those within the wall."""
         return float(self.errors.max())
 
     @property
     def mean_error(self) -> float:
-        """The root of the mean square error over all cells of the box."""
+        """Root mean square error over all cells of the box."""
         return float(np.sqrt((self.errors**2).mean()))
 
 
@@ -272,16 +296,20 @@ SIZES = (16, 24, 32, 48, 64, 96, 128)
 @pytest.mark.parametrize("opening", [Disc.exact, Disc.from_nodes], ids=["exact", "from-nodes"])
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
 def test_liquid_in_a_round_tank_converges_with_second_order(field: Field, opening: Opening) -> None:
-    """In the largest error over all unknowns, cells of which a sliver is open included."""
+    """Second-order convergence of liquid in a round tank.
+
+    In the largest error over all unknowns, including cells with a sliver of open area.
+    """
     assert order({n: Tank(n, field, opening, opening).error for n in SIZES}) >= SECOND_ORDER
 
 
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
 def test_what_nodes_miss_of_a_round_wall_costs_single_cells_only(field: Field) -> None:
-    """The circle's own source with fractions from nodes: an edge that the circle cuts twice is closed, its cell has the wrong source.
+    """Error of fractions from nodes at a round wall.
 
-    The root mean square error is of second order all the same; the largest one, in cells of which a
-    sliver is open, is not (1.2 to 1.3).
+    The source is that of the circle. An edge that the circle cuts twice is closed, so that its cell
+    has a wrong source. The root mean square error is still of second order; the largest one, in
+    cells with a sliver of open area, is not (1.2 to 1.3).
     """
     assert (
         order({n: Tank(n, field, Disc.from_nodes, Disc.exact).mean_error for n in SIZES})
@@ -291,13 +319,16 @@ def test_what_nodes_miss_of_a_round_wall_costs_single_cells_only(field: Field) -
 
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
 def test_whole_cells_are_not_of_second_order(field: Field) -> None:
-    """The negative control: a surface at the cells' faces is of first order, stairs instead of the wall do not converge."""
+    """Order of whole cells: the negative control.
+
+    A surface at the cells' faces is of first order; stairs in place of the wall do not converge.
+    """
     assert order({n: Tank(n, field, theta_min=1.0).error for n in SIZES}) < 1.4
     assert order({n: Tank(n, field, Disc.whole).error for n in SIZES}) < 0.6
 
 
 def test_the_operator_is_the_matrix_assembled_face_by_face() -> None:
-    """SciPy's sparse solver on a matrix made from a list of faces finds the same p."""
+    """Operator against a matrix assembled face by face, solved by SciPy."""
     tank = Tank(24, POOL, Disc.from_nodes, Disc.from_nodes)
     cells, phi, a, rhs, A, p = tank.cells, tank.phi, tank.fractions, tank.rhs, tank.A, tank.p
     number = np.full(cells.shape, -1)

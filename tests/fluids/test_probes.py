@@ -34,7 +34,10 @@ def tank(dimension: int, probes: list[dict[str, Any]], **tables: Any) -> LiquidS
 
 
 def last(simulation: LiquidSimulation, until: float) -> dict[str, Any]:
-    """Step to a time and return the last row of the probes, whose columns are as announced."""
+    """Step to a time and return the last row of the probes.
+
+    Its columns must be the announced ones.
+    """
     advance(simulation, until)
     row = simulation.measured["probes"]
     assert tuple(row) == simulation.tables()["probes"]
@@ -47,7 +50,11 @@ def last(simulation: LiquidSimulation, until: float) -> dict[str, Any]:
 def test_a_tank_at_rest_has_pressures_and_levels_of_its_depth(
     dimension: int, surface: str, bias: float
 ) -> None:
-    """At walls, in corners, at cell centers and anywhere between; whole cells put the surface half a cell too high (`test_rest`)."""
+    """Pressures and levels of a tank at rest.
+
+    The probes are at walls, in corners, at cell centers and between. Whole cells put the surface
+    half a cell too high (`test_rest`).
+    """
     rng = np.random.default_rng(71)
     points = rng.uniform([0.0, 0.0, 0.0], [0.8, 0.4 - DX, 0.2], (20, 3))
     points = np.concatenate(
@@ -95,7 +102,10 @@ def test_a_full_box_ends_levels() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_liquid_in_flight_has_its_velocity_and_no_pressure(dimension: int) -> None:
-    """In free fall the velocity is that of the step's middle; `time` is the step's beginning."""
+    """Velocity and pressure of liquid in free fall.
+
+    The velocity is that of the step's middle; `time` is the begin of the step.
+    """
     velocity, middle = [0.3, 0.5, -0.2][:dimension], [0.4, 0.45, 0.2][:dimension]
     low, high = [0.2, 0.2, 0.1][:dimension], [0.6, 0.7, 0.3][:dimension]
     probes = [probe("a", middle, "velocity"), probe("a", middle)]
@@ -117,7 +127,11 @@ def test_liquid_in_flight_has_its_velocity_and_no_pressure(dimension: int) -> No
 def test_without_gravity_liquid_keeps_its_velocity_and_has_no_pressure(
     dimension: int, gravity: float
 ) -> None:
-    """No direction is up, or hardly one, whose square is 0: the search for the surface ends all the same."""
+    """Velocity without gravity, and no pressure.
+
+    Without a vertical direction, or with gravity whose square is 0, the search for the surface
+    still ends.
+    """
     velocity, middle = [0.3, -0.2, 0.1][:dimension], [0.4, 0.45, 0.2][:dimension]
     liquid = [box([0.2, 0.2, 0.1][:dimension], [0.6, 0.7, 0.3][:dimension], velocity=velocity)]
     probes = [
@@ -147,7 +161,11 @@ def test_without_gravity_liquid_keeps_its_velocity_and_has_no_pressure(
 
 
 def test_a_container_that_moves() -> None:
-    """A tank whose walls move at a steady speed carries its liquid past a probe that stays; walls are a solid, the domain is wider."""
+    """Container that moves.
+
+    A tank whose walls move at a steady speed carries its liquid past a fixed probe. Walls are a
+    solid, the domain is wider.
+    """
     walls = [
         box([0.2, 0.1], [0.28, 0.6], motion={"kind": "translation", "velocity": [0.4, 0.0]}),
         box([0.72, 0.1], [0.8, 0.6], motion={"kind": "translation", "velocity": [0.4, 0.0]}),
@@ -166,7 +184,11 @@ def test_a_container_that_moves() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_grids_that_follow_the_liquid_measure_the_same(dimension: int) -> None:
-    """A box of liquid crosses a wide domain; whichever part of it the grid covers, the probe sees it come."""
+    """Measurements on grids that follow the liquid.
+
+    A box of liquid crosses a wide domain. Whichever part of it the grid covers, the probe detects
+    it.
+    """
     size = [64.0, 32.0] if dimension == 2 else [16.0, 16.0, 8.0]
     resolution, middle = (1024, 30.1) if dimension == 2 else (128, 8.1)
     liquid = [
@@ -240,7 +262,7 @@ def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
     assert run_into(scene, whole).status == "finished"
     assert run_into(scene, parts, stop=lambda: next(asked) >= 7).status == "stopped"
     with open(parts / "probes.csv", "a") as file:
-        file.write("8,0.2,1.0,0.0,0.0\n9,0.")  # a killed process got so far
+        file.write("8,0.2,1.0,0.0,0.0\n9,0.")  # a killed process wrote only this part
     assert run_into(scene, parts, resume=True).status == "finished"
     assert (parts / "probes.csv").read_bytes() == (whole / "probes.csv").read_bytes()
     with (

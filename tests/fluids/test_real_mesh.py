@@ -1,4 +1,4 @@
-"""A dam breaks over a real triangle mesh, where one is at hand."""
+"""Dam break over a real triangle mesh, if one is installed."""
 
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def test_a_dam_breaks_over_spot(solids: str, wall: str) -> None:
     base = simulation.boundary.base.numpy()
     position = simulation.particles.position.numpy()
     x, y, z = (np.floor(position / simulation.grid.spacing).astype(int) + 1).T
-    assert (base[z, y, x] != wl.SOLID).all()  # no particle is inside the cow or the walls
+    assert (base[z, y, x] != wl.SOLID).all()  # no particle is inside the mesh or the walls
     if solids == "cut-cell":
         assert simulation.boundary.admits(position + 0.0).mean() > 0.999
     assert position[:, 0].max() > 1.3  # the wave has passed it

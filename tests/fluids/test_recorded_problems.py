@@ -1,4 +1,7 @@
-"""A run's pressure problems as files: what is read back is what was solved, and every method can be tried on it."""
+"""Recorded pressure problems of a run.
+
+The read problem is the solved one, and every method can solve it.
+"""
 
 import json
 
@@ -50,8 +53,8 @@ def test_the_recorded_problem_is_the_one_that_was_solved(tmp_path, name):
     for path, pressure in zip(files(tmp_path), pressures, strict=True):
         problem = load(path, device="cpu")
         kept = dict(np.load(path, allow_pickle=False))
-        # the oracle reads the file by its description alone: a face off by one, or a shift of
-        # another step, is not solved by the run's x
+        # The oracle uses the description of the file alone. With a shifted face, or the shift of
+        # another step, the run's x is no solution.
         faces = [kept.get(f"face_{axis}", 1.0) for axis in "xyz"]
         A = assemble(kept["cells"], faces, kept.get("shift"))
         fluid = kept["cells"].ravel() == wl.FLUID
@@ -101,7 +104,7 @@ def test_numbers_and_first_guess(tmp_path):
     assert problems[0].tolerance == simulation.projection.tolerance
     assert not problems[0].x0.any()
     both = (first != 0) & (problems[1].x0 != 0)  # the last pressure, scaled with the step
-    # forces act for half of each of two steps
+    # Forces act for half of each of two steps.
     ratio = (problems[0].dt + problems[1].dt) / problems[0].dt
     np.testing.assert_allclose(problems[1].x0[both], ratio * first[both], rtol=1e-12)
     assert both.sum() > 20
@@ -145,7 +148,7 @@ def test_damaged_files_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [
-        # 8 bytes that became a field
+        # 8 bytes that became a field.
         ("b", np.array(1.0), r"b is float64 of shape \(\): must be numbers of shape \("),
         ("lower", np.zeros(3), "lower is float64 of shape"),
         ("face_x", np.ones((2, 2)), "face_x is float64 of shape"),

@@ -1,4 +1,4 @@
-"""Recorded steps against steps that launch at once."""
+"""Recorded steps against steps with immediate launches."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.rows.program import LaunchGraph
 
-# of different lengths: a number that is recorded as it was at first shows
+# Different lengths reveal a number that is recorded only once.
 STEPS = (4e-3, 3e-3, 5e-3, 2e-3, 4e-3, 3e-3)
 JET = [box([0.0, 0.7], [0.1, 0.8], velocity=[1.5, 0.0], start=0.005, stop=0.015)]
 MODELS: dict[str, dict[str, Any]] = {
@@ -26,7 +26,7 @@ MODELS: dict[str, dict[str, Any]] = {
 
 
 def steps(tables: dict[str, Any]) -> tuple[LiquidSimulation, list[dict[str, Any]]]:
-    """Return a tank after some steps, in which a column collapses, and the rows of its log."""
+    """Return a tank after some steps of a collapsing column, and its log."""
     simulation = create(
         scene(size=[1.0, 1.0], resolution=16, liquid=[box([0.1, 0.0], [0.7, 0.6])], **tables)
     )
@@ -35,7 +35,7 @@ def steps(tables: dict[str, Any]) -> tuple[LiquidSimulation, list[dict[str, Any]
 
 @pytest.mark.parametrize("model", MODELS)
 def test_recorded_launches_give_the_same_bits(monkeypatch, model):
-    """Positions, velocities and log equal those of launches at once."""
+    """Equal bits of recorded and immediate launches: positions, velocities, log."""
     recorded, rows = steps(MODELS[model])
     monkeypatch.setattr(
         LaunchGraph, "run", lambda graph, *given, variant=None: graph._record(*given)

@@ -1,4 +1,7 @@
-"""Liquids at rest stay at rest: the LCP may not invent motion. A surface between cells follows the particles' own unevenness."""
+"""Liquids at rest: the LCP must not create motion.
+
+A surface between cells follows the unevenness of the particles.
+"""
 
 import math
 from typing import Any
@@ -71,7 +74,11 @@ def test_a_pool_at_rest_in_space(tables: dict[str, Any], bound: float) -> None:
 
 
 def test_the_pressure_of_a_pool_is_that_of_its_depth() -> None:
-    """The surface of whole cells lies at p = 0 in the AIR cell above, half a cell too high; the other has next to no bias."""
+    """Pressure of a pool at rest.
+
+    The surface of whole cells lies at p = 0 in the AIR cell above, half a cell too high; the other
+    has almost no bias.
+    """
     dx = 0.04
     rows = np.arange(20)
     for tables, bias, bound in ((VOXEL, 0.5, 1e-3), ({}, 0.0, 0.02)):
@@ -110,7 +117,11 @@ BALLS: dict[str, list[dict[str, Any]]] = {
 def test_a_gap_of_less_than_a_cell_above_the_floor_is_no_sink(
     ball: str, surface: str, wall: str
 ) -> None:
-    """Particles must be able to go where the faces are open: else the gap holds no liquid, what flows in is lost, and the pool spins up."""
+    """Gap of less than a cell above the floor.
+
+    Particles must be able to go where the faces are open. Otherwise the gap holds no liquid, inflow
+    is lost, and the pool starts to circulate.
+    """
     simulation = tank("full box", solid=BALLS[ball], pressure={"surface": surface}, wall=wall)
     volume = 0.64 - math.pi * 0.16**2
     rows = advance(simulation, 0.6)

@@ -1,4 +1,7 @@
-"""A run of a scene in which much starts and stops: its log has no slivers, and an interrupted run has the same steps."""
+"""Steps of a scene with many starts and stops.
+
+The log has no tiny steps, and an interrupted run has the same steps.
+"""
 
 import csv
 from itertools import count
@@ -18,7 +21,10 @@ FRAMES = 30.0
 
 
 def busy(end: float = 0.2) -> Any:
-    """Return a scene with a pool, a tap, a drain and a slide, whose times are next to frames and to each other."""
+    """Return a scene with a pool, a tap, a drain and a slide.
+
+    Their times are close to frames and to each other.
+    """
     slide = {
         "kind": "keyframes",
         "times": [0.0666, 0.1251, 0.12513],
@@ -69,7 +75,11 @@ def test_a_busy_run_has_no_slivers_and_goes_on_with_the_same_steps(tmp_path: Pat
 
 @pytest.mark.parametrize("phase", [0.1, 0.4, 0.6, 0.9])
 def test_a_jet_flies_on_whenever_in_a_step_its_source_stops(phase: float) -> None:
-    """A source that pushed with the share of its velocity that it runs in a step would hold back the jet before it."""
+    """Jet whose source stops within a step.
+
+    A source that pushed with the share of its velocity for the part of the step would hold back the
+    jet.
+    """
     dt, velocity = 0.01, 1.5
     source = box([0.0, 0.5], [0.125, 0.625], velocity=[velocity, 0.0], stop=(5 + phase) * dt)
     simulation = create(

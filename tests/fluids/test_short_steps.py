@@ -1,4 +1,7 @@
-"""Steps may be as short as one likes: no exchange between liquid and what flies beside it may happen once a step, whatever its length."""
+"""Very short steps.
+
+No exchange between liquid and spray may happen once per step, independent of its length.
+"""
 
 from pathlib import Path
 
@@ -12,7 +15,11 @@ from warp_lcp.scene.scene_file import load_scene
 
 @pytest.mark.parametrize("cfl", [0.4, 0.125])
 def test_a_drop_that_flies_past_spray_keeps_its_momentum(cfl: float) -> None:
-    """Without gravity and far from walls nothing pushes from outside; spray that took the drop's velocity would change the sum by 4 %."""
+    """Momentum of a drop that flies past spray.
+
+    Without gravity and far from walls there is no force from outside. Spray that took the drop's
+    velocity would change the sum by 4 %.
+    """
     simulation = create(
         scene(
             size=[2.0, 1.0],
@@ -42,9 +49,12 @@ def test_a_drop_that_flies_past_spray_keeps_its_momentum(cfl: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cfl", [0.125, 0.0625])  # the shorter the step the more was gained
+@pytest.mark.parametrize("cfl", [0.125, 0.0625])  # the shorter the step, the more energy was gained
 def test_liquid_poured_over_a_mesh_gains_no_energy_in_short_steps(cfl: float) -> None:
-    """Half of it is spray among drops; dragged along with them in every step it went off at 60 m/s."""
+    """Energy of liquid poured over a mesh in short steps.
+
+    Half of it is spray among drops; dragged along with them in every step it reached 60 m/s.
+    """
     model = load_scene("mesh-obstacle", ["domain.resolution=20", f"time.cfl={cfl}"])
     simulation = SIMULATOR.create(model, device="cpu", folder=Path())
     energy = np.array(
@@ -59,7 +69,11 @@ def test_liquid_poured_over_a_mesh_gains_no_energy_in_short_steps(cfl: float) ->
 
 @pytest.mark.parametrize("until", [5e-3, 0.25])
 def test_crowded_liquid_gains_no_energy_in_a_step_of_any_length(until: float) -> None:
-    """A falling block packs a jittered pool; what emptied its over-full cells within the step made 1e4 times the energy in 1e-6 s."""
+    """Energy of dense liquid in steps of any length.
+
+    A falling block compresses a jittered pool. Emptying over-full cells within the step made 1e4
+    times the energy in 1e-6 s.
+    """
     blocks = [box([0.0, 0.0], [1.0, 0.3]), box([0.3, 0.5], [0.6, 0.8], velocity=[0.0, -2.0])]
     tables = {"pressure": {"model": "unilateral"}, "particles": {"jitter": 1.0}}
     simulation = create(scene(size=[1.0, 1.0], resolution=24, cfl=1.0, liquid=blocks, **tables))
@@ -71,7 +85,11 @@ def test_crowded_liquid_gains_no_energy_in_a_step_of_any_length(until: float) ->
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_one_drop_that_leaves_a_wall_throws_nothing_after_it(cut: bool) -> None:
-    """Nine particles rest on the floor, or on a slab, and one leaves the cell at 4 m/s. No force acts: more energy is from nowhere."""
+    """Drop that leaves a wall without effect on others.
+
+    Nine particles rest on the floor, or on a slab, and one leaves the cell at 4 m/s. No force acts,
+    so that additional energy would come from nowhere.
+    """
     floor = 0.3 if cut else 0.0
     simulation = create(
         scene(

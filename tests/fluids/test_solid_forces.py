@@ -1,4 +1,4 @@
-"""Forces on solids: hydrostatics, Archimedes, momentum, and their table beside the log."""
+"""Forces on solids: hydrostatics, Archimedes, momentum, and their table."""
 
 import csv
 import itertools
@@ -32,7 +32,10 @@ def tank(dimension: int, **tables: Any) -> LiquidSimulation:
 
 
 def forces(simulation: LiquidSimulation, until: float) -> dict[str, np.ndarray]:
-    """Step to a time and return the last step's force and torque on the domain and on each solid, shape (3,) in 2-D, (6,) in 3-D."""
+    """Step to a time; return the last force and torque on the domain and each solid.
+
+    The shape is (3,) in 2-D and (6,) in 3-D.
+    """
     if until:
         advance(simulation, until)
     row = simulation.measured["forces"]
@@ -50,7 +53,11 @@ def ball(dimension: int, **more: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, surface: str) -> None:
-    """The ball is pushed up by what it displaces, as cells are closed; the walls bear that and the weight of the liquid."""
+    """Archimedes' principle, and the weight on the floor.
+
+    The ball is pushed up by its displaced volume, as cells are closed; the walls bear that and the
+    weight of the liquid.
+    """
     simulation = tank(
         dimension, solids=solids, pressure={"surface": surface}, solid=[ball(dimension)]
     )
@@ -59,7 +66,7 @@ def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, sur
     if solids == "voxel":
         volume = simulation.boundary.solids.covered[0] * simulation.grid.cell_volume
     up = found["solid0"][1] / (WATER * volume)
-    # of a ball of 3.75 cells, between the grid's nodes
+    # Error for a ball of 3.75 cells, between the grid's nodes.
     lost = {"voxel": 1e-3, "cut-cell": 0.015 if dimension == 2 else 0.042}[solids]
     assert up == pytest.approx(1.0, abs=lost)
     assert np.abs(np.delete(found["solid0"], 1)).max() < 0.02 * WATER * volume, (
@@ -67,7 +74,7 @@ def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, sur
     )
     filled = 0.8 * 0.56 * (0.8 if dimension == 3 else 1.0)
     if surface == "voxel":
-        # whole cells put the surface half a cell too high
+        # Whole cells put the surface half a cell too high.
         filled += 0.5 * simulation.grid.spacing * 0.8 ** (dimension - 1)
     assert found["domain"][1] / (WATER * filled) == pytest.approx(-1.0, abs=1e-3)
     assert abs(found["domain"][0]) < 0.01 * WATER * filled
@@ -76,14 +83,18 @@ def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, sur
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 def test_floor_and_walls_bear_the_depth(dimension: int, solids: str) -> None:
-    """A floor and a wall as solids, off the cells' faces with cut cells; their torque is about the centers of their boxes."""
+    """Hydrostatic forces on floor and walls.
+
+    A floor and a wall as solids, off the cells' faces with cut cells; their torque is about the
+    centers of their boxes.
+    """
     floor, wall = (0.11, 0.57) if solids == "cut-cell" else (0.12, 0.56)
     low, high = [-0.2] * dimension, [1.0] * dimension
     parts = [box(low, [1.0, floor, 1.0][:dimension]), box([wall, floor, -0.2][:dimension], high)]
     found = forces(tank(dimension, solids=solids, solid=parts), 0.3)
     depth, width = 0.56 - floor, 0.8 if dimension == 3 else 1.0
     weight, push = WATER * depth * wall * width, 0.5 * WATER * depth**2 * width
-    both = found["solid0"] + found["solid1"]  # where they touch, either may have what is buried
+    both = found["solid0"] + found["solid1"]  # where they touch, either may own the buried part
     assert both[:2] == pytest.approx([push, -weight], rel=0.01)
     assert found["domain"][0] == pytest.approx(-push, rel=0.01), "the left wall"
     assert found["domain"][1] == pytest.approx(0.0, abs=1e-3 * weight), (
@@ -96,14 +107,17 @@ def test_floor_and_walls_bear_the_depth(dimension: int, solids: str) -> None:
     aside = forces(
         tank(dimension, solids=solids, solid=[box([wall, -0.2, -0.2][:dimension], high)]), 0.3
     )["solid0"]
-    # of the center of pressure, above that of the box
+    # Torque of the center of pressure, above that of the box.
     push, lever = 0.5 * WATER * 0.56**2 * width, 0.56 / 3.0 - 0.4
     assert aside[:2] == pytest.approx([push, 0.0], rel=0.01, abs=1e-3 * push)
     assert aside[-1] == pytest.approx(-push * lever, rel=0.02)
 
 
 def crowded(dimension: int, solids: str, moves: str) -> LiquidSimulation:
-    """Return liquid in motion around solids that share cells: one stands, one moves or is a body."""
+    """Return liquid in motion around solids that share cells.
+
+    One stands, one moves or is a body.
+    """
     more: dict[str, Any] = {"stands": {}, "body": {"density": 700.0}}.get(moves, {})
     if moves == "moves":
         more = {"motion": {"kind": "translation", "velocity": [0.3, -0.2, 0.1][:dimension]}}
@@ -130,10 +144,11 @@ CROWDED = [("voxel", "stands"), ("cut-cell", "stands"), ("cut-cell", "moves"), (
 def test_what_the_pressure_takes_from_the_liquid_solids_get(
     dimension: int, solids: str, moves: str, monkeypatch: Any
 ) -> None:
-    """On the grid to rounding: the faces' momentum, open fractions times change of velocity, against all solids' impulses.
+    """Momentum that the pressure takes from the liquid and gives to solids.
 
-    Of whole cells with what stops the liquid in the half cells beside closed faces, else of the
-    pressure alone.
+    On the grid to rounding: the faces' momentum, open fractions times change of velocity, against
+    all solids' impulses. With whole cells it includes the stop of the liquid in the half cells
+    beside closed faces, otherwise the pressure alone.
     """
     simulation = crowded(dimension, solids, moves)
     projection, mass, checked = simulation.projection, 1000.0 * simulation.grid.cell_volume, []
@@ -173,7 +188,10 @@ def test_what_the_pressure_takes_from_the_liquid_solids_get(
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_body_is_told_what_it_got(dimension: int) -> None:
-    """The table and the coupling add up the same faces, each in its own way."""
+    """Force on a body by the table and by the coupling.
+
+    Both add up the same faces, each in its own way.
+    """
     simulation = crowded(dimension, "cut-cell", "body")
     body, given = simulation.bodies.bodies[0], []
     push = simulation.projection.push_bodies
@@ -197,7 +215,11 @@ def test_a_body_is_told_what_it_got(dimension: int) -> None:
 def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(
     dimension: int, viscosity: float
 ) -> None:
-    """Each step: pressure, viscous stresses and weight add up to the change of momentum, whatever the solves left."""
+    """Forces and weight of a body in viscous liquid.
+
+    In each step pressure, viscous stresses and weight sum to the change of momentum, whatever the
+    residuals.
+    """
     rod = ball(
         dimension,
         density=7800.0,
@@ -223,7 +245,10 @@ def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(
 
 
 def test_a_rod_that_sinks_through_honey_evenly_is_borne_by_it() -> None:
-    """The mean force is the weight; at first there is none."""
+    """Rod that sinks steadily through honey.
+
+    The mean force is the weight; at first there is none.
+    """
     rod = {"shape": "sphere", "center": [0.02, 0.055], "radius": 0.005, "density": 7800.0}
     tables = {
         "size": [0.04, 0.08],
@@ -243,7 +268,11 @@ def test_a_rod_that_sinks_through_honey_evenly_is_borne_by_it() -> None:
 
 @pytest.mark.parametrize("solids", ["voxel", "cut-cell"])
 def test_an_impact_takes_the_momentum(solids: str) -> None:
-    """A block falls into a tilted tub: what particles lose of their momentum, gravity's apart, the walls have got, to a few percent."""
+    """Momentum of an impact.
+
+    A block falls into a tilted tub. The walls get the momentum that particles lose, without
+    gravity's, to a few percent.
+    """
     tables: dict[str, Any] = {
         "solids": solids,
         "solid": [{"shape": "plane", "point": [0.3, 0.1], "normal": [0.3, 1.0]}],
@@ -271,7 +300,11 @@ def test_an_impact_takes_the_momentum(solids: str) -> None:
 
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
 def test_all_solids_together_bear_the_liquid(seed: int) -> None:
-    """Whatever stands in a pool at rest: the forces on it and on the walls add up to the weight of the particles."""
+    """Sum of the forces on all solids.
+
+    In a pool at rest with any solids, the forces on them and on the walls sum to the weight of the
+    particles.
+    """
     simulation = create(scene(**random_tank(seed), output=FORCES))
     found = forces(simulation, 0.6)
     weight = simulation.particle_mass * simulation.particles.count * GRAVITY
@@ -299,7 +332,11 @@ def test_forces_change_nothing() -> None:
 
 
 def test_reference_points_move_along() -> None:
-    """A rotating paddle: the point is the center of its box, which goes around; a plane has the origin."""
+    """Moving reference points of torques.
+
+    For a rotating paddle the point is the center of its box, which moves around; for a plane it is
+    the origin.
+    """
     motion = {"kind": "rotation", "center": [0.4, 0.4], "rate": 90.0}
     solids = [
         box([0.5, 0.38], [0.7, 0.42], motion=motion),

@@ -1,4 +1,7 @@
-"""Surface tension: curvature, the pressure's jump, walls, frequencies of drops and waves, against what theory says."""
+"""Surface tension against theory.
+
+Curvature, pressure jump, walls, frequencies of drops and waves.
+"""
 
 import math
 from typing import Any
@@ -15,7 +18,8 @@ from warp_lcp.fluids import surface_tension_kernels as kernels
 from warp_lcp.fluids.surface_tension import MOST_PASSES, SurfaceTension, wall_cells
 
 SIGMA, RHO, RADIUS = 0.072, 1000.0, 0.01  # of water [N/m, kg/m^3], and of drops [m]
-SPEED, TIME = math.sqrt(SIGMA / (RHO * RADIUS)), math.sqrt(RHO * RADIUS**3 / SIGMA)  # of a drop
+# Units of a drop.
+SPEED, TIME = math.sqrt(SIGMA / (RHO * RADIUS)), math.sqrt(RHO * RADIUS**3 / SIGMA)
 WATER: dict[str, Any] = {"coefficient": SIGMA}
 
 
@@ -45,7 +49,10 @@ def centers(simulation: LiquidSimulation) -> np.ndarray:
 
 
 def take(simulation: LiquidSimulation, distance: np.ndarray) -> tuple[SurfaceTension, np.ndarray]:
-    """Let the surface tension act on a given distance to the surface; return it and the cells' kinds."""
+    """Apply the surface tension to a given distance to the surface.
+
+    Return it and the kinds of the cells.
+    """
     assert simulation.tension is not None and simulation.surface.phi is not None
     kind = simulation.boundary.base.numpy().copy()
     kind[(kind == wl.AIR) & (distance < 0.0)] = wl.FLUID
@@ -67,14 +74,14 @@ def curvatures(simulation: LiquidSimulation, distance: np.ndarray) -> np.ndarray
 def measured(
     simulation: LiquidSimulation, liquid: np.ndarray, open_: np.ndarray, points: int
 ) -> np.ndarray:
-    """Return the distance that evenly spread particles would say.
+    """Return the level set of evenly spread particles.
 
     Args:
-        simulation: of unit cells.
-        liquid: whether it is at each of `points` an axis and cell, two cells beyond the domain, in
-            the order of the stored cells.
-        open_: whether no solid is there.
-        points: how many.
+        simulation: simulation of unit cells.
+        liquid: whether liquid is at each sample; `points` samples per axis and cell, up to two
+            cells beyond the domain, in the order of the stored cells.
+        open_: whether a sample is outside of solids.
+        points: number of samples along each axis of a cell.
     """
     filled, room = (liquid & open_).astype(np.float64), open_.astype(np.float64)
     for axis, count in enumerate(simulation.grid.counts[::-1]):
@@ -134,7 +141,11 @@ def test_the_curvature_of_a_sphere(dimension: int, radius: float, sign: float) -
 def test_the_surface_is_looked_for_nearby_and_inside_the_grid(
     dimension: int, at: int, sign: float
 ) -> None:
-    """Where the distance hardly changes, its slope says 15 cells, of which 1.5 slopes are gone; ghost cells count for nothing."""
+    """Search for the surface nearby and inside the grid.
+
+    Where the distance is nearly constant, its slope implies 15 cells; the search goes at most 1.5
+    slopes. Ghost cells do not count.
+    """
     simulation = create(
         scene(
             size=[1.0] * dimension,
@@ -190,7 +201,7 @@ def test_the_push_is_a_jump_of_the_pressure(dimension: int) -> None:
     assert result
     projection.project(simulation.velocity, window, result, criteria)
     np.testing.assert_allclose(projection.pressure.numpy()[kind == wl.FLUID], 0.25, rtol=1e-5)
-    # the push is up to 0.25 / theta
+    # The push is up to 0.25 / theta.
     assert max(np.abs(field.numpy()).max() for field in simulation.velocity) < 1e-4
 
 
@@ -232,7 +243,7 @@ def test_a_plane_at_the_contact_angle_is_straight(
         away = (centers(simulation) - foot) * (1.0, 1.0, 0.0)
         near = np.linalg.norm(away, axis=-1) < 6.0
         if dimension == 3:
-            # the sides have the angle, too
+            # The sides have the angle, too.
             near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0
         found[given] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
     assert found[angle] < 0.03
@@ -242,7 +253,10 @@ def test_a_plane_at_the_contact_angle_is_straight(
 def meniscus(
     width: int, angle: float, offset: float, rng: np.random.Generator
 ) -> tuple[LiquidSimulation, np.ndarray, float, float]:
-    """Return an arc between plates, the left one's end at `offset` of a cell or the domain's side: distance, radius, where it begins."""
+    """Return an arc between plates: distance, radius, and its begin.
+
+    The left end is at `offset` of a cell, or at the domain's side.
+    """
     radius, low, depth = (
         0.5 * width / math.cos(math.radians(angle)),
         3.0 + offset if offset else 0.0,
@@ -286,7 +300,10 @@ def meniscus(
     ("width", "offset"), [(12, 0.0), (24, 0.0), (12, 0.25), (12, 1 / 3), (12, 0.5)]
 )
 def test_a_meniscus_has_the_curvature_of_its_arc(width: int, offset: float, angle: float) -> None:
-    """Between walls: 2 cos(angle) / width. The mean, what liquid rises by, was 8 % off where walls cut cells."""
+    """Curvature of a meniscus between walls: 2 cos(angle) / width.
+
+    The mean, which determines the rise of liquid, was 8 % off where walls cut cells.
+    """
     rng, found = np.random.default_rng(17), []
     for _ in range(3):
         simulation, distance, radius, low = meniscus(width, angle, offset, rng)
@@ -301,7 +318,11 @@ def test_a_meniscus_has_the_curvature_of_its_arc(width: int, offset: float, angl
 
 @pytest.mark.parametrize("angle", [30.0, 150.0])
 def test_the_widest_filter_bends_no_flat_surface_beside_a_wall(angle: float) -> None:
-    """A kernel may be empty, or full, where that of the wall's cell behind it is not: the surface seemed to turn by 0.028 there."""
+    """Flat surface beside a wall with the widest filter.
+
+    A kernel may be empty, or full, where that of the wall cell behind it is not: the surface seemed
+    to turn by 0.028 there.
+    """
     turns, rng = [], np.random.default_rng(11)
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     simulation = tank(2, 32, angle=angle)
@@ -350,7 +371,7 @@ def test_cells_of_walls_mirror_what_is_before_them() -> None:
 
 
 def drop(across: int, dimension: int = 2, *, seed: int = 2015, **tables: Any) -> LiquidSimulation:
-    """Return a drop in free space, that many cells in diameter."""
+    """Return a drop in free space of so many cells in diameter."""
     side = (4 if dimension == 2 else 3) * RADIUS
     liquid = [{"shape": "sphere", "center": [side / 2] * dimension, "radius": RADIUS}]
     settings = {"particles": {"seed": seed}, "surface_tension": WATER} | tables
@@ -366,7 +387,7 @@ def drop(across: int, dimension: int = 2, *, seed: int = 2015, **tables: Any) ->
 
 
 def capillary_step(simulation: LiquidSimulation) -> float:
-    """Return the step [s] beyond which pushes without a filter are unstable."""
+    """Return the step [s] beyond which unfiltered surface tension is unstable."""
     return math.sqrt(RHO * simulation.grid.spacing**3 / (math.pi * SIGMA))
 
 
@@ -409,14 +430,14 @@ def test_a_drop_at_rest_stays_so(times: float, bound: float) -> None:
 
 
 def moved(simulation: LiquidSimulation, position: np.ndarray) -> None:
-    """Put the particles elsewhere."""
+    """Set the particles' positions."""
     arrays = {name: array.numpy() for name, array in simulation.particles.arrays().items()}
     simulation.particles.assign(arrays | {"position": position.astype(np.float32)})
     simulation.particles.sort()
 
 
 def frequency(times: list[float], values: list[float], guess: float) -> tuple[float, float]:
-    """Return the frequency and the damping of an oscillation over a guess."""
+    """Return the frequency and the damping of an oscillation, relative to a guess."""
 
     def decaying(t: np.ndarray, a: float, b: float, w: float, c: float, d: float) -> np.ndarray:
         return np.exp(-c * t) * (a * np.cos(w * t) + b * np.sin(w * t)) + d
@@ -466,7 +487,10 @@ def test_a_drop_oscillates_at_lambs_frequency(dimension: int) -> None:
 
 
 def wave(cells: int, times: float = 1.0) -> float:
-    """Return the frequency of a standing capillary wave over sqrt(sigma k^3 tanh(k h) / rho)."""
+    """Return the frequency of a standing capillary wave over the exact one.
+
+    The exact one is sqrt(sigma k^3 tanh(k h) / rho).
+    """
     length = 2.0 * RADIUS
     k, depth, height = 2.0 * math.pi / length, length / 2, 0.02 * length
     liquid = [box([0.0, 0.0], [length, depth])]
@@ -501,12 +525,15 @@ def test_a_capillary_wave() -> None:
 @pytest.mark.slow
 def test_capillary_waves_converge() -> None:
     assert wave(64, 3.0) == pytest.approx(1.0, abs=0.012)
-    # the widest filter takes part of so short a wave
+    # The widest filter reduces so short a wave.
     assert wave(32, 10.0) == pytest.approx(1.0, abs=0.05)
 
 
 def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
-    """Return a drop on the floor that meets it at an angle, the height of its center of mass and the radius of its surface [m]."""
+    """Return a drop on the floor with a contact angle.
+
+    The height of its center of mass and the radius of its surface [m] are returned too.
+    """
     a = math.radians(angle)
     radius = RADIUS * math.sqrt(0.5 * math.pi / (a - math.sin(a) * math.cos(a)))
     side = 6.0 * RADIUS
@@ -566,7 +593,11 @@ def test_what_cannot_be_is_refused(tables: dict[str, Any], message: str) -> None
 @pytest.mark.parametrize("angle", [20.0, 60.0, 100.0, 150.0])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) -> None:
-    """What the surface pulls with beside a wall that lets go is borne by the liquid there, however near to its center the surface lies."""
+    """Speed of a splash at separating walls.
+
+    Beside a separating wall the liquid bears the pull of the surface, however near to its center
+    the surface lies.
+    """
     low, high = [0.1, 0.2, 0.3][:dimension], [0.5, 0.4, 0.5][:dimension]
     drop = [
         box(
@@ -597,7 +628,11 @@ def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) 
 
 @pytest.mark.parametrize(("angle", "hangs"), [(50.0, True), (130.0, False)])
 def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, hangs: bool) -> None:
-    """Of 7.8 mm of free fall: the air holds up what clings to the ceiling by its surface, and nothing holds up what does not."""
+    """Drop at a separating ceiling, with and without wetting.
+
+    Over 7.8 mm of free fall: the air holds up what wets the ceiling, and nothing holds up what does
+    not.
+    """
     drop = {"shape": "sphere", "center": [0.01, 0.01], "radius": 0.004}
     tension = {"coefficient": 0.072, "contact_angle": angle}
     simulation = create(
@@ -619,7 +654,10 @@ def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, ha
     ("width", "angle"), [(0.004, 30.0), (0.004, 70.0), (0.008, 20.0), (0.008, 60.0)]
 )
 def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) -> None:
-    """The pressure in it is below that of the air, down to some cells below the surface too, and no air gets there."""
+    """Rise of a meniscus along separating walls.
+
+    Its pressure is below that of the air, also some cells below the surface, and no air gets there.
+    """
     tension, liquid = (
         {"coefficient": 0.072, "contact_angle": angle},
         [box([0.0, 0.0], [width, 0.006])],
@@ -641,7 +679,11 @@ def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) ->
 
 @pytest.mark.parametrize("angle", [60.0, 30.0])
 def test_liquid_rises_between_plates(angle: float) -> None:
-    """By 2 sigma cos(angle) / (rho g width) over its pressure's level, 12 cells apart and 30, the mean over the width."""
+    """Rise of liquid between plates.
+
+    The rise is 2 sigma cos(angle) / (rho g width) over its pressure's level, for widths of 12 and
+    30 cells, as the mean over the width.
+    """
     plate, bath = box([0.004, 0.002], [0.006, 0.02]), [box([0.0, 0.0], [0.016, 0.006])]
     tables = {
         "solid": [plate],

@@ -1,4 +1,4 @@
-"""Solids thinner than cells: nothing passes them, both sides are apart, and they bear what stands on them."""
+"""Solids thinner than cells: no leaks, separate sides, and support of loads."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,10 @@ def thin_walls(monkeypatch):
 def bottle(
     dimension: int, thickness: float, motion: dict[str, Any] | None = None, **place: Any
 ) -> tuple[list[dict[str, Any]], np.ndarray]:
-    """Return the walls of a closed box, some cells thick and off the grid, and the ends of its inside along each axis."""
+    """Return the walls of a closed box, and the ends of its inside along each axis.
+
+    They are some cells thick and off the grid.
+    """
     ends = np.array([[0.5 - 0.3 + 0.3 * CELL, 0.5 + 0.3 + 0.1 * CELL]] * dimension)
     solids = []
     for axis in range(dimension):
@@ -46,7 +49,7 @@ def filled(ends: np.ndarray, share: float = 0.6) -> list[dict[str, Any]]:
 
 
 def inside(simulation: LiquidSimulation, ends: np.ndarray) -> bool:
-    """Return whether all particles are between the ends, in the frame of the first solid."""
+    """Return whether all particles are between the ends, relative to the first solid."""
     motion = simulation.boundary.cut.solids[0].motion
     x = simulation.particles.position.numpy().astype(np.float64)
     if motion is not None:
@@ -117,7 +120,10 @@ def test_pools_on_two_sides_of_a_plate_stay_apart(thickness: float) -> None:
 
 
 def test_a_thin_piston_takes_all_along() -> None:
-    """At 1 m/s and CFL 8 it goes several cells a step, each many times its thickness."""
+    """Thin piston that moves all liquid.
+
+    At 1 m/s and CFL 8 it moves several cells in a step, each many times its thickness.
+    """
     piston = box(
         [0.1, -0.2],
         [0.1 + 0.2 * CELL, 1.2],
@@ -149,7 +155,7 @@ def test_gaps_narrower_than_a_cell_are_told() -> None:
 
 
 def test_built_in_scenes_have_no_thin_solids() -> None:
-    """They are as before, in all bits: whatever thin solids change is not there."""
+    """Built-in scenes without thin solids: unchanged bits."""
     for name in built_in_scenes():
         loaded = load_scene(name)
         if loaded.scene.simulator != "contacts" and loaded.solid and loaded.dimension == 2:

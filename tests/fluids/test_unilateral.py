@@ -1,4 +1,4 @@
-"""The unilateral pressure: it pushes where a cell would over-fill, and never pulls."""
+"""Unilateral pressure: it pushes where a cell would over-fill, and never pulls."""
 
 from typing import Any
 
@@ -27,8 +27,8 @@ def splines(distance: np.ndarray) -> np.ndarray:
 
 
 def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
-    # NumPy, cell by cell, from mass balance alone: y is what cells can still take after a step. A
-    # wrong sign or row shows.
+    # NumPy, cell by cell, from mass balance alone: y is the capacity of cells after a step. A wrong
+    # sign or row would show.
     rng = np.random.default_rng(77)
     blocks = [
         box([0.0, 0.0], [0.5, 0.5], velocity=[3.0, -1.0]),
@@ -89,7 +89,11 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_is_too_dense_flies_as_it_is_and_settles_slowly(dimension: int) -> None:
-    """Without gravity crowding is no velocity; with it a cell twice as full expands by at most a fifth of sqrt(g dx), whatever dt is."""
+    """Speed of too dense liquid.
+
+    Without gravity excess density is no velocity. With it a cell twice as full expands by at most a
+    fifth of sqrt(g dx), whatever dt is.
+    """
     low, high = [0.375] * dimension, [0.625] * dimension
     for g, dt in ((0.0, 0.01), (GRAVITY, 1e-5)):
         simulation = liquid(
@@ -120,7 +124,7 @@ def test_cells_with_room_have_no_pressure_and_spray_is_ballistic() -> None:
         [1.0, 1.0], [box([0.25, 0.25], [0.75, 0.75])], particles={"per_axis": 2, "jitter": 1.0}
     )
     thin = simulation.particles.marks
-    # a quarter stays
+    # A quarter remains.
     thin.assign((np.arange(simulation.particles.count) % 4 != 0).astype(np.int32))
     simulation.particles.remove(thin)
     velocity = np.random.default_rng(5).uniform(-0.2, 0.2, (simulation.particles.count, 3)).astype(
@@ -141,8 +145,8 @@ def test_cells_with_room_have_no_pressure_and_spray_is_ballistic() -> None:
 @pytest.mark.parametrize("cfl", [0.7, 2.0])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
-    # with fluxes of the mean density its front seems to over-fill the cells ahead, and is blown off
-    # at some m/s
+    # With fluxes of the mean density its front seems to over-fill the cells ahead and is blown off
+    # at some m/s.
     low, high = [0.375, 0.6, 0.0][:dimension], [0.625, 0.9, 0.25][:dimension]
     block = box(low, high, velocity=[0.5, 0.0, 0.0][:dimension])
     simulation = liquid([1.0, 1.0, 0.25][:dimension], [block], cfl=cfl)
@@ -150,7 +154,7 @@ def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
     velocity = simulation.particles.velocity.numpy().astype(np.float64)
     expected = [0.5, -(0.2 - 0.5 * simulation.last_dt) * GRAVITY, 0.0]
     np.testing.assert_allclose(velocity.mean(axis=0), expected, atol=2e-3)
-    # 3 % of the speed: the jitter's densest cells settle
+    # 3 % of the speed: the densest cells of the jitter settle.
     assert np.abs(velocity - expected).max() < 0.06
     assert np.abs(velocity - expected).std() < 0.01
 
@@ -172,7 +176,7 @@ def test_a_pool_holds_itself(dimension: int, cut: bool) -> None:
     assert rows[-1]["kinetic_energy"] < 1e-3 * rows[-1]["potential_energy"]
     p = simulation.grid.interior(simulation.projection.pressures(1000.0))[..., 0].mean(axis=0)
     depth = 0.5 - (np.arange(32) + 0.5) / 32
-    # the surface is known to half a cell
+    # The surface is known to half a cell.
     np.testing.assert_allclose(p[:14] / (1000.0 * GRAVITY), depth[:14], atol=0.45 / 32)
     assert not p[17:].any()
 
@@ -189,7 +193,7 @@ def test_blocks_that_part_are_not_held_together() -> None:
         )
         advance(simulation, 0.1, 0.005)
         speeds[model] = np.abs(simulation.particles.velocity.numpy()[:, 0]).mean()
-    # particles within a cell of the seam share faces: they stay behind as spray
+    # Particles within a cell of the seam share faces and stay behind as spray.
     assert speeds["unilateral"] > 0.93
     assert speeds["incompressible"] < 0.8
 
@@ -217,4 +221,4 @@ def test_a_collision_conserves_volume_and_momentum() -> None:
     np.testing.assert_allclose(velocity.mean(axis=0), 0.0, atol=0.02)
     assert rows[-1]["volume"] == pytest.approx(rows[0]["volume"], rel=0.06)
     energies = [row["kinetic_energy"] for row in rows]
-    assert max(energies) < 1.02 * energies[0]  # it gives no energy
+    assert max(energies) < 1.02 * energies[0]  # there is no gain of energy

@@ -1,4 +1,7 @@
-"""Viscosity: its equations against their energy, what they keep, walls that hold, let go or slip, and bodies."""
+"""Viscosity: energy of its equations, conservation, walls, and bodies.
+
+Walls are no-slip, separating or slip.
+"""
 
 import math
 
@@ -25,7 +28,7 @@ def blob(
     own: float | None = None,
     **tables,
 ):
-    """A box of liquid in free flight."""
+    """Return a box of liquid in free flight."""
     low, high = [0.3, 0.35, 0.4][:dimension], [0.7, 0.62, 0.65][:dimension]
     physics = {"physics": {"gravity": [0.0] * dimension}}
     given = {"viscosity": {"value": viscosity}, **physics, **tables}
@@ -40,7 +43,7 @@ def blob(
 
 
 def prepared(simulation, velocity, dt: float = 0.01):
-    """Take a viscous step of a velocity as the simulation's liquid is."""
+    """Take a viscous step of a velocity with the simulation's liquid."""
     for field, values in zip(simulation.velocity, velocity, strict=True):
         field.assign(values.astype(np.float32))
     projection = simulation.projection
@@ -52,7 +55,10 @@ def prepared(simulation, velocity, dt: float = 0.01):
 
 
 def force_of_energy(simulation, u, tau: float, relative=None):
-    """V u + tau K u from the energy's definition, for liquid that touches no wall; V of each component. `relative`: viscosity on faces."""
+    """Return V u + tau K u from the energy's definition, and V of each component.
+
+    For liquid that touches no wall. `relative`: viscosity on faces.
+    """
     phi, d = simulation.surface.phi.numpy().astype(float), simulation.grid.dimension
     axis_of = {a: 2 - a for a in range(d)}
 
@@ -75,7 +81,7 @@ def force_of_energy(simulation, u, tau: float, relative=None):
             )
         return sum(m + above(m, a) for a, m in enumerate(relative)) / (2 * d)
 
-    # between two cells of air velocities are continued: no mass
+    # Between two cells of air velocities are extrapolated: no mass.
     fluid = simulation.projection.kind.numpy() == FLUID
     volume = [
         np.where(fluid | below(fluid, a), filled(0.5 * (phi + below(phi, a))), 0.0)
@@ -149,7 +155,11 @@ def test_rigid_motions_stay_and_momenta_are_kept(dimension: int) -> None:
 
 @pytest.mark.parametrize("above", [0.1, 0.3, 0.45])
 def test_the_surface_bears_no_shear_however_short_the_step(above: float) -> None:
-    """A layer that reaches `above` of a cell over its last row of unknowns: the face in air above has no mass to withstand the shear."""
+    """Surface without shear, however short the step.
+
+    A layer reaches `above` of a cell over its last row of unknowns; the face in air above has no
+    mass to withstand the shear.
+    """
     low, speed = box([0.0, 0.0], [1.0, (8.0 + above) / 16.0]), 1.0
     tables = {"viscosity": {"value": 1.0}, "wall": "free-slip", "particles": {"jitter": 0.0}}
     simulation = create(scene(size=[1.0, 1.0], resolution=16, liquid=[low], **tables))
@@ -158,7 +168,7 @@ def test_the_surface_bears_no_shear_however_short_the_step(above: float) -> None
     for dt in (0.01, 0.1):  # nu dt / dx^2: .0026 and .026
         prepared(simulation, [np.zeros_like(x), speed * np.cos(math.pi * x)], dt)
         u, v = (field.numpy()[1, :, 3:15].astype(float) for field in simulation.velocity)
-        # at the edges beside the surface, the lower side of row 9
+        # At the edges beside the surface, the lower side of row 9.
         across = u[9, 1:] - u[8, 1:] + np.diff(v[9])
         inside = u[5, 1:] - u[4, 1:] + np.diff(v[5])
         shear[dt] = np.abs(across).max() / np.abs(inside).max()
@@ -194,7 +204,7 @@ def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> Non
             simulation,
             [np.sin(index[1]) * np.cos(2.0 * index[0]), np.sin(index[0]) * np.cos(2.0 * index[1])],
         )
-        # forces of 1e-5 of the momentum, which float32 velocities round to 1e-7 of it
+        # Forces of 1e-5 of the momentum, which float32 velocities round to 1e-7 of it.
         rounding = 3e-4 if viscosity < 1.0 else 0.0
         assert result.converged and result.relative_residual <= max(1e-4, rounding)
         counts.append(result.iterations)
@@ -202,7 +212,10 @@ def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> Non
 
 
 def least_eigenvalue(level, steps: int = 60) -> float:
-    """Return, by Lanczos from chance, about the least eigenvalue of a level's equations with their diagonal scaled to 1."""
+    """Return about the least eigenvalue of a level's equations, by Lanczos.
+
+    It starts from a random vector; the diagonal is scaled to 1.
+    """
     shape, axes = level.grid.shape, range(level.dimension)
     diagonal = np.stack([field.numpy() for field in level.diagonal])
     scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
@@ -232,7 +245,11 @@ def least_eigenvalue(level, steps: int = 60) -> float:
     [4, 6, 28, 37, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(100, 160))],
 )
 def test_any_liquid_among_any_solids_is_solved(seed: int) -> None:
-    """Every step converges in a few dozen iterations, and no level's equations have a negative eigenvalue."""
+    """Solves of any liquid among any solids.
+
+    Every step converges in a few dozen iterations, and no level's equations have a negative
+    eigenvalue.
+    """
     simulation, most = create(viscous_scene(seed)), 0
     for _ in range(24):
         most = max(most, simulation.step(min(simulation.stable_dt(), 0.02))["viscous_iterations"])
@@ -246,7 +263,11 @@ def test_any_liquid_among_any_solids_is_solved(seed: int) -> None:
     "seed", [43, 74, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(100, 160))]
 )
 def test_any_liquid_stirred_by_any_solids_is_solved(seed: int) -> None:
-    """Solids that turn, bodies, slip, sources and liquids of several viscosities: every step converges in a few iterations."""
+    """Solves of any liquid stirred by any solids.
+
+    Solids that turn, bodies, slip, sources and liquids of several viscosities: every step converges
+    in a few iterations.
+    """
     simulation, most = create(stirred_scene(seed)), 0
     for _ in range(12):
         most = max(
@@ -258,7 +279,10 @@ def test_any_liquid_stirred_by_any_solids_is_solved(seed: int) -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("slip", [0.0, 0.02, 0.3])
 def test_liquid_that_turns_with_its_wall_feels_no_force(dimension: int, slip: float) -> None:
-    """Where liquid and solid move as one rigid body there is no rate of strain, at any slip length: nothing changes."""
+    """Rigid rotation of liquid with its wall: no force.
+
+    Where liquid and solid move as one rigid body there is no rate of strain, at any slip length.
+    """
     middle = [0.5, 0.5, 0.5][:dimension]
     motion = {
         "kind": "rotation",
@@ -301,7 +325,10 @@ def test_liquid_that_turns_with_its_wall_feels_no_force(dimension: int, slip: fl
 
 
 def test_liquid_that_falls_as_fast_as_its_source_feels_no_force() -> None:
-    """The source's own faces have its velocity in the products of components beside it too."""
+    """Liquid that falls as fast as its source: no force.
+
+    The source's own faces have its velocity also in the products of neighboring components.
+    """
     source = box([0.35, 0.7], [0.65, 0.8], velocity=[0.0, -1.0])
     tables = {"viscosity": {"value": 100.0}, "source": [source], **WEIGHTLESS}
     simulation = create(
@@ -315,7 +342,11 @@ def test_liquid_that_falls_as_fast_as_its_source_feels_no_force() -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("viscosity", [1.0, 100.0, 1e4])
 def test_a_block_leaves_a_ceiling_that_separates(dimension: int, viscosity: float) -> None:
-    """Every particle falls freely; held by suction it hangs, stretching by its weight, and so it does where it sticks."""
+    """Separation of a block from a ceiling.
+
+    Every particle falls freely. Held by suction it hangs and stretches by its weight, as it does
+    where it sticks.
+    """
     low, size = [0.25, 1.6, 0.25][:dimension], [1.0, 2.0, 1.0][:dimension]
     high = [0.75, 2.0, 0.75][:dimension]
     fallen = {}
@@ -340,7 +371,7 @@ def test_a_block_leaves_a_ceiling_that_separates(dimension: int, viscosity: floa
 
 
 def test_couette_flow_between_cut_walls() -> None:
-    """The velocity between a disc that turns and a round wall, 16 cells apart: A r + B / r."""
+    """Velocity between a turning disc and a round wall, 16 cells apart: A r + B / r."""
     inner, outer, rate = 0.2, 0.45, 1.0
     errors = []
     for resolution in (32, 64):
@@ -388,7 +419,11 @@ def test_couette_flow_between_cut_walls() -> None:
 
 @pytest.mark.parametrize("slip", [0.0, 0.1])
 def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
-    """The front of a thin layer on a no-slip floor, Huppert 1982: 1.411 (g q^3 t / (3 nu))^(1/5), q the area on each side of the middle."""
+    """Front of a thin layer on a no-slip floor.
+
+    It is at 1.411 (g q^3 t / (3 nu))^(1/5) (Huppert 1982), where q is the area on each side of the
+    middle.
+    """
     given = {
         "viscosity": {"value": 1000.0, "slip_length": slip},
         "physics": {"gravity": [0.0, -10.0], "density": 1000.0},
@@ -403,17 +438,20 @@ def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
         fronts.append([simulation.time, 0.5 * float(x.max() - x.min())])
     t, front = np.array([row for row in fronts if row[0] > 6.0]).T
     expected = 1.411 * (10.0 * 0.125**3 / 3.0) ** 0.2
-    # a block's start is no similarity solution's: the rate forgets it sooner
+    # The initial block is not the similarity solution; the rate depends less on it.
     rate = np.polyfit(t, front**5, 1)[0] ** 0.2 / expected
     if slip:
-        assert rate > 1.1  # the floor is what slows it
+        assert rate > 1.1  # only the floor slows it
     else:
         assert abs(rate - 1.0) < 0.05
         assert abs(front[-1] / (expected * t[-1] ** 0.2) - 1.0) < 0.05
 
 
 def test_a_slip_length_moves_the_wall_away() -> None:
-    """A layer over a floor that drags it: u - nu dt u'' = 1 with u(0) = slip u'(0), u'(H) = 0."""
+    """Slip length as a shift of the wall.
+
+    A layer over a floor that drags it: u - nu dt u'' = 1 with u(0) = slip u'(0), u'(H) = 0.
+    """
     depth, length = 0.125, math.sqrt(0.02)
     for slip in (0.0, 0.05, math.inf):
         tables = {
@@ -436,12 +474,16 @@ def test_a_slip_length_moves_the_wall_away() -> None:
             else 1.0 / (math.cosh(depth / length) + slip / length * math.sinh(depth / length))
         )
         expected = 1.0 - part * np.cosh((depth - y) / length)
-        # the tank's ends reach here
+        # The influence of the tank's ends.
         assert np.abs(simulation.velocity[0].numpy()[1, 1:9, 65] - expected).max() < 0.015
 
 
 def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
-    """Stokes's law with the walls' factor of .6 or so; momenta of liquid and body together are kept."""
+    """Slow sinking of a body, and stability of a light one.
+
+    Stokes's law with a wall factor of about 0.6; the sum of the momenta of liquid and body is
+    conserved.
+    """
     ball = {"shape": "sphere", "center": [0.2, 0.2, 0.2], "radius": 0.05}
     speeds = {}
     for density in (2000.0, 50.0):
@@ -487,7 +529,7 @@ def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
 
     before = momentum()
     advance(simulation, 0.1)
-    assert momentum() == pytest.approx(before, rel=0.03)  # without viscosity the same: transfers
+    assert momentum() == pytest.approx(before, rel=0.03)  # the same without viscosity: transfers
     assert 0.0 < body.velocity[0] < 1.0
     slower = abs(body.angular_velocity[2]) / math.radians(90.0)
     assert slower < 1.0
@@ -496,7 +538,7 @@ def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_solids_bear_what_the_liquid_loses(dimension: int, solids: str) -> None:
-    """Forces of pressure and stresses on all solids are the change of the liquid's momentum."""
+    """Forces of pressure and stresses on solids against the liquid's momentum."""
     ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.15}
     liquid = box(
         [0.0] * dimension, [1.0, 0.9, 1.0][:dimension], velocity=[1.0, 0.3, 0.2][:dimension]
@@ -513,7 +555,7 @@ def test_solids_bear_what_the_liquid_loses(dimension: int, solids: str) -> None:
             size=[1.0] * dimension, resolution={2: 32, 3: 16}[dimension], liquid=[liquid], **tables
         )
     )
-    start = simulation.particle_mass * simulation.particles.count  # of 1 m/s
+    start = simulation.particle_mass * simulation.particles.count  # momentum at 1 m/s
     for _ in range(3):
         before = simulation.particles.velocity.numpy()[:, 0].astype(float).sum()
         simulation.step(0.005)
@@ -570,7 +612,7 @@ def test_a_step_that_cannot_be_solved_may_be_tried_again(monkeypatch: pytest.Mon
 
 def test_a_solve_that_gets_no_nearer_is_said_to_stagnate() -> None:
     simulation = blob(2)
-    simulation.viscosity.tolerance = 1e-14  # which float32 cannot reach
+    simulation.viscosity.tolerance = 1e-14  # unreachable in float32
     speed = np.random.default_rng(8).standard_normal(simulation.grid.shape)
     for field in simulation.velocity:
         field.assign(speed.astype(np.float32))
@@ -583,7 +625,11 @@ def test_a_solve_that_gets_no_nearer_is_said_to_stagnate() -> None:
 
 
 def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forces act for half of the last step and half of the next: what is left of a long step is solved in parts, of the same sum."""
+    """Retry with less stiff equations.
+
+    Forces act for half of the last step and half of the next: the rest of a long step is solved in
+    parts with the same sum.
+    """
     disc = {
         "shape": "sphere",
         "center": [0.5, 0.45],
@@ -612,7 +658,7 @@ def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.Monkey
     assert len(spans) == 8
     assert max(spans) < 2.0 * 0.001
     assert sum(spans) == pytest.approx(0.5 * (0.016 + 0.001))
-    # of one solve of the whole span: -0.43 N s of 4.8
+    # Of one solve of the whole span: -0.43 N s of 4.8.
     assert changes == pytest.approx(reference, rel=0.1)
     assert row["viscous_iterations"] >= 8
 
@@ -659,14 +705,18 @@ def test_momenta_are_kept_where_thick_liquid_meets_thin(dimension: int) -> None:
         for value in np.float32([0.01, 1e3])
     )
     assert len(thin) + len(thick) == len(x)
-    # what is thick turns and flies as one
+    # Viscous material turns and flies as one.
     assert thick.std(axis=0).max() < 0.5 * thin.std(axis=0).min()
 
 
 @pytest.mark.parametrize("spread", [1.0, 1.0005, 100.0])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_differing_viscosities_lose_energy_beside_walls(dimension: int, spread: float) -> None:
-    """Matrix and cycle are symmetric and positive on random velocities, where the null Lagrangian is left out and where it is not."""
+    """Energy loss with variable viscosities beside walls.
+
+    Matrix and cycle are symmetric and positive on random velocities, with and without the null
+    Lagrangian.
+    """
     ball = {"shape": "sphere", "center": [0.5, 0.3, 0.5][:dimension], "radius": 0.15}
     liquid = [box([0.0] * dimension, [1.0, 0.7, 1.0][:dimension], viscosity=100.0)]
     tables = {"viscosity": {"value": 100.0}, "wall": "sticky", "solid": [ball]}

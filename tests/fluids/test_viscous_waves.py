@@ -1,4 +1,7 @@
-"""Standing waves on a viscous liquid decay as the root of Lamb's equation says, at a finite depth and a finite viscosity."""
+"""Decay of standing waves on a viscous liquid, by Lamb's equation.
+
+The depth and the viscosity are finite.
+"""
 
 import cmath
 import math
@@ -13,24 +16,24 @@ from scipy.optimize import least_squares, root
 from small_liquids import GRAVITY, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
-LONG, DEPTH, AMPLITUDE = 1.0, 0.5, 0.01  # m: wavelength, depth, height of the wave at the start
+LONG, DEPTH, AMPLITUDE = 1.0, 0.5, 0.01  # [m] wavelength, depth, initial height of the wave
 VIEWED = 3  # periods
 
 
 @dataclass(frozen=True)
 class StandingWave:
-    """The slowest mode exp(n t) of a liquid of depth H over a floor without friction, linear in its height.
+    """Slowest mode exp(n t) of a liquid of depth H over a free-slip floor.
 
-    With m^2 = k^2 + n / nu the velocity is, up to a factor,
+    It is linear in its height. With m^2 = k^2 + n / nu the velocity is, up to a factor,
 
         v_y = (sinh(k y) / sinh(k H) + b sinh(m y) / sinh(m H)) cos(k x),   d_x v_x + d_y v_y = 0,
 
-    a potential flow and a layer of vorticity; the surface bears neither shear, b = -2 k^2 / (k^2 +
+    a potential flow and a layer of vorticity. The surface bears neither shear, b = -2 k^2 / (k^2 +
     m^2), nor a normal stress,
 
         n coth(k H) / k + g (1 + b) / n + 2 nu (k coth(k H) + b m coth(m H)) = 0.
 
-    Of an infinite depth this is Lamb's equation.
+    For an infinite depth this is Lamb's equation.
     """
 
     k: float
@@ -38,7 +41,7 @@ class StandingWave:
     nu: float
 
     def stress(self, n: complex) -> complex:
-        """The normal stress on the surface over density and velocity [m/s]."""
+        """Return the normal stress on the surface over density and velocity [m/s]."""
         m, b = self._layer(n)
         pressed = n / cmath.tanh(self.k * self.depth) / self.k + GRAVITY * (1.0 + b) / n
         return pressed + 2.0 * self.nu * (
@@ -51,7 +54,7 @@ class StandingWave:
 
     @cached_property
     def rate(self) -> complex:
-        """n: -decay + i frequency [1/s]."""
+        """Rate n: -decay + i frequency [1/s]."""
         start = [
             -2.0 * self.nu * self.k**2,
             math.sqrt(GRAVITY * self.k * math.tanh(self.k * self.depth)),
@@ -65,7 +68,7 @@ class StandingWave:
         return complex(*found)
 
     def velocity(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Complex v_x and v_y of a wave with v_y = cos(k x) on the surface."""
+        """Return complex v_x and v_y of a wave with v_y = cos(k x) on the surface."""
         m, b = self._layer(self.rate)
         parts = [(q, w / ((1.0 + b) * np.sinh(q * self.depth))) for q, w in ((self.k, 1.0), (m, b))]
         v_x = -sum(w * q * np.cosh(q * y) for q, w in parts) * np.sin(self.k * x) / self.k
@@ -73,7 +76,10 @@ class StandingWave:
 
 
 def tank(wave: StandingWave, cells: int, viscosity: float, **tables: Any) -> LiquidSimulation:
-    """Return a tank that is one wave long, whose particles lie and move as the wave's do at its greatest height."""
+    """Return a tank of one wavelength, with the wave at its greatest height.
+
+    Positions and velocities of the particles are those of the wave.
+    """
     liquid = [box([0.0, 0.0], [LONG, DEPTH])]
     given = {
         "wall": "free-slip",
@@ -95,7 +101,10 @@ def tank(wave: StandingWave, cells: int, viscosity: float, **tables: Any) -> Liq
 
 
 def decay(simulation: LiquidSimulation, wave: StandingWave, dt: float) -> complex:
-    """Return -decay + i frequency [1/s] of the velocity beneath crest and trough, in units of its own parts of the wave's rate."""
+    """Return -decay + i frequency [1/s] of the velocity beneath crest and trough.
+
+    Its parts are in units of those of the wave's own rate.
+    """
     seen, n = [], wave.rate
     while simulation.time < VIEWED * 2.0 * math.pi / n.imag:
         simulation.step(dt)
@@ -104,7 +113,7 @@ def decay(simulation: LiquidSimulation, wave: StandingWave, dt: float) -> comple
             for of in (simulation.particles.position, simulation.particles.velocity)
         )
         share = np.cosh(wave.k * x[:, 1]) / np.cosh(wave.k * DEPTH) * np.cos(wave.k * x[:, 0])
-        # velocities are of the middle of steps
+        # Velocities are those of the middle of steps.
         seen.append((simulation.time - 0.5 * dt, float((share * v[:, 1]).mean())))
     t, speed = np.array(seen).T
     speed /= np.abs(speed).max()
@@ -118,13 +127,17 @@ def decay(simulation: LiquidSimulation, wave: StandingWave, dt: float) -> comple
 
 
 def wave_of(share: float) -> StandingWave:
-    """Return the wave with nu k^2 such a share of its frequency without viscosity."""
+    """Return the wave whose nu k^2 is a share of its inviscid frequency."""
     k = 2.0 * math.pi / LONG
     return StandingWave(k, DEPTH, share * math.sqrt(GRAVITY * k * math.tanh(k * DEPTH)) / k**2)
 
 
 def test_the_root_is_known_where_viscosity_is_small() -> None:
-    """2 nu k^2 (1 - sqrt(share / 2)) at first; and the mode moves without divergence or shear on the surface."""
+    """Root of the equation for small viscosity.
+
+    It is 2 nu k^2 (1 - sqrt(share / 2)) at first. The mode has no divergence, and no shear on the
+    surface.
+    """
     for share in (1e-4, 1e-3):
         wave = wave_of(share)
         assert -wave.rate.real / (2.0 * wave.nu * wave.k**2) == pytest.approx(
@@ -149,7 +162,11 @@ def test_the_root_is_known_where_viscosity_is_small() -> None:
     ],
 )
 def test_a_standing_wave_decays(cells: int, dt: float, expected: float) -> None:
-    """nu k^2 is .04 of the frequency, where 2 nu k^2 is 16 % more than the root; what is expected has been measured."""
+    """Decay of a standing wave.
+
+    nu k^2 is 0.04 of the frequency, where 2 nu k^2 is 16 % more than the root. Expected values were
+    measured.
+    """
     wave = wave_of(0.04)
     found = decay(tank(wave, cells, 1000.0 * wave.nu), wave, dt)
     assert found.real == pytest.approx(expected, abs=0.03)
@@ -158,7 +175,10 @@ def test_a_standing_wave_decays(cells: int, dt: float, expected: float) -> None:
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_half_or_twice_the_viscosity_is_seen(factor: float) -> None:
-    """The liquid's differs from the wave's: by less than the band above no factor of 2 hides."""
+    """Detection of half or twice the viscosity.
+
+    The liquid's viscosity differs from the wave's; the tolerance above hides no factor of 2.
+    """
     wave = wave_of(0.04)
     found = decay(tank(wave, 16, factor * 1000.0 * wave.nu), wave, 0.02).real
     assert abs(found - 1.0) > 0.25

@@ -1,4 +1,7 @@
-"""Drag along walls: the law of a sheet, areas of slanted walls, momentum, moving walls, and what it must leave alone."""
+"""Drag along walls: law of a sheet, slanted walls, momentum, moving walls.
+
+And cases without drag.
+"""
 
 import math
 from typing import Any, no_type_check
@@ -29,7 +32,10 @@ def sheet(
     floor: float = 0.0,
     **tables: Any,
 ) -> LiquidSimulation:
-    """Return a sheet over a floor, so many cells deep, that slides to the right; of a floor off the cells' faces, as a solid."""
+    """Return a sheet over a floor that slides to the right.
+
+    It is so many cells deep. The floor may be a solid off the cells' faces.
+    """
     size, low, high = (
         [4.0, 0.8, 0.4][:dimension],
         [0.2, floor * DX, 0.0][:dimension],
@@ -46,7 +52,10 @@ def sheet(
 
 
 def middle(simulation: LiquidSimulation, speed: float = 1.0) -> float:
-    """Return the mean velocity along x [m/s] of what waves from the sheet's ends have not reached."""
+    """Return the mean velocity along x [m/s] of the sheet without its ends.
+
+    Waves from the ends have not reached that part.
+    """
     x, v = (
         a.numpy()[:, 0].astype(np.float64)
         for a in (simulation.particles.position, simulation.particles.velocity)
@@ -56,7 +65,10 @@ def middle(simulation: LiquidSimulation, speed: float = 1.0) -> float:
 
 
 def lost(simulation: LiquidSimulation, depth: float, c: float) -> float:
-    """Return how much of its speed a sheet has lost, over what u0 / (1 + c/2 u0 t / h) says; velocities are of the middle of steps."""
+    """Return the speed loss of a sheet over that of u0 / (1 + c/2 u0 t / h).
+
+    Velocities are those of the middle of steps.
+    """
     time = simulation.time - 0.5 * simulation.last_dt
     return (1.0 - middle(simulation)) / (1.0 - 1.0 / (1.0 + 0.5 * c * time / (depth * DX)))
 
@@ -68,7 +80,10 @@ def lost(simulation: LiquidSimulation, depth: float, c: float) -> float:
 def test_a_sheet_slows_down_by_its_law(
     dimension: int, c: float, floor: float, tables: dict[str, Any], bound: float
 ) -> None:
-    """A cell deep: to the thickness that the surface shows."""
+    """Deceleration of a sheet a cell deep.
+
+    To the accuracy of the thickness that the surface shows.
+    """
     simulation = sheet(1.0, c, dimension, floor=floor, **tables)
     advance(simulation, 0.3)
     assert lost(simulation, 1.0, c) == pytest.approx(1.0, abs=bound)
@@ -84,7 +99,11 @@ def fill_kernel(D: Drag, out: wp.array3d(dtype=float)):
 
 @pytest.mark.parametrize("surface", [True, False])
 def test_cells_of_liquid_are_half_full_at_least_and_those_of_air_at_most(surface: bool) -> None:
-    """Cells without neighbors in liquid, and slivers, are FLUID though their centers lie outside the surface."""
+    """Fill of cells: liquid cells at least half full, air cells at most.
+
+    Cells without neighbors in liquid, and slivers, are FLUID though their centers lie outside the
+    surface.
+    """
     phi = [-2.0, -0.3, 0.2, 0.5, 2.0]
     D = Drag()
     D.kind = wp.array([[[FLUID] * 5 + [AIR] * 5]], dtype=wp.int8, device="cpu")
@@ -103,7 +122,10 @@ def test_cells_of_liquid_are_half_full_at_least_and_those_of_air_at_most(surface
     [{}, {"pressure": {"model": "unilateral"}}, {"particles": {"narrow_band": {}}}, {"cfl": 0.4}],
 )
 def test_other_models_of_the_liquid_are_dragged(tables: dict[str, Any]) -> None:
-    """Eight cells deep, once the pressure is there: c/2 rho u^2 on two meters of floor."""
+    """Drag in other models of the liquid.
+
+    Eight cells deep, once the pressure exists: c/2 rho u^2 on two meters of floor.
+    """
     simulation = sheet(8.0, 0.01, **tables)
     advance(simulation, 0.06)
     assert simulation.measured["forces"]["domain_fx"] == pytest.approx(
@@ -119,7 +141,10 @@ def test_the_length_of_steps_does_not_matter(cfl: float) -> None:
 
 
 def test_of_a_deep_flow_the_cells_beside_the_wall_slow_down() -> None:
-    """The law holds at first; later the stress is that of the slower cells, and the rest goes on."""
+    """Deep flow whose cells beside the wall slow down.
+
+    The law holds at first. Later the stress is that of the slower cells, and the rest continues.
+    """
     simulation = sheet(4.0, 0.1, physics={"gravity": [0.0, -1.0]})
     assert simulation.step(0.01)["drag_work"] == pytest.approx(
         0.05 * 1000.0 * 2.0 * simulation.kick_dt, rel=0.05
@@ -135,7 +160,11 @@ def test_of_a_deep_flow_the_cells_beside_the_wall_slow_down() -> None:
 
 @pytest.mark.parametrize(("depth", "c"), [(4.0, 0.2), (8.0, 0.4)])
 def test_a_channel_keeps_what_the_cells_beside_its_wall_do_not_lose(depth: float, c: float) -> None:
-    """One of N cells slows down: with S = c/2 u0 t / h the mean is 1 - S / (1 + N S) of u0; by the law of the mean it were 1 / (1 + S)."""
+    """Momentum of a channel with drag beside its wall.
+
+    One of N cells slows down: with S = c/2 u0 t / h the mean is 1 - S / (1 + N S) of u0; by the law
+    of the mean it would be 1 / (1 + S).
+    """
     simulation = sheet(depth, c, physics={"gravity": [0.0, -1.0]})
     advance(simulation, 0.5)
     share = 0.5 * c * (simulation.time - 0.5 * simulation.last_dt) / (depth * DX)
@@ -145,7 +174,11 @@ def test_a_channel_keeps_what_the_cells_beside_its_wall_do_not_lose(depth: float
 
 
 def test_a_viscous_channel_is_dragged_as_its_equation_says() -> None:
-    """du/dt = nu u_yy, nu u_y = c/2 u^2 at the floor and 0 at the surface: viscosity mixes what walls slow down with what flows above."""
+    """Viscous channel with drag.
+
+    du/dt = nu u_yy, nu u_y = c/2 u^2 at the floor and 0 at the surface: viscosity mixes the slow
+    layer at the wall with the flow above.
+    """
     cells, c, nu, fine = 4, 0.2, 0.05, 64
     tables: dict[str, Any] = {
         "viscosity": {"value": 1000.0 * nu},
@@ -157,7 +190,7 @@ def test_a_viscous_channel_is_dragged_as_its_equation_says() -> None:
     d = cells * DX / fine
 
     def change(_time: float, u: np.ndarray) -> np.ndarray:
-        # between the lowest value and the floor: pull (u - u_floor) = c/2 u_floor^2
+        # Between the lowest value and the floor: pull (u - u_floor) = c/2 u_floor^2.
         pull = 2.0 * nu / d
         floor = (math.sqrt(pull**2 + 2.0 * c * pull * u[0]) - pull) / c
         return np.diff(np.concatenate(([0.5 * c * floor**2], nu * np.diff(u) / d, [0.0]))) / d
@@ -180,7 +213,11 @@ def test_a_viscous_channel_is_dragged_as_its_equation_says() -> None:
 @pytest.mark.parametrize("degrees", [0.0, 7.0, 20.0, 31.0, 45.0, 68.0])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_walls_at_any_angle_drag_by_their_area(dimension: int, degrees: float) -> None:
-    """A layer along a plane, gravity across it: the first step's stress is c/2 rho u^2 along the flow, on the area that is wet."""
+    """Drag of walls at any angle by their area.
+
+    A layer along a plane, gravity across it: the first step's stress is c/2 rho u^2 along the flow,
+    on the wet area.
+    """
     angle, c, depth, length = math.radians(degrees), 0.05, 0.2, 0.8
     along, up = (
         np.array([math.cos(angle), math.sin(angle), 0.0]),
@@ -222,7 +259,10 @@ def test_walls_at_any_angle_drag_by_their_area(dimension: int, degrees: float) -
 
 
 def test_what_liquid_loses_walls_get() -> None:
-    """Momentum of the particles, of which no wall but the floor takes any, and energy of the faces."""
+    """Momentum that liquid loses and walls get.
+
+    Momentum of the particles, which only the floor takes, and energy of the faces.
+    """
     simulation = sheet(2.0, 0.05)
     mass = simulation.particle_mass
 
@@ -246,7 +286,11 @@ def test_what_liquid_loses_walls_get() -> None:
 
 @pytest.mark.parametrize("seed", [21, 22, 23, 24])
 def test_momentum_and_energy_of_any_flow(seed: int) -> None:
-    """In random flows around random solids: faces never gain speed, and what they lose is what walls get, and `drag_work`."""
+    """Momentum and energy of any flow.
+
+    In random flows around random solids faces never gain speed. Their loss is the walls' gain, and
+    `drag_work`.
+    """
     rng = np.random.default_rng(seed)
     tables = random_tank(seed)
     dimension = len(tables["size"])
@@ -281,7 +325,7 @@ def test_momentum_and_energy_of_any_flow(seed: int) -> None:
             m = mass * free * 0.5 * (fluid + np.roll(fluid, 1, 2 - axis))
             lost[axis], energy = (m * (u - now)).sum(), energy + 0.5 * (m * (u**2 - now**2)).sum()
             sizes += (m * np.abs(u)).sum(), (m * u**2).sum()
-        # float32 faces
+        # Faces are float32.
         assert (
             np.abs(impulses[:, :3].sum(axis=0) - lost).max()
             <= 1e-5 * np.abs(impulses).max() + 1e-7 * sizes[0]
@@ -296,7 +340,11 @@ def test_momentum_and_energy_of_any_flow(seed: int) -> None:
 
 
 def test_walls_that_move_pull() -> None:
-    """A belt drags liquid at rest along, never past it; one as fast as the liquid does nothing."""
+    """Drag of moving walls.
+
+    A belt drags resting liquid along, never beyond its speed. A belt as fast as the liquid does
+    nothing.
+    """
     belt = box(
         [-9.0, -1.0], [3.0, 0.025], motion={"kind": "translation", "velocity": [1.0, 0.0]}, drag=0.2
     )
@@ -320,7 +368,11 @@ def test_walls_that_move_pull() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_strongest_drag_stops_and_does_not_turn(dimension: int) -> None:
-    """Whatever the coefficient: faces beside the wall keep their sign and lose speed, and the step stays stable."""
+    """Strongest drag: it stops the flow and does not reverse it.
+
+    Whatever the coefficient, faces beside the wall keep their sign and lose speed, and the step is
+    stable.
+    """
     size, high = [1.0, 0.5, 0.5][:dimension], [0.5, 0.4, 0.3][:dimension]
     solids = [{"shape": "sphere", "center": [0.6, 0.2, 0.2][:dimension], "radius": 0.13}]
     for _ in range(2):
@@ -361,7 +413,10 @@ def test_the_strongest_drag_stops_and_does_not_turn(dimension: int) -> None:
 
 
 def test_liquid_that_leaves_its_wall_is_not_held() -> None:
-    """Thrown off the floor it is RELEASED; held by a ceiling's free slip it would not be."""
+    """Liquid that leaves its wall, without drag.
+
+    Thrown off the floor it is RELEASED; held by a free-slip ceiling it would not be.
+    """
     liquid = [box([0.3, 0.0], [0.9, 0.2], velocity=[1.0, 3.0])]
     simulation = create(
         scene(
@@ -388,7 +443,10 @@ def test_liquid_that_leaves_its_wall_is_not_held() -> None:
 
 
 def test_bodies_are_dragged_along() -> None:
-    """A plate that floats in a stream: it gets what the stream loses to it."""
+    """Drag on a plate that floats in a stream.
+
+    It gets the momentum that the stream loses.
+    """
     plate = box([0.8, 0.17], [1.4, 0.23], density=500.0, wall="free-slip", drag=0.2)
     momenta = []
     for drag in (0.2, 0.0):

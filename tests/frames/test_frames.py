@@ -57,7 +57,7 @@ def test_cells_share_corners(tmp_path, dimension, kind, corners):
     cells = some_cells(dimension)
     write_vtu(tmp_path / "a.vtu", cells)
     mesh = meshio.read(tmp_path / "a.vtu")
-    # three cells in an L: 8 corners a layer, and 4 of the one apart
+    # Three cells in an L: 8 corners a layer, and 4 of the separate one.
     assert len(mesh.points) == corners
     np.testing.assert_allclose(mesh.points[mesh.cells_dict[kind][:, 0]], cells.index * 0.25)
     middle = np.array([0.5, 0.5, 0.5 if dimension == 3 else 0.0])
@@ -69,7 +69,7 @@ def test_cells_share_corners(tmp_path, dimension, kind, corners):
 
 
 def some_surface(dimension: int) -> Surface:
-    """A tetrahedron, or a square in 2-D, seen from outside."""
+    """Return a tetrahedron, or a square in 2-D, oriented outward."""
     points = np.array(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
         if dimension == 3
@@ -100,7 +100,7 @@ def test_vtk_finds_the_volume_inside_a_surface(tmp_path):
     write_vtu(tmp_path / "a.vtu", some_surface(3))
     mesh = pyvista.read(tmp_path / "a.vtu").extract_surface(algorithm="dataset_surface")
     assert mesh.is_all_triangles
-    # VTK's sign: triangles are counterclockwise from outside
+    # VTK's sign: triangles are counterclockwise from outside.
     np.testing.assert_allclose(mesh.volume, 1 / 6)
     outward = mesh.compute_normals(
         point_normals=False, consistent_normals=False, auto_orient_normals=False
@@ -161,7 +161,7 @@ def test_vtk_opens_every_frame(tmp_path, part):
     assert set(data.keys()) == part.fields.keys()
     if isinstance(part, Cells) and size:
         measure = "Area" if part.dimension == 2 else "Volume"
-        # positive: VTK's corner order
+        # Positive: VTK's corner order.
         np.testing.assert_allclose(grid.compute_cell_sizes()[measure], 0.25**part.dimension)
 
 
@@ -208,7 +208,7 @@ def test_collections_grow_and_resume(tmp_path):
 
 
 class SlowFolder(FrameFolder):
-    """Frames that wait to be let through, and one that fails."""
+    """Frame folder that blocks writes until released, with one that fails."""
 
     def __init__(self, folder, fails: int = -1) -> None:
         super().__init__(folder)
@@ -256,7 +256,7 @@ def test_a_writer_holds_few_frames(tmp_path):
         release = threading.Timer(0.2, folder.gate.release)
         release.start()
         writer.put(WAITING, float(WAITING), [some_points(3)])
-        assert writer.newest is not None  # it has waited for one to be written
+        assert writer.newest is not None  # it has waited until one was written
         folder.gate.release(WAITING)
     release.join()
 

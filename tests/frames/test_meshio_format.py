@@ -1,4 +1,7 @@
-"""Frames as meshio's meshes and in its formats: written, read back, resumed, drawn, or refused before any work is done."""
+"""Frames in meshio's formats.
+
+Written, read back, resumed, drawn, or refused before any work is done.
+"""
 
 import importlib.util
 import json
@@ -39,7 +42,7 @@ from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import Cells, Points, Surface, Volume
 
 RNG = np.random.default_rng(3301)
-WHOLE = ("xdmf", "vtk", "gmsh", "med")  # hold every part with its fields
+WHOLE = ("xdmf", "vtk", "gmsh", "med")  # formats that hold every part with its fields
 
 
 def fields(count: int) -> dict[str, np.ndarray]:
@@ -90,7 +93,10 @@ def same(found: Mesh, expected: Mesh, *, bare: bool) -> None:
 @pytest.mark.parametrize("name", SUFFIXES)
 @pytest.mark.parametrize("part", PARTS)
 def test_what_a_format_holds_comes_back(tmp_path, name, part):
-    """And nothing is said meanwhile that would spoil a terminal, but where meshio warns of the format itself."""
+    """Round trip of a part through each format.
+
+    Without messages that would spoil a terminal, except meshio's warnings about the format.
+    """
     if name == "med" and importlib.util.find_spec("h5py") is None:
         pytest.skip("needs h5py")
     given, held = PARTS[part], holds(name, *kind_of(PARTS[part]))
@@ -111,7 +117,7 @@ def test_what_a_format_holds_comes_back(tmp_path, name, part):
     if name in WRITTEN_ONLY:
         with pytest.raises(ValueError, match="are written for other programs"):
             read_meshio(file, name)
-    if name == "stl":  # which holds triangles one by one, and no points beside
+    if name == "stl":  # it holds triangles one by one, without shared points
         np.testing.assert_allclose(
             found.points[found.corners], given.points[given.corners], rtol=1e-6, atol=1e-7
         )
@@ -133,7 +139,11 @@ def test_nothing_is_said(tmp_path, capfd, name):
 
 
 def test_every_format_of_meshio_is_there_or_cannot_be():
-    """Left out: other versions of one that is there, another format with the suffix of gmsh's, and what meshio does not read back."""
+    """Formats of meshio: all are listed, or cannot be.
+
+    Left out: other versions of a listed format, another format with the suffix of gmsh's, and
+    formats that meshio does not read back.
+    """
     versions, unread = {"gmsh22", "vtk42", "vtk51", "ansys"}, {"svg"}
     writers = set(meshio._helpers._writer_map)
     assert set(get_args(FrameFormat)) == {"vtu", *SUFFIXES}
@@ -189,7 +199,11 @@ def test_a_volume_is_its_active_voxels():
 
 @pytest.mark.parametrize("part", PARTS)
 def test_an_empty_frame(tmp_path, part):
-    """meshio's own reader takes no VTU file without cells, not even its own; `read_frame` takes all of a run's."""
+    """Empty frames.
+
+    meshio's own reader takes no VTU file without cells, not even its own; `read_frame` takes all of
+    a run's.
+    """
     none = without(PARTS[part])
     file = tmp_path / f"{none.name}_000000.vtu"
     write_vtu(file, none)
@@ -198,7 +212,7 @@ def test_an_empty_frame(tmp_path, part):
     assert (
         mesh.cell_data if isinstance(none, Cells) else mesh.point_data
     ).keys() == none.fields.keys()
-    with pytest.raises(IndexError):  # once it does, this and the page on frames can go
+    with pytest.raises(IndexError):  # once it succeeds, this and the page on frames can be removed
         meshio.read(file)
     for name in ("xdmf", "vtk", "gmsh"):
         folder = FrameFolder(tmp_path / name, frame_format=name)
@@ -235,7 +249,10 @@ def test_frames_of_every_kind_are_read(tmp_path):
     ids=["empty", "zeros", "text", "half"],
 )
 def test_damaged_files_are_named(tmp_path, name, content):
-    """Neither does meshio end the process, as its own `read` does."""
+    """Damaged files, named in the message.
+
+    meshio must not end the process, as its own `read` does.
+    """
     part = next(
         (part for part in PARTS.values() if holds(name, *kind_of(part)).dress is not None), None
     )
@@ -307,7 +324,7 @@ def test_a_run_in_another_format_goes_on_and_is_drawn(scene_file, tmp_path, name
         for first, second in zip(one.read(number), two.read(number), strict=True):
             np.testing.assert_allclose(second, first, rtol=1e-6, atol=1e-9)
     assert len(list(render_run(other, looks=Looks(cut=True, color=Color.SPEED)))) == 5
-    run_into(scene, other, force=True)  # whose files are the run's
+    run_into(scene, other, force=True)  # its files are the run's
     (other / "frames" / f"grid_000001.{SUFFIXES[name]}").unlink()
     record = run_into(
         load_scene(scene_file, ["time.duration=0.25", f"output.format={name}"]), other, resume=True
@@ -326,7 +343,7 @@ def test_the_format_may_change_when_a_run_goes_on(scene_file, tmp_path):
     assert Recording(out).numbers == list(range(5))
     run_into(load_scene(scene_file, ["time.duration=0.25"]), out, resume=True)
     assert Recording(out).numbers == list(range(6))
-    # those that a collection can name
+    # The files that a collection can name.
     assert (out / "particles.pvd").read_text().count("DataSet ") == 4
 
 
@@ -392,7 +409,10 @@ def test_fields_that_a_format_does_not_hold_are_told(scene_file, tmp_path):
 
 
 def test_the_surface_of_a_liquid_as_stl(tmp_path):
-    """Which modelers and slicers read: no particles, no cells, triangles alone."""
+    """Surface of a liquid as STL, for modelers and slicers.
+
+    The file has no particles and no cells, but triangles alone.
+    """
     scene = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 0.1, "frames_per_second": 20},

@@ -1,4 +1,4 @@
-"""Volumes as NanoVDB files, read back by TinyVDB, by Warp, and byte by byte."""
+"""NanoVDB volumes, read back by TinyVDB, by Warp, and byte by byte."""
 
 import struct
 
@@ -11,7 +11,7 @@ from warp_lcp.frames.nvdb import name_key, write_nvdb
 from warp_lcp.simulation import Volume
 
 SPACING = 0.125
-# [m]; the ball is not in the middle: axes that are mixed up would show
+# [m] The ball is not in the middle, so that mixed-up axes show.
 CENTER, RADIUS, BAND = np.array([1.6, 1.3, 1.1]), 0.8, 0.3
 SHAPE = (19, 24, 31)  # planes, rows, columns
 
@@ -102,7 +102,7 @@ def test_warp_samples_it_in_world_units(tmp_path):
         device="cpu",
     )
     exact = np.linalg.norm(points - CENTER, axis=1) - RADIUS
-    # a sphere's curvature, between voxels
+    # Curvature of a sphere, between voxels.
     np.testing.assert_allclose(values.numpy(), exact, atol=SPACING**2 / 2 / RADIUS)
     info = volume.get_grid_info()
     np.testing.assert_allclose(info.translation, SPACING / 2)
@@ -125,7 +125,7 @@ def test_the_header_byte_by_byte(tmp_path):
     grid = data[begin:]
     assert grid[40:50] == b"level_set\0"
     assert struct.unpack_from("<Q", grid, 32)[0] == len(grid)
-    # index to world
+    # From index to world.
     assert struct.unpack_from("<9d", grid, 384) == (SPACING, 0, 0, 0, SPACING, 0, 0, 0, SPACING)
     assert struct.unpack_from("<9d", grid, 456) == (8, 0, 0, 0, 8, 0, 0, 0, 8)  # and back
     assert struct.unpack_from("<3d", grid, 528) == (SPACING / 2,) * 3
@@ -134,7 +134,7 @@ def test_the_header_byte_by_byte(tmp_path):
     tiles = np.pad(distance(), [(0, -count % 8) for count in SHAPE], constant_values=1.0).reshape(
         3, 8, 3, 8, 4, 8
     )
-    # what is far outside takes no room
+    # Voxels far outside take no space.
     assert leaves == np.count_nonzero(tiles.min(axis=(1, 3, 5)) < BAND)
 
 

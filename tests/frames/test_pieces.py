@@ -1,4 +1,4 @@
-"""Frames in pieces: the files that name them, as this package and VTK read them back."""
+"""Partitioned frames: index files, read back by this package and by VTK."""
 
 from pathlib import Path
 
@@ -16,11 +16,12 @@ from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Cells, Part, Points, Surface
 
 COUNTS = (6, 4, 2)
-BOXES = (((0, 0, 0), (2, 4, 2)), ((2, 0, 0), (5, 4, 2)), ((5, 0, 0), (6, 4, 2)))  # of three ranks
+# Boxes of three ranks.
+BOXES = (((0, 0, 0), (2, 4, 2)), ((2, 0, 0), (5, 4, 2)), ((5, 0, 0), (6, 4, 2)))
 
 
 def whole() -> list[Part]:
-    """Return a frame of everything: 300 points, 20 cells, a surface of two triangles."""
+    """Return a frame of 300 points, 20 cells and a surface of two triangles."""
     random = np.random.default_rng(411)
     points = (random.random((300, 3)) * COUNTS).astype(np.float32)
     cells = np.argwhere(np.ones(COUNTS, dtype=bool))[random.permutation(48)[:20]]
@@ -41,7 +42,7 @@ def whole() -> list[Part]:
 
 
 def piece(box: tuple[tuple[int, int, int], tuple[int, int, int]]) -> list[Part]:
-    """Return what of the frame lies in a rank's box."""
+    """Return the part of the frame in a rank's box."""
     points, cells, surface = whole()
     assert isinstance(points, Points) and isinstance(cells, Cells) and isinstance(surface, Surface)
     low, high = box[0][0], box[1][0]
@@ -79,7 +80,7 @@ def write(folder: Path, grid_format: str, frames: int = 1) -> None:
         found = []
         for rank, box in enumerate(BOXES):
             collective = Collective.of_one()
-            collective.ranks.comm.rank = rank  # of ranks that are asked nothing else
+            collective.ranks.comm.rank = rank  # other data of the ranks are not used
             mine = RankFrames(FrameFolder(folder, grid_format), collective)
             mine.write(index, 0.5 * index, piece(box))
             found.append(mine.describe(piece(box)))
@@ -115,7 +116,7 @@ def test_vtk_reads_the_frame_of_one_process(tmp_path, grid_format):
 
 
 def ordered(mesh, name):
-    """Return what a data set shows, its fields and positions in the order of the latter."""
+    """Return fields and positions of a data set in the order of the latter."""
     fields = dict(mesh.cell_data if name == "grid" else mesh.point_data)
     at = mesh.points
     if name == "grid":
@@ -156,7 +157,7 @@ def test_a_recording_of_pieces_is_that_of_one_process(dots, tmp_path, grid_forma
     )
     assert FrameFolder(tmp_path / "many").missing("particles", 2) == []
     (tmp_path / "many" / "frames" / "rank_0001" / "particles_000001.vtu").unlink()
-    # as if the rank had not written it
+    # As if the rank had not written it.
     assert FrameFolder(tmp_path / "many").missing("particles", 2) == [1]
     with pytest.raises(RenderError, match=r"rank_0001.particles_000001.vtu: cannot be read"):
         many.read(1)
@@ -212,7 +213,11 @@ def test_images_of_ranks_without_cells_fill_the_whole(tmp_path):
 
 
 def test_pieces_are_files_of_the_run(dots, tmp_path):
-    """A run that goes on deletes later pieces; --force deletes all, and nothing that is not a run's."""
+    """Part files as files of the run.
+
+    A resumed run deletes later parts; --force deletes all, and nothing that does not belong to a
+    run.
+    """
     text = (
         '[scene]\nsimulator = "dots"\n[time]\nduration = 1.0\nframes_per_second = '
         "2\n[domain]\nsize = [6.0, 4.0, 2.0]\nresolution = 6\n"
@@ -239,7 +244,7 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
 
 def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path):
     collective = Collective.of_one()
-    collective.ranks.comm.rank = 1  # the first one writes elsewhere
+    collective.ranks.comm.rank = 1  # the first rank writes elsewhere
     folder = RunFolder(tmp_path / "out", load_scene(scene_file), collective)
     with pytest.raises(
         OutputError,
@@ -297,7 +302,7 @@ def test_a_piece_is_named_once(tmp_path):
 
 
 def test_entities_are_refused(tmp_path):
-    """A few lines that would become 10^9 characters."""
+    """Refusal of XML entities: a few lines would become 10^9 characters."""
     lines = "".join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(9))
     (tmp_path / "a.pvtu").write_text(
         f'<!DOCTYPE x [<!ENTITY a0 "xxxxxxxxxx">{lines}]><VTKFile>&a9;</VTKFile>'

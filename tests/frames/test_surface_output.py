@@ -1,4 +1,7 @@
-"""Surfaces in a run's folder: VTU series and PLY files, of liquid and sand, in 2-D and 3-D; nothing of them where no scene asks."""
+"""Surfaces in a run's folder: VTU series and PLY files.
+
+They are those of liquid and sand, in 2-D and 3-D. There is none unless the scene requests it.
+"""
 
 import meshio
 import numpy as np
@@ -30,7 +33,7 @@ def test_a_dam_has_its_surface_at_the_start_and_later(dimension):
     start = surface_of(simulation)
     assert start.corners.shape[1] == dimension
     assert_closed(start.corners)
-    # six cells high: edges are round
+    # Six cells high: edges are round.
     assert enclosed(start.points, start.corners) == pytest.approx(SIZE[dimension], rel=0.04)
     assert start.fields["velocity"] == pytest.approx(0.0, abs=1e-6)
     small_liquids.advance(simulation, 0.15)
@@ -89,7 +92,7 @@ def test_a_frame_changes_nothing_of_the_run():
 
 
 def test_off_is_nothing(monkeypatch):
-    """No surface, no field, no kernel."""
+    """Without the option no surface, no field, no kernel."""
     launched = []
     monkeypatch.setattr(particle_frames, "faces_from_particles", lambda *a: launched.append(a))
     monkeypatch.setattr(particle_frames, "sample", lambda *a: launched.append(a))
@@ -114,7 +117,7 @@ def test_the_memory_that_is_announced_is_taken(dimension, solid):
     taken = sum(field.capacity for field in [*fields, *mesh._fields])
     announced = simulation.scene.memory_parts()["surface mesh"]
     points = 2 * (32 * 16 + 16 * 8 + 8 * 32) if dimension == 3 else 2 * (32 + 16)
-    # of a lattice this small it is a third
+    # A third for so small a lattice.
     ring = np.prod(mesh.lattice.shape) / (32 * 16 * (8 if dimension == 3 else 3))
     assert taken == pytest.approx(ring * (announced - 80 * points), rel=0.02)
 
@@ -165,7 +168,7 @@ def test_ply_files_come_beside_the_series_and_go_with_it(tmp_path):
             f"surface_{index:06d}.ply",
         ]
     size = sum(file.stat().st_size for file in (tmp_path / "frames").glob("*_000001.*"))
-    # of files that are mostly headers
+    # Files that are mostly headers.
     assert 0.95 * size < frame_bytes(frame, surface_ply=True) < size + 6000
     FrameFolder(tmp_path, surface_ply=True).resume([0.0])
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [

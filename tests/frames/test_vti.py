@@ -26,7 +26,7 @@ def pyvista():
 
 
 def drawn(image):
-    """Return what ParaView draws, which is what this filter lets through."""
+    """Return the cells that ParaView draws, those that this filter passes."""
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
 
     shell = vtkGeometryFilter()
@@ -57,7 +57,7 @@ def test_vtk_shows_exactly_the_cells(pyvista, tmp_path, dimension, whole):
     if dimension == 2:
         np.testing.assert_allclose(shell.area, 4 * 0.25**2)
     else:
-        assert shell.n_cells == 4 * 6 - 2 * 2  # faces, but for the two that cells share
+        assert shell.n_cells == 4 * 6 - 2 * 2  # without the two that cells share
 
 
 def test_every_frame_has_the_whole_grid(pyvista, tmp_path):
@@ -128,7 +128,10 @@ def test_files_that_say_what_cannot_be(tmp_path, old, new):
 
 
 def test_arrays_do_not_share_their_bytes(tmp_path):
-    """A name costs a file some bytes, and its reader a whole array."""
+    """Separate bytes of arrays.
+
+    A name costs a file some bytes, and its reader a whole array.
+    """
     write_vti(tmp_path / "a.vti", some_cells(3))
     array = b'<DataArray type="Float64" Name="%d" format="appended" offset="0"/>'
     whole = (tmp_path / "a.vti").read_bytes()

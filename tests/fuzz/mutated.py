@@ -1,4 +1,7 @@
-"""Bytes that were once a good file: flipped bits, cuts, doubled and foreign pieces, and numbers that promise too much."""
+"""Mutated bytes of valid files.
+
+Flipped bits, cuts, doubled and foreign parts, and numbers that claim too much.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +46,9 @@ def mutated(draw: st.DrawFn, originals: list[bytes], most: int = 4) -> bytes:
     """Draw one of some good files with one to `most` mutations.
 
     Args:
-        draw: of Hypothesis.
-        originals: the good files.
-        most: the largest number of mutations.
+        draw: draw function of Hypothesis.
+        originals: valid files.
+        most: largest number of mutations.
     """
     data = draw(st.sampled_from(originals))
     for _ in range(draw(st.integers(1, most))):

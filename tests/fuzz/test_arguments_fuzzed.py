@@ -1,4 +1,4 @@
-"""Words of the command line itself: whatever they are, a command ends with 0 or 2 and a message."""
+"""Random arguments of the command line: exit code 0 or 2, and a message."""
 
 from __future__ import annotations
 

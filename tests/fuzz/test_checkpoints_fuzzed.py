@@ -1,4 +1,4 @@
-"""Checkpoints that were once good: a run that goes on takes the one before, and says why."""
+"""Damaged checkpoints: a resumed run uses the one before, and says why."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ KEYS = {"time.cfl": 2.0, "liquid[0].max": [0.4, 0.4]}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> CheckpointFolder:
-    """Return checkpoints of the steps 5 and 12, the latter in pieces of two ranks."""
+    """Return checkpoints of the steps 5 and 12, the latter in parts of two ranks."""
     folder = CheckpointFolder(tmp_path_factory.mktemp("checkpoints"), "fingerprint", KEYS)
     folder.write(Checkpoint(5, 0.25, STATE))
     pieces = [Checkpoint(12, 0.5, STATE | {"rank": np.array(rank)}) for rank in range(2)]
@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> CheckpointFolder:
 
 
 def newest(folder: CheckpointFolder, path: Path, data: bytes) -> Checkpoint | None:
-    """Return what a run continues from when a file holds something else."""
+    """Return the checkpoint that a run continues from if a file is changed."""
     good = path.read_bytes()
     try:
         path.write_bytes(data)
@@ -74,7 +74,10 @@ def test_checkpoints_in_pieces(folder: CheckpointFolder, data: st.DataObject) ->
 @costly
 @given(st.data())
 def test_checkpoints_whose_zip_is_right(folder: CheckpointFolder, data: st.DataObject) -> None:
-    """Members are other ones, as in a file that somebody made on purpose."""
+    """Checkpoints with a valid zip file.
+
+    Members are changed, as in a file that was made on purpose.
+    """
     path = folder.path(5)
     with zipfile.ZipFile(path) as archive:
         members = {info.filename: archive.read(info) for info in archive.infolist()}
@@ -122,7 +125,10 @@ def rezipped(members: dict[str, bytes]) -> bytes:
 
 
 def refused(folder: CheckpointFolder, data: bytes) -> str | None:
-    """Return why a file is refused as the checkpoint of step 5; None if it is not, and then its state is the one that was written."""
+    """Return why a file is refused as the checkpoint of step 5; None if accepted.
+
+    An accepted state must be the one that was written.
+    """
     path = folder.path(5)
     good = path.read_bytes()
     try:
@@ -139,7 +145,7 @@ def refused(folder: CheckpointFolder, data: bytes) -> str | None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run of a few steps that is at its end."""
+    """Return a finished run of a few steps."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     assert told(*command(folder)) == 0
     return folder
@@ -158,10 +164,10 @@ def command(folder: Path) -> list[str]:
     return ["run", *scene, "--device", "cpu", "--out", str(folder)]
 
 
-@settings(max_examples=settings().max_examples // 10)  # each is a run
+@settings(max_examples=settings().max_examples // 10)  # each example is a run
 @given(st.data())
 def test_folders_of_runs(run: Path, data: st.DataObject) -> None:
-    """Whatever one of a run's files holds, going on ends with 0 or a refusal."""
+    """Run folders with damaged files: resuming ends with 0 or a refusal."""
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     path = data.draw(st.sampled_from(sorted(before)))
     try:

@@ -1,4 +1,4 @@
-"""Contact problems (HDF5) that were once good: `read_fclib` reads them, or says what is wrong."""
+"""Damaged contact problems (HDF5): `read_fclib` reads them or reports the fault."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ B = np.diag([2.0, 3.0, 4.0, 5.0]) + np.eye(4, k=1) + np.eye(4, k=-1)
 
 
 def contacts(kind: str, **changed: Any) -> bytes:
-    """Return a local problem of one contact and a joint, or a global one, in which some datasets are other ones."""
+    """Return a local problem of a contact and a joint, or a global one.
+
+    Some of its datasets are changed.
+    """
     stream = io.BytesIO()
     with h5py.File(stream, "w") as file:
         arrays: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Frames of a run that were once good: images read them back, or say what is wrong."""
+"""Damaged frames of a run: images are drawn, or the fault is reported."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ PARTS: list[Part] = [
 
 
 def write_run(folder: Path) -> None:
-    """Write frames of one process and, with the number 1, of two ranks, in both formats."""
+    """Write frames of one process and, with the number 1, of two ranks.
+
+    They are written in both formats.
+    """
     folder.mkdir()
     (folder / "scene.toml").write_text(SCENE)
     for index, kind in enumerate(("vti", "vtu", "vti")):
@@ -57,7 +60,7 @@ def write_run(folder: Path) -> None:
                 whole.with_name(whole.name.replace("000001", "000002")),
                 whole.parent / f"rank_000{rank}" / whole.name,
             )
-        if part.name != "bodies":  # frame 1 has pieces of all but these
+        if part.name != "bodies":  # frame 1 has parts of all but these
             (whole.parent / f"{part.name}_000001.vtu").unlink()
             pieces = [(f"rank_000{rank}/{whole.name}", describe(part, kind)) for rank in range(2)]
             write_whole(whole.with_suffix(f".p{kind}"), pieces)
@@ -71,13 +74,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def recordings(folder: Path) -> list[Recording]:
-    """Return the run's recordings, of all that there is to read."""
+    """Return all recordings of the run."""
     chosen = ((Color.PRESSURE, Show.BOTH, True), (Color.SPEED, Show.BOTH, False))
     return [Recording(folder, color, show, cells=cells) for color, show, cells in chosen]
 
 
 def shown(recording: Recording) -> str:
-    """Read all that images show; return what is wrong with it, "" if nothing is."""
+    """Read everything that images show; return the fault, "" if none."""
     vars(recording).pop("scale", None)
     try:
         with limited():

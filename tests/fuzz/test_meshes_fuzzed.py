@@ -1,4 +1,7 @@
-"""Mesh files: each is a closed surface or refused with its name, and takes no more memory than it has bytes for."""
+"""Damaged mesh files: each is a closed surface, or refused with its name.
+
+Reading takes no more memory than the file has bytes for.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +103,7 @@ FILES = {
 
 
 def accepted(path: Path, data: bytes) -> bool:
-    """Return whether a file is a closed surface; if not, its refusal names it."""
+    """Return whether a file is a closed surface; a refusal must name it."""
     path.write_bytes(data)
     try:
         with limited(1 << 28):
@@ -161,7 +164,10 @@ def test_sizes_are_not_believed(
 
 
 def test_a_vertex_astray_does_not_merge_all_others(tmp_path: Path) -> None:
-    """Of n vertices closer than a millionth of the mesh's size there are n^2 / 2 pairs."""
+    """Mesh with one distant vertex.
+
+    Of n vertices closer than a millionth of the mesh's size there are n^2 / 2 pairs.
+    """
     count = 20_000
     chance = np.random.default_rng(4419)
     rows = [

@@ -1,4 +1,4 @@
-"""Matrices and recorded problems that were once good: `warp-lcp solve` reads them, or says what is wrong."""
+"""Damaged matrices and recorded problems: `warp-lcp solve` reads or refuses them."""
 
 from __future__ import annotations
 

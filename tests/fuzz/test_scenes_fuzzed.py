@@ -1,4 +1,4 @@
-"""Scene files that are wrong in ways nobody thought of: `check` accepts or refuses them, and does nothing else."""
+"""Damaged scene files: `check` accepts or refuses them, without side effects."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from warp_lcp.run.check import check_scene
 from warp_lcp.scene.scene_file import built_in_scenes
 from warp_lcp.scene.table import SceneError
 
-ROOM = 8 << 20  # bytes of memory that a scene may take to be made: those of a few thousand cells
+ROOM = 8 << 20  # bytes of memory to make a scene: those of a few thousand cells
 NUMBERS = [
     0,
     -1,
@@ -116,7 +116,7 @@ SMALL = [
 
 @given(st.integers(0, 2**32).map(lambda seed: fuzzed(random.Random(seed))))
 def test_changed_scenes(data: bytes) -> None:
-    """Keys and values that have changed places: `check_scene` takes the scene or says what is wrong."""
+    """Exchanged keys and values: `check_scene` accepts or refuses the scene."""
     with TemporaryDirectory() as folder:
         file = Path(folder, "scene.toml")
         file.write_bytes(data)
@@ -136,7 +136,7 @@ def test_changed_scenes(data: bytes) -> None:
     )
 )
 def test_mutated_scenes(data: bytes) -> None:
-    """Bytes and values: `check` makes what it takes, and ends with 0, or with 2 and a message."""
+    """Mutated bytes and values: `check` ends with 0, or with 2 and a message."""
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(check, "free_memory", lambda device: ROOM)
         file = Path(folder, "scene.toml")
@@ -188,7 +188,10 @@ def test_a_folder_is_no_scene_and_no_mesh(tmp_path: Path) -> None:
 
 
 def fuzzed(chance: random.Random, original: bytes | None = None) -> bytes:
-    """Return a scene, a built-in one unless given, with a few random changes of its keys and values, and sometimes of its bytes."""
+    """Return a scene with a few random changes of keys, values and sometimes bytes.
+
+    By default the scene is a built-in one.
+    """
     text = (
         chance.choice(list(built_in_scenes().values())).read_bytes()
         if original is None
@@ -215,7 +218,10 @@ def _value(chance: random.Random) -> Any:
 
 
 def _change_number(data: dict[str, Any], chance: random.Random) -> None:
-    """Change a number to one that the scene may well allow, so that what comes after the first checks is reached."""
+    """Change a number to one that the scene probably allows.
+
+    So the checks after the first ones are reached.
+    """
     owner, key = chance.choice(
         [
             (o, k)

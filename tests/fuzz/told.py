@@ -1,4 +1,7 @@
-"""Runs the command line in this process, and asserts what every command promises whatever its files hold."""
+"""Command line in this process, with assertions of its promises.
+
+They hold whatever its files contain.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +24,16 @@ except ImportError:  # not on Windows
     resource = None
 
 COUNT = settings().max_examples
-# a quarter in the short tests, all of them in `make fuzz`
+# A quarter in the short tests, all in `make fuzz`.
 costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 4)
-MEMORY = 1 << 30  # bytes that reading one small file may take
+MEMORY = 1 << 30  # bytes of memory for reading one small file
 
 
 def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) -> int:
-    """Run a command that reads files; return its exit code, one of `codes`, 0 or 2 unless given.
+    """Run a command that reads files; return its exit code, one of `codes`.
 
-    It ends without a traceback, takes no more than MEMORY, says why when it refuses, and prints
-    nothing that a terminal obeys.
+    By default `codes` are 0 and 2. The command ends without a traceback, takes at most MEMORY,
+    gives the reason of a refusal, and prints nothing that controls a terminal.
     """
     if arguments[0] == "check":
         make_kernels()
@@ -47,7 +50,10 @@ def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) 
 
 @cache
 def make_kernels() -> None:
-    """Compile what checks of scenes launch, which takes more memory than they may."""
+    """Compile the kernels of checks of scenes.
+
+    Compilation takes more memory than a check may.
+    """
     for scene in (
         "dam-break-2d",
         "column-collapse-2d",
@@ -60,7 +66,10 @@ def make_kernels() -> None:
 
 @contextmanager
 def limited(memory: int = MEMORY) -> Iterator[None]:
-    """Let this process take no more than `memory` more bytes of address space; beyond it allocations fail."""
+    """Limit this process to `memory` more bytes of address space.
+
+    Allocations beyond it fail.
+    """
     if resource is None or not Path("/proc/self/statm").exists():
         yield
         return

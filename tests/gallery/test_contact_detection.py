@@ -1,4 +1,7 @@
-"""Contacts of pairs whose gap is known by geometry; and J, against the change of the gap as bodies move a little."""
+"""Contacts of pairs with a known gap, and the Jacobian J.
+
+J is compared with the change of the gap as bodies move a little.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +34,8 @@ def test_spheres():
     contacts = world_of(ball([0, 0, 0], 1.0), ball([0, 0, 1.4], 0.5)).contacts(margin=0.1)
     assert len(contacts) == 1
     assert contacts.gap[0] == pytest.approx(-0.1)
-    np.testing.assert_allclose(contacts.frames[0, 0], [0, 0, 1])  # into the first, which is above
+    # Into the first body, which is above.
+    np.testing.assert_allclose(contacts.frames[0, 0], [0, 0, 1])
     assert (contacts.first[0], contacts.second[0]) == (1, 0)
     np.testing.assert_allclose(contacts.point[0], [0, 0, 0.95])  # halfway between 1.0 and 0.9
     assert len(world_of(ball([0, 0, 0], 1.0), ball([0, 0, 1.7], 0.5)).contacts(margin=0.1)) == 0
@@ -42,7 +46,7 @@ def test_a_sphere_and_a_tilted_plane():
     contacts = world_of(
         ball(0.55 * normal + np.array([0, 3, 0]), 0.5), obstacles=(plane(normal),)
     ).contacts(margin=0.1)
-    assert contacts.second[0] == 1  # no body
+    assert contacts.second[0] == 1  # no second body
     assert contacts.gap[0] == pytest.approx(0.05)
     np.testing.assert_allclose(contacts.point[0], 0.025 * normal + [0, 3, 0], atol=1e-14)
 
@@ -73,7 +77,7 @@ def test_a_face_on_a_face_gives_the_corners_of_the_overlap():
     )
     np.testing.assert_allclose(contacts.gap, -0.01)
     np.testing.assert_allclose(contacts.frames[:, 0], np.tile([0, 0, 1.0], (4, 1)), atol=1e-14)
-    # x from 0.2 to 0.6, cut at 0.5
+    # x from 0.2 to 0.6, cut at 0.5.
     expected = {(x, y, 0.995) for x in (0.2, 0.5) for y in (-0.2, 0.2)}
     assert {tuple(p) for p in contacts.point.round(9).tolist()} == expected
 
@@ -91,9 +95,9 @@ def test_a_turned_face_gives_an_octagon():
 
 def test_crossed_edges_meet_in_a_point():
     h = 0.5
-    # an edge along x on top, at height h sqrt 2
+    # An edge along x on top, at height h sqrt 2.
     a = OrientedBox(np.zeros(3), turn(np.pi / 4, 0, 0).as_matrix(), np.full(3, h))
-    # along y, below
+    # Along y, below.
     b = OrientedBox(
         np.array([0.1, 0.05, 2 * h * np.sqrt(2) + 0.01]),
         turn(0, np.pi / 4, 0).as_matrix(),
@@ -142,7 +146,10 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_normal_rows_of_the_jacobian_are_the_rate_of_the_gap(kind):
-    """A wrong sign or arm in J shows: moving bodies by v dt changes the gap by J_n v dt."""
+    """Normal rows of the Jacobian against the rate of the gap.
+
+    A wrong sign or arm in J shows: moving bodies by v dt changes the gap by J_n v dt.
+    """
     world, rng = KINDS[kind](), np.random.default_rng(91)
     contacts = world.contacts(margin=0.05)
     deepest, velocity = int(contacts.gap.argmin()), rng.standard_normal((len(world.bodies), 6))

@@ -1,4 +1,7 @@
-"""Friction models: Coulomb's law written out here, closed forms of one contact, and the polyhedral cone against the circular one."""
+"""Friction models against Coulomb's law and closed forms of one contact.
+
+The polyhedral cone is compared with the circular one.
+"""
 
 import numpy as np
 import pytest
@@ -14,14 +17,14 @@ from warp_lcp.gallery.contact_models import (
 )
 from warp_lcp.gallery.contact_scenes import box_stack, contact_scene, incline, motor_arm
 
-# [m/s]: friction turns the slip by a thousandth at most, so that two vectors share it next to
-# nowhere
+# [m/s] Friction turns the slip by a thousandth at most, so that it is almost never shared by two
+# vectors.
 FAST = 300.0
 TIGHT = wl.StoppingCriteria(rtol=1e-12, max_iterations=2000, patience=2000)
 
 
 def particle(slip, mu, weight=1.0, mass=2.0):
-    """A particle on the ground that falls with the impulse `weight` and slides with `slip`."""
+    """Return a particle on the ground with the impulse `weight` and the slip `slip`."""
     return ContactSystem(
         "particle",
         scipy.sparse.csr_array(np.eye(3) / mass),
@@ -40,7 +43,11 @@ def solved(system, model, method=None):
 
 @pytest.mark.parametrize("directions", [4, 8, 16])
 def test_friction_dissipates_the_most_that_its_cone_allows(directions):
-    """KKT of the model, of the slip that results: u.r_t is the least over the polygon of mu r_n times the K vectors."""
+    """Dissipation of friction: the largest that its cone allows.
+
+    KKT conditions with the resulting slip: u.r_t is the minimum over the polygon of mu r_n times
+    the K vectors.
+    """
     angles = 2 * np.pi * np.arange(directions) / directions
     vectors = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     for slip in np.random.default_rng(23).standard_normal((8, 2)) * 0.5:
@@ -51,7 +58,7 @@ def test_friction_dissipates_the_most_that_its_cone_allows(directions):
         sides = np.stack(
             [np.cos(angles + np.pi / directions), np.sin(angles + np.pi / directions)], axis=1
         )
-        # inside the polygon
+        # Inside the polygon.
         assert (sides @ r[1:]).max() <= 0.5 * r[0] * np.cos(np.pi / directions) + 1e-9
 
 
@@ -62,7 +69,7 @@ def test_a_sliding_particle_is_held_along_the_nearest_vector(directions):
         slip = FAST * np.array([np.cos(angle), np.sin(angle)])
         r = solved(particle(slip, mu, mass=mass), model)
         assert r[0] == pytest.approx(1.0)
-        # it slides: friction is on the cone
+        # The particle slides: friction is on the cone.
         assert np.linalg.norm(r[1:]) == pytest.approx(mu * r[0])
         nearest = 2 * np.pi / directions * np.round((angle + np.pi) / (2 * np.pi / directions))
         np.testing.assert_allclose(
@@ -71,7 +78,11 @@ def test_a_sliding_particle_is_held_along_the_nearest_vector(directions):
 
 
 def test_the_polyhedral_cone_converges_to_the_circular_one():
-    """The largest error of a sliding particle's friction is 2 sin(pi / 2K) of it: it halves when K doubles."""
+    """Convergence of the polyhedral cone to the circular one.
+
+    The largest error of a sliding particle's friction is 2 sin(pi / 2K) of it: it halves when K
+    doubles.
+    """
     mu, worst = 0.5, {}
     for K in (4, 8, 16, 32):
         errors = []
@@ -79,7 +90,7 @@ def test_the_polyhedral_cone_converges_to_the_circular_one():
             slip = FAST * np.array([np.cos(angle), np.sin(angle)])
             system = particle(slip, mu)
             exact, residual, _ = proximal_sweeps(system)
-            # opposite to the slip: Coulomb's law
+            # Opposite to the slip: Coulomb's law.
             np.testing.assert_allclose(exact[1:], -mu * slip / FAST, atol=1e-9)
             assert residual < 1e-9
             errors.append(np.linalg.norm(solved(system, StewartTrinkleModel(K)) - exact) / mu)
@@ -89,7 +100,11 @@ def test_the_polyhedral_cone_converges_to_the_circular_one():
 
 
 def test_in_a_stack_velocities_converge_to_those_of_the_circular_cone():
-    """Impulses of face contacts are not unique; velocities of what slides are. Boxes thrown along the ground in odd directions."""
+    """Convergence of velocities in a stack to those of the circular cone.
+
+    Impulses of face contacts are not unique; velocities of sliding bodies are. Boxes thrown along
+    the ground in odd directions.
+    """
     world = incline(3, angle=0.0, friction=0.3)
     for body, thrown in zip(
         world.bodies, ([2.0, 0.7, 0.0], [0.3, 1.1, 0.0], [-1.3, 0.4, 0.0]), strict=True
@@ -105,7 +120,7 @@ def test_in_a_stack_velocities_converge_to_those_of_the_circular_cone():
             np.abs(assembly.velocity(solved(system, StewartTrinkleModel(K))) - exact)[:, :2].max()
         )
     assert errors[2] < 0.5 * errors[0]
-    assert errors[2] < 0.2 * 0.3 * 9.81 * 0.01  # of the change that friction makes in the step
+    assert errors[2] < 0.2 * 0.3 * 9.81 * 0.01  # share of the change by friction in the step
 
 
 def test_in_the_plane_both_models_are_coulombs_law():
@@ -129,7 +144,7 @@ def test_in_the_plane_both_models_are_coulombs_law():
 def test_the_boxed_model_is_tighter_than_nothing_and_wider_than_the_cone():
     system = particle(np.array([3.0, 3.0]), 0.5)
     r = solved(system, BoxedModel(), wl.ProjectedSOR(omega=1.0))
-    # sqrt(2) mu along a diagonal, as it is documented
+    # sqrt(2) mu along a diagonal, as documented.
     np.testing.assert_allclose(r, [1.0, -0.5, -0.5], atol=1e-9)
     frozen = solved(system, FrozenBoxModel(np.array([2.0])), wl.IncrementalPivoting())
     np.testing.assert_allclose(frozen, [1.0, -1.0, -1.0], atol=1e-9)

@@ -1,4 +1,4 @@
-"""Every scene is a problem that methods solve to the same velocities; figures known by statics are met."""
+"""Scenes of contacts: equal velocities by all methods, and known statics."""
 
 import numpy as np
 import pytest
@@ -48,12 +48,15 @@ def test_scenes_are_problems_that_repeat(name):
         )
         or not np.array_equal(problem.b, contact_scene(name, SMALL.get(name), seed=7).b)
         or name in ("arched-snake", "heavy-on-snake", "hanging-snake")
-    )  # whose limits alone are drawn
+    )  # only its limits are drawn
 
 
 @pytest.mark.parametrize("name", [n for n in SCENES if n not in ("driven-gears", "hanging-snake")])
 def test_lemke_and_newton_find_the_same_velocities(name):
-    """Impulses are not unique, velocities of these scenes are: methods that share nothing agree on them."""
+    """Velocities of these scenes by independent methods.
+
+    Impulses are not unique, velocities are.
+    """
     world = SCENES[name](SMALL.get(name, 2))
     assembly = world.assemble(DT)
     system, model, found = assembly.system, StewartTrinkleModel(4), []
@@ -97,7 +100,7 @@ def test_a_stack_by_its_name_is_of_boxes_of_water_about_to_fall_for_a_hundredth_
     world = box_stack(2)
     assert [body.properties.mass for body in world.bodies] == pytest.approx([1000.0 * 0.5**3] * 2)
     assert (world.assemble(DT).system.friction == 0.5).all()
-    # all contacts are closed and at rest
+    # All contacts are closed and at rest.
     assert contact_scene("box-stack", 2).b.min() == pytest.approx(-9.81 * 0.01)
 
 
@@ -176,7 +179,11 @@ def test_wrong_scenes_are_named():
     "world", [box_stack(10), heavy_on_light(2, ratio=1000.0)], ids=lambda w: w.name
 )
 def test_nncg_beats_sweeps_on_stacks_and_mass_ratios(world):
-    """[Book] fig. 2.12. Friction that is projected by bounds of before the move along p loses this: 2 x on the heavy box."""
+    """NNCG against sweeps on stacks and mass ratios, [Book] fig. 2.12.
+
+    If friction is projected by the bounds before the move along p, the advantage is lost: a factor
+    of 2 on the heavy box.
+    """
     problem = BoxedModel().problem(world.assemble(DT).system).lcp(device="cpu")
     stopping = wl.StoppingCriteria(rtol=1e-13, max_iterations=1000, patience=1000)
     sweeps, nncg = (
@@ -187,7 +194,11 @@ def test_nncg_beats_sweeps_on_stacks_and_mass_ratios(world):
 
 
 def test_subspace_minimization_with_affine_bounds_solves_stacks():
-    """Held friction that stayed where it was while its normal impulse moved would end at the residual of sweeps, 1e-3."""
+    """Subspace minimization with affine bounds on stacks.
+
+    If active friction did not follow its moving normal impulse, the residual would end at that of
+    sweeps, 1e-3.
+    """
     problem = BoxedModel().problem(box_stack(10).assemble(DT).system).lcp(device="cpu")
     result = wl.solve(
         problem, wl.SubspaceMinimization(precision="double", backtracks=-1), stopping=TIGHT

@@ -1,4 +1,7 @@
-"""Time steps against closed forms: fall, rest, slide, collide; conservation laws; scenes that stand."""
+"""Time steps of rigid bodies against closed forms.
+
+Fall, rest, sliding, collision; conservation laws; stable scenes.
+"""
 
 import numpy as np
 import pytest
@@ -36,7 +39,7 @@ def positions(world):
 
 
 def momentum(world):
-    """Of all bodies, and angular about the origin."""
+    """Return the momentum of all bodies, and the angular one about the origin."""
     turns = [
         np.cross(body.position, body.momentum) + body.angular_momentum for body in world.bodies
     ]
@@ -51,7 +54,7 @@ def test_a_ball_falls_then_rests_with_the_impulse_of_its_weight():
     for n in range(1, 11):
         stepper.step()
         assert world.bodies[0].velocity[2] == pytest.approx(-9.81 * DT * n)
-        # semi-implicit Euler, summed
+        # Semi-implicit Euler, summed.
         assert world.bodies[0].position[2] == pytest.approx(1.5 - 9.81 * DT**2 * n * (n + 1) / 2)
     for _ in range(60):
         report = stepper.step()
@@ -88,7 +91,11 @@ def collision():
 
 @pytest.mark.parametrize("stabilization", ["none", "baumgarte", "split"])
 def test_momentum_stays_without_gravity(stabilization):
-    """Impulses are opposite and on one line: a wrong sign or arm in J changes momentum or angular momentum."""
+    """Momentum without gravity.
+
+    Impulses are opposite and on one line: a wrong sign or arm in J changes momentum or angular
+    momentum.
+    """
     world = collision()
     before, touched = momentum(world), 0
     stepper = ContactStepper(world, dt=DT, stabilization=stabilization)
@@ -98,7 +105,7 @@ def test_momentum_stays_without_gravity(stabilization):
             (report.impulses[: 3 * report.contacts : 3] > 1e-3).any()
         )
         np.testing.assert_allclose(momentum(world)[:3], before[:3], atol=1e-10)
-        if stabilization != "split":  # which moves bodies without momentum
+        if stabilization != "split":  # "split" moves bodies without momentum
             np.testing.assert_allclose(momentum(world)[3:], before[3:], atol=1e-10)
     assert touched > 2
 
@@ -112,7 +119,7 @@ def test_energy_does_not_grow():
         energies.append(world.energy())
     assert energies[-1] < 0.9 * energies[0]  # the collisions are plastic
     rise = np.diff(energies).max()
-    # of turning bodies with their angular momentum kept, first order in dt
+    # Energy of turning bodies with their angular momentum kept, first order in dt.
     assert rise < 5e-3 * energies[0]
 
 
@@ -155,7 +162,7 @@ def test_overlaps_are_removed_as_asked(stabilization):
         if stabilization == "none"
         else world.deepest() < 0.0015
     )
-    # which gives the body the velocity it is moved with
+    # Baumgarte's correction gives the body the velocity of the move.
     assert (top > 0.1) == (stabilization == "baumgarte")
 
 
@@ -194,7 +201,7 @@ def test_limits_hold_a_hanging_chain_and_gears_turn_each_other():
     for _ in range(80):
         stepper.step()
     assert gears.bodies[0].angular_velocity[1] == pytest.approx(1.0, rel=0.05)  # the motor's speed
-    assert gears.hinges[1].angle(gears.bodies) < -0.3  # and the other way
+    assert gears.hinges[1].angle(gears.bodies) < -0.3  # and the other direction
 
 
 def test_warm_starting_saves_iterations():

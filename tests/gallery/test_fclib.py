@@ -1,4 +1,7 @@
-"""FCLIB files written here as its own writer does: three kinds of matrices, local and global problems, solutions, what is wrong."""
+"""FCLIB files in the format of its own writer.
+
+The tests cover three kinds of matrices, local and global problems, solutions, and wrong input.
+"""
 
 import numpy as np
 import pytest
@@ -60,7 +63,10 @@ def test_local_problems_come_back(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", STORED)
 def test_unsymmetric_blocks_are_read_the_right_way_round(tmp_path, kind):
-    """V is not square: rows and columns in the wrong place show."""
+    """Orientation of unsymmetric blocks.
+
+    V is not square: swapped rows and columns show.
+    """
     rng = np.random.default_rng(17)
     root = rng.standard_normal((8, 8))
     full = root @ root.T
@@ -79,7 +85,10 @@ def test_unsymmetric_blocks_are_read_the_right_way_round(tmp_path, kind):
 
 
 def test_a_global_problem_has_the_velocities_of_its_bodies(tmp_path):
-    """M v = H r + G l + f, u = H'v + w, G'v + b = 0, written out for random impulses."""
+    """Velocities of the bodies of a global problem.
+
+    The equations M v = H r + G l + f, u = H'v + w, G'v + b = 0 are written out for random impulses.
+    """
     rng = np.random.default_rng(29)
     root = rng.standard_normal((7, 7))
     M, H, G = root @ root.T + np.eye(7), rng.standard_normal((7, 4)), rng.standard_normal((7, 1))
@@ -134,7 +143,10 @@ def test_wrong_files_are_named(tmp_path):
 
 
 def hostile(file, name):
-    """Return what harms: a size that nothing stored can make, places beyond a matrix, and what is in other files."""
+    """Change a file to malicious content.
+
+    A size that no stored data can have, indices beyond a matrix, and entries of other files.
+    """
     matrix = file["fclib_local/W"]
     if name == "size":
         matrix["m"][0] = matrix["n"][0] = 2**31 - 1
@@ -183,7 +195,7 @@ def test_files_that_could_harm_are_refused(tmp_path, name, message):
 
 
 def test_each_contact_has_friction(tmp_path):
-    """Rows without any once became joints."""
+    """Friction of each contact; rows without friction became joints before."""
     write_local(tmp_path / "few.hdf5", np.eye(6), np.ones(6), np.array([0.3]))
     with pytest.raises(ValueError, match="mu has 1 values for 6 rows of 3 a contact"):
         read_fclib(tmp_path / "few.hdf5")

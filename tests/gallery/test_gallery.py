@@ -1,4 +1,7 @@
-"""Gallery problems are what their facts say; planted solutions solve them, by definitions written out here and in the oracle."""
+"""Gallery problems against their facts; planted solutions solve them.
+
+The definitions are written out here and in the oracle.
+"""
 
 import numpy as np
 import pytest
@@ -139,7 +142,7 @@ def test_contacts_have_the_block_pattern_and_a_solution(directions):
     assert np.linalg.eigvalsh(G)[0] > -1e-12
     tangents = p.A[1:last, 1:last].reshape(directions, directions)
     half = directions // 2
-    # tangents come in opposite pairs
+    # Tangents are opposite pairs.
     np.testing.assert_allclose(tangents[:half], -tangents[half:], atol=1e-12)
     x = lemke(p.A, p.b)
     assert x is not None

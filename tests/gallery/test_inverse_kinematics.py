@@ -1,4 +1,7 @@
-"""Inverse kinematics with joint limits: forward kinematics, the LCPs' signs, limits, descent, SciPy's optimum."""
+"""Inverse kinematics with joint limits.
+
+The tests cover forward kinematics, the LCPs' signs, limits, descent, and SciPy's optimum.
+"""
 
 import dataclasses
 
@@ -31,7 +34,11 @@ def some_pose(figure, seed=57):
 
 
 def walked(figure, theta):
-    """Forward kinematics again: each point carried from the tip to the root by SciPy's rotations, not from the root to the tip."""
+    """Return positions by independent forward kinematics.
+
+    Each point is carried from the tip to the root by SciPy's rotations, not from the root to the
+    tip.
+    """
     ends = []
     for j, tip in zip(figure.effectors, figure.tips, strict=True):
         point = tip
@@ -44,7 +51,10 @@ def walked(figure, theta):
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_positions_are_those_of_another_walk(name):
-    """An axis taken in the wrong frame, or an offset turned by its own hinge, moves the ends by centimeters."""
+    """Positions by two ways of forward kinematics.
+
+    An axis in the wrong frame, or an offset turned by its own hinge, moves the ends by centimeters.
+    """
     figure = FIGURES[name]
     for seed in (5, 6, 7):
         theta = some_pose(figure, seed)
@@ -62,7 +72,10 @@ def test_a_planar_chain_is_a_sum_of_complex_numbers():
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_derivatives_are_differences(name):
-    """Central differences of the other walk: a wrong sign, order of cross products or ancestor is off by the arm's length."""
+    """Derivatives against central differences of the independent kinematics.
+
+    A wrong sign, order of cross products or ancestor is off by the arm's length.
+    """
     figure, h = FIGURES[name], 1e-6
     theta, unit = some_pose(figure), np.eye(figure.hinges)
     J = np.stack(
@@ -86,7 +99,11 @@ def test_derivatives_are_differences(name):
 
 
 def test_the_two_forms_of_a_step_are_the_minimum_of_its_quadratic_program():
-    """The boxed LCP and the book's LCP in the multipliers; a wrong sign of c or of B would leave the box or climb."""
+    """Two forms of a step, against the minimum of its quadratic program.
+
+    They are the boxed LCP and the book's LCP in the multipliers. A wrong sign of c or of B would
+    leave the box or ascend.
+    """
     rng = np.random.default_rng(59)
     for _ in range(10):
         R = rng.standard_normal((5, 5))
@@ -98,7 +115,7 @@ def test_the_two_forms_of_a_step_are_the_minimum_of_its_quadratic_program():
         )
         d = wl.solve(model.lcp(device="cpu"), wl.MinimumMapNewton(), stopping=TIGHT).x.numpy()
         lemke = wl.solve(model.multipliers(device="cpu"), wl.Lemke(), stopping=TIGHT)
-        # |root d + root^-T c|^2 / 2 is the model but for a constant
+        # |root d + root^-T c|^2 / 2 is the model up to a constant.
         root = np.linalg.cholesky(model.H).T
         oracle = scipy.optimize.lsq_linear(
             root,
@@ -114,7 +131,7 @@ def test_the_two_forms_of_a_step_are_the_minimum_of_its_quadratic_program():
 
 
 def test_every_method_finds_the_pose():
-    """All methods of dense matrices take the steps of one figure to one optimum, with three limits active."""
+    """Pose by all methods of dense matrices: one optimum with three active limits."""
     figure = planar_chain([1.0, 0.8, 0.6, 0.4], lower=-0.2, upper=np.array([2.0, 0.3, 0.7, 0.2]))
     goal, start = np.array([[-1.5, 1.5]]), np.full(4, 0.1)
     oracle = scipy.optimize.least_squares(
@@ -150,7 +167,10 @@ def test_multipliers_take_the_same_steps(curvature):
 
 
 def agree(counts, count, share=0.95):
-    """Limits hold, no objective grows, and a share of the objectives is SciPy's; a step with curvature may lead to another optimum."""
+    """Check limits, descent, and a share of optima equal to SciPy's.
+
+    A step with curvature may lead to another optimum.
+    """
     parts = counts.values()
     assert sum(c.targets for c in parts) == count
     assert max(c.outside for c in parts) <= OUTSIDE
@@ -161,11 +181,14 @@ def agree(counts, count, share=0.95):
 
 
 def test_random_targets_beside_scipy():
-    """In reach and out of it, a planar, a spatial and a branching figure with random limits."""
+    """Random targets, compared with SciPy.
+
+    In reach and out of it; a planar, a spatial and a branching figure with random limits.
+    """
     counts = compare(12, {"Gauss-Newton": InverseKinematics(device="cpu", max_iterations=300)})[
         "Gauss-Newton"
     ]
-    agree(counts, 12)  # each of the twelve: two of a kind
+    agree(counts, 12)  # all twelve: two of a kind
     assert {key.split(", ")[1] for key in counts} == {"in reach", "out of reach"}
 
 
@@ -177,7 +200,11 @@ def test_a_thousand_random_targets_beside_scipy():
 
 @pytest.mark.slow
 def test_the_price_of_damping():
-    """Heavy damping takes many more steps to a goal in reach; curvature pays where goals are out of reach."""
+    """Cost of damping.
+
+    Heavy damping takes many more steps to a target in reach. Curvature helps where targets are out
+    of reach.
+    """
 
     def steps(reachable, **settings):
         solver = InverseKinematics(device="cpu", **settings)

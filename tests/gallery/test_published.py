@@ -1,4 +1,4 @@
-"""Numbers that others have printed, digit by digit; and what holds for the problems besides."""
+"""Published numbers, digit by digit, and further properties of the problems."""
 
 import itertools
 import re
@@ -20,7 +20,7 @@ ROWS = [
     pytest.param(p, marks=SLOW if p.slow else (), id=f"{p.problem}, {p.case}, {p.source}")
     for p in PUBLISHED
 ]
-# of a cell, corners (x, y), the right angle first
+# Triangles of a cell: corners (x, y), the right angle first.
 TRIANGLES = (((0, 0), (1, 0), (0, 1)), ((1, 1), (0, 1), (1, 0)))
 
 
@@ -29,13 +29,16 @@ def test_published_digits_are_met(published):
     value = published.measure()
     off = abs(value - float(published.printed))
     assert off <= published.tolerance, (value, published.printed)
-    if published.within:  # where a digit is not met, the table says so
+    if published.within:  # if a digit differs, the table says so
         exact = type(published)("", "", published.printed, "", published.measure)
         assert off > exact.tolerance or published.source == "QuantLib"
 
 
 def test_bearing_is_the_integral_over_triangles():
-    """The energy of any u, from the integrals of linear elements one by one; the load by the rule of the corners."""
+    """Bearing as an integral over triangles.
+
+    The energy of any u is the sum of integrals of linear elements; the load is by the corner rule.
+    """
     nx, ny, e, half_width = 5, 4, 0.7, 3.0
     p = journal_bearing(nx, ny, e, half_width=half_width, device="cpu")
     u = np.zeros((ny + 2, nx + 2))
@@ -60,7 +63,10 @@ def test_bearing_is_the_integral_over_triangles():
     ids=lambda p: p.name,
 )
 def test_border_has_half_the_weight(p):
-    """By the energy's definition: each inner node has a quarter of the squares of its differences to all four neighbors."""
+    """Half weight of the border, by the energy's definition.
+
+    Each inner node has a quarter of the squares of its differences to all four neighbors.
+    """
     ny, nx = p.b.shape
     u = np.zeros((ny, nx))
     u[1:-1, 1:-1] = np.random.default_rng(19).uniform(-1, 1, (ny - 2, nx - 2))
@@ -91,7 +97,10 @@ def test_torsion_has_the_bits_it_had():
 
 
 def european(m, spot, variance):
-    """Heston's closed form in the version of Albrecher et al.: the put by both chances that S ends above K."""
+    """Return Heston's closed form of a put, in the version of Albrecher et al.
+
+    By both probabilities that S ends above K.
+    """
     kappa, sigma, rho, T = m.reversion, m.volatility, m.correlation, m.expiry
 
     def characteristic(z):
@@ -141,7 +150,7 @@ def test_european_puts_by_the_closed_form(correlation):
         for k in (1, 2)
     )
     assert fine < 5e-4
-    assert fine < coarse / 2.8  # the order is two
+    assert fine < coarse / 2.8  # order two
 
 
 def test_steady_variance_is_black_and_scholes():
@@ -158,13 +167,13 @@ def test_american_put_is_worth_more_and_is_exercised_below():
     assert (prices.u >= payoff).all()
     assert (prices.u >= held.u - 1e-6).all()
     exercised = (prices.u == payoff) & (prices.S < 10)
-    assert (np.diff(exercised.sum(1)) <= 0).all()  # the less the variance, the sooner
+    assert (np.diff(exercised.sum(1)) <= 0).all()  # the smaller the variance, the earlier
     assert exercised[0].any()
 
 
 @pytest.mark.slow
 def test_american_puts_on_one_grid():
-    """All four digits without extrapolation."""
+    """American puts on one grid: all four digits without extrapolation."""
     prices = Heston().put(384, 96, 128, device="cpu").at(np.arange(8.0, 13.0), 0.0625)
     assert [f"{price:.4f}" for price in prices] == [
         "2.0000",
@@ -184,7 +193,7 @@ def test_money_grows_by_the_rate():
         dtype=wp.float64,
     )
     growth = A.apply(wp.ones((9, 13), dtype=wp.float64, device="cpu")).numpy()
-    np.testing.assert_allclose(growth, model.rate, atol=1e-10)  # what is the same everywhere
+    np.testing.assert_allclose(growth, model.rate, atol=1e-10)  # constants grow at the rate
 
 
 def test_ice_flows_by_its_derivative():
@@ -197,7 +206,7 @@ def test_ice_flows_by_its_derivative():
         rtol=1e-6,
         atol=1e-1,
     )
-    # what leaves a volume enters another
+    # The outflow of a volume is the inflow of another.
     assert abs(dome.outflow(H, 0.01)[0].sum()) < 1e-6 * np.abs(dome.outflow(H, 0.01)[0]).max()
 
 
@@ -222,7 +231,11 @@ def test_ice_balance_is_the_divergence_of_the_known_dome():
 
 @pytest.mark.slow
 def test_ice_dome_converges_to_the_known_one():
-    """Thickness at the center, mean error, radius: the margin, where the slope is infinite, keeps the largest error large."""
+    """Convergence of the ice dome to the exact one.
+
+    The measures are thickness at the center, mean error and radius. At the margin the slope is
+    infinite, so that the largest error stays large.
+    """
     center, mean, radius = [], [], []
     for n in (17, 33, 65):
         dome = IceDome(nodes=n)
@@ -258,7 +271,7 @@ def test_arguments_out_of_range_are_named():
 
 
 def test_the_page_has_the_table():
-    """Each number with what came out here when the page was made."""
+    """Table on the page: each number with the result when the page was made."""
     text = (
         Path(__file__).parents[2] / "benchmarks" / "results" / "amd-epyc" / "problems.md"
     ).read_text()

@@ -1,4 +1,4 @@
-"""Worlds: what their bodies are made of, which of them move, and what is refused."""
+"""Worlds of rigid bodies: mass properties, moving bodies, refusals."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,10 @@ from warp_lcp.grid.solids import Sphere
 
 
 def sampled_inertia(half, mass, n=60):
-    """Midpoint sums of (|r|^2 1 - r r') over a box: no formula of the code."""
+    """Return midpoint sums of (|r|^2 1 - r r') over a box.
+
+    No formula of the code is used.
+    """
     axes = [(np.arange(n) + 0.5) / n * 2 * h - h for h in half]
     r = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return mass * (
@@ -20,7 +23,10 @@ def sampled_inertia(half, mass, n=60):
 
 
 def test_a_gear_has_the_mass_and_inertia_of_its_bars():
-    """Bars count where they overlap: three bars of a third of the mass, in the xz plane."""
+    """Mass and inertia of a gear of bars.
+
+    Overlapping parts count twice: three bars of a third of the mass, in the xz plane.
+    """
     body = World("", [gear([1.0, 2.0, 3.0], (0.3, 0.05, 0.1), 0.2)], [6.0]).bodies[0]
     upright, total = Rotation.from_rotvec([np.pi / 2, 0, 0]), np.zeros((3, 3))
     for k in range(3):
@@ -32,7 +38,7 @@ def test_a_gear_has_the_mass_and_inertia_of_its_bars():
 
 
 def tumbling():
-    """A box that turns, a ball, and a box that does not move whatever it is given."""
+    """Return a turning box, a ball, and a fixed box."""
     turn = Rotation.random(random_state=np.random.default_rng(5))
     solids = [
         box([0, 0, 1], (0.1, 0.2, 0.5), turn),
@@ -67,7 +73,10 @@ def test_what_is_fixed_stays_and_answers_to_no_impulse():
 
 
 def test_the_inverse_mass_is_that_of_the_energy():
-    """v'M v / 2 with M^-1 of the velocity problem, along what a contact does."""
+    """Inverse mass against the kinetic energy.
+
+    The energy is v'M v / 2 with M^-1 of the velocity problem, along the effect of a contact.
+    """
     world = World(
         "",
         [box([0, 0, 0.5], (0.1, 0.2, 0.5), about((0.0, 0.0, 1.0), 0.4))],

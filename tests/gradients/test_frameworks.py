@@ -1,4 +1,4 @@
-"""Solves on Warp's tape, in PyTorch and in JAX have the gradients of `wl.vjp`."""
+"""Gradients of `wl.vjp` on Warp's tape, in PyTorch and in JAX."""
 
 import contextlib
 import importlib
@@ -33,7 +33,7 @@ def data():
 
 
 def expected():
-    """x, and the gradients of g.x + |x|^2 / 2."""
+    """Return x, and the gradients of g.x + |x|^2 / 2."""
     _, make, fields, g = data()
     result = wl.solve(
         wl.LCP(make(face_x=fields["face_x"]), fields["b"], fields["lower"]),
@@ -61,7 +61,10 @@ def double_kernel(half: wp.array2d(dtype=wp.float64), whole: wp.array2d(dtype=wp
 
 
 def test_tapes():
-    """A kernel before the solve, and one after it; gradients are added up and can be zeroed."""
+    """Tapes: a kernel before the solve, and one after it.
+
+    Gradients accumulate and can be zeroed.
+    """
     cells, make, fields, g = data()
     x, found = expected()
     arrays = {
@@ -94,7 +97,7 @@ def test_tapes():
         record.backward(loss)
         for name in ("lower", "face_x"):
             assert np.allclose(arrays[name].grad.numpy(), found[name].numpy(), atol=1e-12)
-        # a kernel that writes b takes its gradient
+        # A kernel that writes b receives its gradient.
         assert np.allclose(half.grad.numpy(), 2 * found["b"].numpy(), atol=1e-12)
         record.zero()
         assert not arrays["face_x"].grad.numpy().any()
@@ -112,7 +115,7 @@ def test_gradients_on_a_tape_are_of_the_types_given_and_added_up():
 
 
 def stencil(given):
-    """Coefficients of a stencil that is not symmetric, as a function of two of them."""
+    """Return an unsymmetric stencil's coefficients, as a function of two of them."""
     center, east = given
     return {
         "coefficients": {(0, 0): center, (0, 1): east, (0, -1): -0.5, (1, 0): -1.0, (-1, 0): -1.0}
@@ -120,7 +123,10 @@ def stencil(given):
 
 
 def test_coefficients_of_stencils():
-    """They are a mapping: its arrays have gradients of their own, on tapes, in PyTorch and in JAX."""
+    """Coefficients of stencils as a mapping, on tapes, in PyTorch and in JAX.
+
+    Its arrays have gradients of their own.
+    """
     cells, _, fields, g = data()
     make, values = (
         partial(wl.Stencil, cells, device="cpu", dtype=wp.float64),

@@ -1,4 +1,4 @@
-"""Gradients through solutions against finite differences, and what is refused."""
+"""Gradients through solutions against finite differences, and refusals."""
 
 import pickle
 import tracemalloc
@@ -12,7 +12,7 @@ import warp_lcp as wl
 
 TIGHT = wl.StoppingCriteria(rtol=1e-13, atol=1e-13, max_iterations=300)
 STEP = 1e-6
-DIRECTIONS = 8  # along which fields are changed
+DIRECTIONS = 8  # number of fields along which differences are taken
 F64 = {"device": "cpu", "dtype": wp.float64}
 
 
@@ -23,7 +23,7 @@ def solved(make, data):
 
 
 def directions(value):
-    """Ways to change a value: each entry if they are few, else random ones that change all."""
+    """Yield directions of change: each entry if they are few, else random ones."""
     shape = np.shape(value)
     if np.size(value) <= DIRECTIONS:
         return np.eye(np.size(value)).reshape(-1, *shape)
@@ -31,7 +31,10 @@ def directions(value):
 
 
 def differences(make, data, name, g):
-    """The derivatives of L = g.x along the `directions` of data[name], by central differences."""
+    """Return the derivatives of L = g.x along the `directions` of data[name].
+
+    They are central differences.
+    """
     value, found = np.array(data[name], dtype=float), []
     for way in directions(value):
         moved = [value + sign * STEP * way for sign in (1, -1)]
@@ -44,7 +47,7 @@ def differences(make, data, name, g):
 
 
 def along(gradient):
-    """The derivatives along the same directions that a gradient says."""
+    """Return the derivatives along the same directions by a gradient."""
     return np.array([np.vdot(gradient, way) for way in directions(gradient)])
 
 
@@ -53,7 +56,10 @@ def host(value):
 
 
 def check(make, data, seed, *, skip=()):
-    """Compare the gradients of all data with differences, each direction and length; return the gradients."""
+    """Compare the gradients of all data with differences; return the gradients.
+
+    They are compared along each direction, and in length.
+    """
     result = solved(make, data)
     g = np.random.default_rng(seed).standard_normal(result.x.shape)
     gradients = wl.vjp(result, g, stopping=wl.StoppingCriteria(rtol=1e-12))
@@ -70,7 +76,10 @@ def check(make, data, seed, *, skip=()):
 
 
 def random_grid(shape, seed):
-    """Cells of all types, boxes that some unknowns touch, and coefficients of each kind."""
+    """Return random cells, boxes, and coefficients of each kind.
+
+    Cells are of all types, and some unknowns are at their bounds.
+    """
     rng = np.random.default_rng(seed)
     cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], shape, p=[0.15, 0.7, 0.15])
     faces = [list(shape) for _ in shape]
@@ -152,7 +161,7 @@ def test_periodic_axes_share_the_derivative_of_the_face_that_is_one():
     check(grid_problem(cells, periodic=(True, True)), uniform, 55, skip=("b", "shift"))
 
 
-# offsets whose coefficients vary, offsets of numbers, a center above their sum, periodic axes
+# Offsets with variable coefficients, offsets with numbers, a center above their sum, periodic axes.
 STENCILS = {
     "turned": (((0, 1), (0, -1), (1, 0), (-1, 1), (-1, -1)), {(1, 1): -0.5}, 6.0, (False, False)),
     "periodic": (
@@ -235,7 +244,7 @@ def test_functions_have_the_gradients_of_their_values():
     assert found[0][0, 0] == pytest.approx(found[1][0, 0].numpy().sum())
 
 
-# with drift and 2.1 a few sweeps are faster
+# With drift and 2.1 a few sweeps are faster.
 @pytest.mark.parametrize(("drift", "center"), [(0.0, 2.1), (0.3, 2.0)])
 def test_matrices_solved_as_grids_have_gradients_of_their_own(drift, center):
     n, rng = 50, np.random.default_rng(4)
@@ -336,7 +345,10 @@ def test_matrices(symmetric):
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_large_sparse_matrices_by_their_own_methods(symmetric):
-    """Past the direct ones, against SciPy's solution on the same free set."""
+    """Large sparse matrices by methods beyond the direct ones.
+
+    They are compared with SciPy's solution on the same free set.
+    """
     A, rng = random_matrix(3000, 41, symmetric)
     b, lower, g = rng.standard_normal(3000), -0.1 * rng.random(3000), rng.standard_normal(3000)
     result = wl.solve(
@@ -354,7 +366,7 @@ def test_large_sparse_matrices_by_their_own_methods(symmetric):
 
 
 class Products:
-    """An operator with products alone."""
+    """Operator with products alone."""
 
     def __init__(self, matrix, symmetric):
         self._A, self.symmetric = wl.DenseOperator(matrix, device="cpu"), symmetric
@@ -425,7 +437,11 @@ def test_bounds_that_are_equal_move_x_with_them():
 
 
 def test_of_two_bounds_that_are_equal_the_one_holds_that_y_pushes_against():
-    """Nothing is free, so that the derivative of g.x by a bound is g's entry; at y = 0 it is the lower bound's."""
+    """Two equal bounds: the active one is the one against which y pushes.
+
+    Nothing is free, so that the derivative of g.x by a bound is g's entry; at y = 0 it is the lower
+    bound's.
+    """
     A = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 2.0]])
     x = np.array([0.2, -0.1, 0.3])
     result = solved(
@@ -439,7 +455,11 @@ def test_of_two_bounds_that_are_equal_the_one_holds_that_y_pushes_against():
 
 
 def test_degenerate_unknowns_are_counted_and_held():
-    """b = 0: every unknown is at its bound with y = 0. Held, they follow their bound; b moves nothing."""
+    """Degenerate unknowns, counted and held.
+
+    With b = 0 every unknown is at its bound with y = 0. Held, they follow their bound; b has no
+    effect.
+    """
     A = np.array([[2.0, -1.0], [-1.0, 2.0]])
     found = wl.vjp(wl.solve(wl.LCP(A, np.zeros(2))), np.array([1.0, 2.0]))
     assert (found.degenerate, found.free) == (2, 0)
@@ -448,7 +468,11 @@ def test_degenerate_unknowns_are_counted_and_held():
 
 
 def test_an_element_of_the_b_subdifferential_at_a_degenerate_solution():
-    """The gradients are the limit of those of problems nearby, where the degenerate unknown is held strictly."""
+    """Element of the B-subdifferential at a degenerate solution.
+
+    The gradients are the limit of those of nearby problems, where the degenerate unknown is
+    strictly held.
+    """
     A, rng = random_matrix(10, 47, True)
     b = rng.standard_normal(10)
     x = wl.solve(wl.LCP(A, b), stopping=TIGHT).x.numpy()
@@ -465,7 +489,10 @@ def test_an_element_of_the_b_subdifferential_at_a_degenerate_solution():
 
 
 def test_a_floating_component_is_defined_but_for_a_constant():
-    """Neumann on all sides, no bounds: the gradient is that of directions which keep b compatible."""
+    """Floating component, defined up to a constant.
+
+    Neumann on all sides, no bounds: the gradient is that of directions that keep b compatible.
+    """
     cells = np.full((5, 6), wl.FLUID)
     cells[2, 3] = wl.SOLID
     inside = cells == wl.FLUID
@@ -543,7 +570,10 @@ def test_solves_that_do_not_converge_say_so():
 
 
 def test_a_singular_free_block_is_no_success():
-    """A free block that has no inverse: a scalar of x has no gradient unless it is blind to the null space."""
+    """Singular free block: no success.
+
+    A scalar of x has a gradient only if it vanishes on the null space.
+    """
     L = scipy.sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
     result = wl.solve(wl.LCP(L, np.array([1.0, -1.0]), -np.inf))
     with pytest.raises(ArithmeticError):
@@ -579,7 +609,11 @@ def test_what_a_cotangent_has_off_the_unknowns_does_not_count():
 
 
 def test_memory_does_not_grow_with_the_iterations():
-    """Of the solve: what a result holds beyond its history is x, and what gradients take is the same, to what Python itself varies by."""
+    """Memory, independent of the number of iterations.
+
+    Beyond its history a result holds x, and gradients take the same memory, up to Python's own
+    variation.
+    """
     cells, data = random_grid((60, 60), 131)
     problem, peaks, steps = grid_problem(cells)(data["b"], shift=data["shift"]), [], []
     for method in (wl.ProjectedMultigrid(), wl.ProjectedSOR(omega=1.0)):

@@ -1,4 +1,7 @@
-"""Gradients of problems with every kind of operator against implicit differentiation of the dense matrix, A_FF' mu_F = -g_F."""
+"""Gradients for every kind of operator against dense implicit differentiation.
+
+The multipliers solve A_FF' mu_F = -g_F.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ OTHERS = ("dense", "sparse", "products", "low rank and sparse", "low rank and gr
 
 
 def operator(kind, seed):
-    """An operator, its matrix by NumPy, where the unknowns are in its fields."""
+    """Return an operator, its matrix by NumPy, and the places of unknowns."""
     rng, n = np.random.default_rng([seed, 5]), 24
     if kind in KINDS:
         stencil = drawn([seed, 11], kind)
@@ -58,7 +61,7 @@ def operator(kind, seed):
 
 def check(kind, seed):
     A, M, inside = operator(kind, seed)
-    # those are float32
+    # Some operators are float32.
     rng, within = np.random.default_rng([seed, 6]), 1e-4 if kind == "functions" else 1e-7
     x, free = rng.standard_normal(inside.shape) * inside, rng.random(inside.shape) < 0.5
     y = np.where(free, 0, rng.choice([-1, 1], inside.shape) * rng.uniform(0.5, 1.5, inside.shape))
@@ -88,7 +91,7 @@ def check(kind, seed):
 
 
 def check_coefficients(stencil, found, x, mu, within):
-    """Compare with mu_i times what the coefficient of cell i counts for."""
+    """Compare with mu_i times the factor of cell i's coefficient."""
     cells = stencil.cells
     for offset, gradient in found.items():
         expected = np.zeros(cells.shape)
@@ -121,7 +124,11 @@ def test_more_gradients_are_those_of_the_matrix(kind, seed):
 
 @pytest.mark.parametrize("kind", ["rows", "columns", "circulant"])
 def test_gradients_of_singular_stencils_are_those_of_the_pseudo_inverse(kind):
-    """With g compatible, mu is defined but for a left null vector, which neither b nor a step of x sees."""
+    """Gradients of singular stencils: those of the pseudo-inverse.
+
+    With g compatible, mu is defined up to a left null vector, which has no effect on b or on a step
+    of x.
+    """
     stencil = drawn_singular(18, kind)
     A, inside, rng = stencil.operator(), stencil.inside, np.random.default_rng(19)
     M = grid_matrix(A).toarray()

@@ -1,4 +1,4 @@
-"""Pressure and friction together in deep sand: what a solve takes, and what is left where sand yields."""
+"""Coupled pressure and friction in deep sand: iterations and residuals."""
 
 from typing import Any
 
@@ -36,9 +36,11 @@ def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 @pytest.mark.parametrize("cells", [32, 64, 96])
 def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction: float) -> None:
-    """Waves as long as the depth keep their momentum: a solve that limits it before they are gone takes twice as long.
+    """Iterations of a cold start in deep sand.
 
-    To the tolerance, that is; by itself the first step's solve goes on from there.
+    Waves as long as the depth keep their momentum. A solve that limits it before they have decayed
+    takes twice as long. This counts to the tolerance; by default the first step's solve continues
+    from there.
     """
     dx = 0.02
     sand = [box([0.0, 0.0], [8 * dx, cells * dx])]
@@ -52,7 +54,10 @@ def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction:
 
 
 def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields() -> None:
-    """Sand of 40 degrees that runs out of a silo: pressure and the friction's bound drive each other on."""
+    """Limit of the momentum: smaller residual where deep sand yields.
+
+    Sand of 40 degrees runs out of a silo: pressure and the friction's bound amplify each other.
+    """
     medians = []
     for limits in ((), HeavyBallProjectedGradient().calm):
         simulation = silo(24, 48, 6, material={"friction_angle": 40.0}, density_correction={})

@@ -1,4 +1,4 @@
-"""Percentiles that a device selects, against NumPy's partition."""
+"""Percentiles selected on a device, against NumPy's partition."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ DEVICE = wp.get_device("cpu")
 
 
 class Points:
-    """Particles at some points, shape (n, 3)."""
+    """Particles at given points, shape (n, 3)."""
 
     def __init__(self, points: np.ndarray) -> None:
         self.count, self.position = (
@@ -23,7 +23,7 @@ class Points:
 
 
 def particles(points: np.ndarray) -> Any:
-    """Return particles at some points."""
+    """Return particles at given points."""
     return Points(points)
 
 
@@ -35,7 +35,7 @@ def test_the_number_at_a_place_is_that_of_the_sorted_ones(seed: int) -> None:
         points = (rng.standard_normal((n, 3)) * 10.0 ** rng.integers(-30, 30, (n, 3))).astype(
             np.float32
         )
-        points[rng.random((n, 3)) < 0.3] = rng.choice([0.0, 1.0, -1.0, 1e-42])  # many alike
+        points[rng.random((n, 3)) < 0.3] = rng.choice([0.0, 1.0, -1.0, 1e-42])  # many equal values
         for place in {percentile_place(n), 0, n - 1, int(rng.integers(0, n))}:
             front.find(particles(points), place)
             expected = np.sort(points[:, :2], axis=0)[place]

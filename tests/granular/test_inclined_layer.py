@@ -1,4 +1,7 @@
-"""Sand on slopes, whose angles of rest and accelerations are known; all angles and resolutions are in the suite `validation`."""
+"""Sand on slopes with known angles of rest and accelerations.
+
+All angles and resolutions are in the suite `validation`.
+"""
 
 import pytest
 
@@ -12,7 +15,11 @@ def test_a_layer_rests_and_runs_as_its_friction_angle_says_and_the_box_does_not(
 
 
 def test_a_stiff_slab_rests_and_slides_as_the_walls_friction_says() -> None:
-    """Were half of the sand above the last full row weightless, the slab would gain speed more than 1.5 times too fast."""
+    """Rest and sliding of a stiff slab by the wall friction.
+
+    If half of the sand above the last full row were weightless, the acceleration would be more than
+    1.5 times too large.
+    """
     trial = inclined.slab(12, angles=(26.8,))
     assert trial.failures() == []
     assert trial.findings[1].what == "26.8 degrees: acceleration over expected"
@@ -20,7 +27,10 @@ def test_a_stiff_slab_rests_and_slides_as_the_walls_friction_says() -> None:
 
 
 def test_a_layer_that_runs_comes_to_rest_where_it_should() -> None:
-    """Below the angle it loses speed as fast as friction exceeds gravity, all rows alike."""
+    """Rest of a running layer below the angle.
+
+    Its deceleration is friction less gravity, equal in all rows.
+    """
     slower = inclined.runs(16, 22.0)
     assert slower == pytest.approx(inclined.accelerates(22.0), rel=0.01)
     assert slower < -0.8

@@ -1,4 +1,7 @@
-"""Sweeps over pressure and friction: in colors, as on CUDA, and over listed cells."""
+"""Sweeps over pressure and friction.
+
+They run in colors, as on CUDA, and over listed cells.
+"""
 
 import numpy as np
 import pytest

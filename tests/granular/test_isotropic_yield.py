@@ -1,4 +1,4 @@
-"""How much shear sand bears must not depend on how the shear lies to the grid."""
+"""Isotropy of the yield set with respect to the grid."""
 
 import math
 
@@ -11,7 +11,7 @@ from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 
-# cells an edge; p and k of the yield set [m/s]; shear of the flow, times dx [m/s]
+# Cells along an edge; p and k of the yield set [m/s]; shear of the flow times dx [m/s].
 CELLS, PRESSURE, SLOPE, RATE = 6, 1.0, 0.5, 300.0
 
 
@@ -34,9 +34,10 @@ def linear_flow(grid: StaggeredGrid, gradient: np.ndarray) -> list[wp.array]:
 
 
 def borne(degrees: float, plane: tuple[int, int], dimension: int, *, box: bool) -> float:
-    """Return the shear stress over k p in a cell amid packed sand that is sheared fast along a direction in a plane of two axes.
+    """Return the shear stress over k p in a cell of packed sand under fast shear.
 
-    It is the dissipation over the flow's rate of shear: all that friction can take from the flow.
+    The shear is along a direction in a plane of two axes. The stress is the dissipation over the
+    rate of shear: the largest power that friction can take from the flow.
     """
     grid = StaggeredGrid((CELLS, CELLS, CELLS if dimension == 3 else 1), 1.0, dimension)
     base, one = grid.field(wp.int8), wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
@@ -55,9 +56,9 @@ def borne(degrees: float, plane: tuple[int, int], dimension: int, *, box: bool) 
     stress.now.assign(start)
     stress.kick_dt = 1.0
     stress.begin(YieldSet(SLOPE), np.zeros(3), 1.0, 1.0)
-    # the pressure stays
+    # The pressure stays constant.
     stress.restart(pressure_step=1e-6, shear_step=0.2, lookahead=0.0, momentum=0.0)
-    # so fast a flow takes the stress to the point of the yield set where friction takes most
+    # So fast a flow moves the stress to the point of the yield set with the largest dissipation.
     stress.advance(1)
     k = CELLS // 2 if dimension == 3 else 1
     cell = stress.now.numpy()[:, k, CELLS // 2, CELLS // 2].astype(float)
@@ -86,7 +87,10 @@ def test_the_cone_bears_the_same_shear_in_all_directions(
 
 @pytest.mark.parametrize(("dimension", "plane"), CASES)
 def test_the_box_bears_more_between_its_axes(dimension: int, plane: tuple[int, int]) -> None:
-    """The negative control: normal and shear stress each have their own bound, both are full at 22.5 degrees."""
+    """Box between its axes: the negative control.
+
+    Normal and shear stress each have their own bound; both are reached at 22.5 degrees.
+    """
     assert borne(0.0, plane, dimension, box=True) == pytest.approx(1.0, abs=0.03)
     assert borne(45.0, plane, dimension, box=True) == pytest.approx(1.0, abs=0.03)
     assert borne(22.5, plane, dimension, box=True) == pytest.approx(math.sqrt(2.0), abs=0.03)

@@ -1,4 +1,4 @@
-"""Sand in a domain without sides must not notice where its grid begins and ends."""
+"""Sand in periodic domains, independent of where the grid begins."""
 
 import math
 from pathlib import Path
@@ -20,7 +20,7 @@ DX, DT = 0.02, 2e-3  # [m], [s]
 
 
 def scene(cells: tuple[int, ...], sand: list[dict[str, Any]], **tables: Any) -> dict[str, Any]:
-    """Return a scene of cells of DX without an end along x and z."""
+    """Return a scene of cells of DX, periodic along x and z."""
     domain = {
         "size": [n * DX for n in cells],
         "resolution": max(cells),
@@ -47,7 +47,10 @@ def create(*args: Any, **tables: Any) -> SandSimulation:
 def block(
     low: list[float], high: list[float], count: int, shift: int, velocity: list[float]
 ) -> list[dict[str, Any]]:
-    """Return a box [cells], moved along x by whole cells around a domain of `count`; in two parts where it crosses the side."""
+    """Return a box [cells], shifted along x by whole cells in a periodic domain.
+
+    The domain has `count` cells. A box across the side is in two parts.
+    """
     x0 = (low[0] + shift) % count
     x1 = x0 + high[0] - low[0]
     parts = [(x0, min(x1, count))] + ([(0.0, x1 - count)] if x1 > count else [])
@@ -82,7 +85,10 @@ def test_the_ring_repeats_the_other_side() -> None:
 
 
 def folded(field: Any) -> np.ndarray:
-    """Return a field in double, what lies in the ring added to the cells along z and x that it repeats."""
+    """Return a field in double, with the ring added to the cells that it repeats.
+
+    That is done along z and x.
+    """
     values = np.asarray(field, float).copy()
     for _ in range(2):
         values[1] += values[-1]
@@ -94,7 +100,10 @@ def folded(field: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("at", [1, 8])
 def test_velocities_go_on_through_a_side(at: int) -> None:
-    """One face is known: what it gives to those around it does not depend on where the grid begins."""
+    """Extrapolation of velocities through a periodic side.
+
+    One face is known. Its effect on its neighbors does not depend on where the grid begins.
+    """
     grid = StaggeredGrid((8, 4, 4), 1.0, 3)
     window, join = (
         Window.of((1, 1, 1), (5, 5, 9), wp.get_device("cpu")),
@@ -148,13 +157,17 @@ def test_particles_come_in_again_and_keep_off_the_end() -> None:
     found = position.numpy()
     assert found[:, 0] == pytest.approx([L - 0.3 * DX, 0.25 * DX, 0.0, 0.0, 0.1, 0.01], abs=1e-7)
     assert (found[:, 0] < L - 5e-4 * DX).all()
-    assert found[4, 1] == np.float32(-1e-4)  # who has not crossed is not touched
+    assert found[4, 1] == np.float32(-1e-4)  # what has not crossed the side is unchanged
     assert found[5, 1] == pytest.approx(1e-3 * DX)
 
 
 @pytest.mark.parametrize(("transfer", "steps"), [("apic", 20), ("flip", 8)])
 def test_sand_that_starts_elsewhere_ends_elsewhere(transfer: str, steps: int) -> None:
-    """A block that slides and collapses, once amid the grid, once across its sides: without a row of the ring they part within a step."""
+    """Shifted start: shifted result.
+
+    A block slides and collapses, once inside the grid, once across its sides. Without a row of the
+    ring the two differ within a step.
+    """
     count = 12
 
     def run(shift: int) -> tuple[np.ndarray, np.ndarray]:
@@ -173,7 +186,7 @@ def test_sand_that_starts_elsewhere_ends_elsewhere(transfer: str, steps: int) ->
         assert len(set(partner)) == len(at)
         assert distance.max() < 1e-2 * DX
         assert np.abs(moving - velocity[partner]).max() < 1e-3
-    assert at[:, 0].mean() > (6 + 0.15 * steps / 8) * DX  # it has gone somewhere
+    assert at[:, 0].mean() > (6 + 0.15 * steps / 8) * DX  # the block has moved
 
 
 def test_the_same_in_three_dimensions() -> None:
@@ -203,7 +216,10 @@ def test_the_same_in_three_dimensions() -> None:
 
 
 def test_nothing_is_lost_on_the_way_round() -> None:
-    """A layer that slides on a smooth floor keeps its mass, momentum and height for two rounds."""
+    """Conservation on the way around.
+
+    A layer that slides on a smooth floor keeps its mass, momentum and height for two rounds.
+    """
     count = 8
     simulation = create(
         (count, 8), block([0, 0], [count, 4], count, 0, [1.0, 0.0]), domain={"friction": 0.0}
@@ -219,7 +235,11 @@ def test_nothing_is_lost_on_the_way_round() -> None:
 
 
 def test_a_floor_goes_on_across_the_sides() -> None:
-    """On a slanted floor the sides differ and the scene is refused; on a flat one the layer slides as on the domain's own floor."""
+    """Floor across periodic sides.
+
+    On a slanted floor the sides differ and the scene is refused. On a flat one the layer slides as
+    on the domain's own floor.
+    """
     sand = block([0, 0], [8, 6], 8, 0, [1.0, 0.0])
     flat = {"shape": "box", "min": [-1.0, -1.0], "max": [1.0, 2.5 * DX], "friction": 0.0}
     simulation = create((8, 10), sand, solid=[flat])
@@ -229,7 +249,7 @@ def test_a_floor_goes_on_across_the_sides() -> None:
     assert simulation.particles.count == particles
     assert simulation.particles.velocity.numpy()[:, 0].mean() == pytest.approx(1.0, abs=1e-4)
     assert simulation.particles.position.numpy()[:, 1].min() > 2.5 * DX
-    # that end on the side, or nearer to it than anything may come to a wall
+    # Points on the side, or nearer to it than the margin of a wall.
     points = np.zeros((21, 3), dtype=np.float32)
     points[:, 0], points[:, 1] = (7.5 + np.linspace(-1e-3, 1e-3, 21)) * DX, 6.5 * DX
     position, wind = wp.array(points, dtype=wp.vec3), simulation.grid.faces()

@@ -1,4 +1,7 @@
-"""Friction that grows with the rate of shear, mu(I); the projection of a cell is compared with SciPy's in `test_sand_stress`."""
+"""Rate-dependent friction mu(I).
+
+The projection of a cell is compared with SciPy's in `test_sand_stress`.
+"""
 
 import math
 
@@ -19,7 +22,7 @@ GLASS = {
 
 
 def sand(dimension: int = 2, **tables: object) -> SandScene:
-    """Return a column whose friction grows with the rate."""
+    """Return a column with rate-dependent friction."""
     size, high = [1.0, 0.5, 0.25], [0.375, 0.375, 0.25]
     column = [box([0.0] * dimension, high[:dimension])]
     return scene(
@@ -28,7 +31,11 @@ def sand(dimension: int = 2, **tables: object) -> SandScene:
 
 
 def test_a_layer_runs_as_fast_as_bagnold_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It starts with nine tenths of the speed; were friction the same at any rate, it would run twice as fast by then."""
+    """Speed of a layer by Bagnold's profile.
+
+    It starts with nine tenths of the speed. With constant friction it would run twice as fast by
+    then.
+    """
     monkeypatch.setattr(inclined, "SETS_IN", 0.25)
     monkeypatch.setattr(inclined, "OFF", 0.9)
     angle, tables = 24.0, {"material": {"friction_angle": inclined.STATIC}}
@@ -41,13 +48,17 @@ def test_a_layer_runs_as_fast_as_bagnold_says(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_bagnolds_profile_keeps_the_balance_of_forces() -> None:
-    """The shear stress mu(I) p of its rate of shear is rho g sin(angle) times the depth, at each depth."""
+    """Balance of forces in Bagnold's profile.
+
+    The shear stress mu(I) p of its rate of shear is rho g sin(angle) times the depth, at each
+    depth.
+    """
     angle, d, h = 28.0, inclined.GRAIN, inclined.DEPTH
     y = np.linspace(0.1, 0.8, 8) * h
     rate = (
         inclined.bagnold_profile(y + 1e-6, angle) - inclined.bagnold_profile(y - 1e-6, angle)
     ) / 2e-6
-    # over rho; a grain's density is rho over 0.6
+    # Over rho; the density of a grain is rho over 0.6.
     p = inclined.GRAVITY * math.cos(math.radians(angle)) * (h - y)
     number = rate * d / np.sqrt(0.6 * p)
     static, most = (math.tan(math.radians(a)) for a in (inclined.STATIC, inclined.DYNAMIC))
@@ -61,7 +72,11 @@ def test_bagnolds_profile_keeps_the_balance_of_forces() -> None:
 def test_sand_that_falls_bears_more_than_at_rest_and_no_more_than_its_rate_allows(
     dimension: int,
 ) -> None:
-    """In cells that yield, stress over pressure lies between both slopes; reported is the ratio to the bound of their rate, 1."""
+    """Stress of falling sand: between its bounds at rest and at its rate.
+
+    In cells that yield, stress over pressure lies between both slopes. The reported ratio to the
+    bound of their rate is 1.
+    """
     simulation = create(sand(dimension, solver={"tolerance": 1e-4, "max_iterations": 3000}))
     for _ in range(12):
         row = simulation.step(5e-3)

@@ -1,4 +1,7 @@
-"""Walls rougher than sand: the sand beside them fails, so that what is pushed between them has a way out."""
+"""Walls rougher than sand: the sand beside them fails first.
+
+So sand that is pushed between them can move.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,10 @@ DX, DT, SPEED = 0.05, 0.02, 0.2  # [m], [s], [m/s]
 def pushed(
     friction: float | str, *, depth: int, cohesion: float = 0.0, **more: float
 ) -> tuple[str, float, float]:
-    """Push a column six cells wide up between walls, twice; return the last status, its speed [m/s], the most pressure [rho g dx]."""
+    """Push a column six cells wide up between walls, twice.
+
+    Return the last status, its speed [m/s] and the largest pressure [rho g dx].
+    """
     floor = box(
         [-1.0, -1.0], [2.0, 2 * DX], motion={"kind": "translation", "velocity": [0.0, SPEED]}
     )
@@ -36,23 +42,34 @@ def pushed(
 
 @pytest.mark.parametrize("cohesion", [0.0, 300.0])
 def test_a_piston_lifts_sand_between_walls_that_stick(cohesion: float) -> None:
-    """Coulomb's law alone loads the column by exp(2 mu h / l): the piston went through it, and pressures grew with every step."""
+    """Sand lifted by a piston between rough walls.
+
+    With Coulomb's law alone the load of the column is exp(2 mu h / l): the piston went through it,
+    and pressures grew with every step.
+    """
     status, speed, pressure = pushed("stick", depth=12, cohesion=cohesion)
     assert status == "CONVERGED"
     assert speed == pytest.approx(SPEED, rel=0.01)
     rough = pushed(2.0, depth=12, cohesion=cohesion)
-    # the pressure does not depend on mu above the sand's own friction
+    # The pressure does not depend on mu above the sand's own friction.
     assert pressure == pytest.approx(rough[2], rel=0.05)
 
 
 def test_smoother_walls_bear_what_coulomb_says() -> None:
-    """The bound is the sand's: below its tangent, 0.84, the walls' coefficient counts as ever, and rougher walls load the piston more."""
+    """Load of smoother walls by Coulomb's law.
+
+    The bound is the sand's: below its tangent, 0.84, the walls' coefficient counts, and rougher
+    walls load the piston more.
+    """
     pressures = [pushed(friction, depth=12)[2] for friction in (0.0, 0.4, 0.8, "stick")]
     assert (np.diff(pressures) > 1.0).all()
 
 
 def test_a_rough_floor_holds_sand_that_leans_on_it() -> None:
-    """A wall as rough as sand is not slippery: on a slope below the angle of repose nothing slides."""
+    """Rest on a rough floor.
+
+    On a slope below the angle of repose nothing slides on a wall as rough as sand.
+    """
     tilt = np.radians(25.0)
     tables = {
         "physics": {"gravity": [GRAVITY * np.sin(tilt), -GRAVITY * np.cos(tilt)]},

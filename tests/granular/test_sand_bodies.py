@@ -1,4 +1,4 @@
-"""Rigid bodies in sand: what floats, what sinks, what slides, what the sand below bears."""
+"""Rigid bodies in sand: floating, sinking, sliding, and the load below."""
 
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,10 @@ def start(
 
     Args:
         solids: the tables [[solid]].
-        size: of the domain [m].
-        depth: of the bed [m].
+        size: size of the domain [m].
+        depth: depth of the bed [m].
         resolution: cells along the longest side.
-        tables: other tables of the scene.
+        tables: further tables of the scene.
     """
     flat = len(size) == 2
     bed = {"shape": "box", "min": [0.0] * len(size), "max": [size[0], depth, *size[2:]]}
@@ -45,7 +45,7 @@ def start(
 
 
 def run(simulation: SandSimulation, until: float) -> list[dict[str, Any]]:
-    """Step to a time [s], return the log."""
+    """Step to a time [s] and return the log."""
     rows: list[dict[str, Any]] = []
     while simulation.time < until - 1e-9:
         rows.append(
@@ -70,7 +70,11 @@ def height(simulation: SandSimulation) -> float:
 
 
 def test_a_light_ball_stays_on_top_and_a_heavy_one_digs_in_and_stops() -> None:
-    """A fifth of sand's density leaves a shallow dent; five times as dense, it sinks by most of its radius, and then stands."""
+    """Light and heavy ball on sand.
+
+    At a fifth of sand's density it leaves a shallow dent; at five times the density it sinks by
+    most of its radius and then stops.
+    """
     depths, speeds = [], []
     for density in (0.2 * DENSITY, 5.0 * DENSITY):
         sand = {"friction_angle": 26.565}  # sand of 30 degrees bears twice as much
@@ -92,7 +96,11 @@ def test_a_light_ball_stays_on_top_and_a_heavy_one_digs_in_and_stops() -> None:
 
 
 def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
-    """A block on smooth-walled sand stays where it is, and the floor's pressure is the weight of sand and block."""
+    """Loads of a block on sand and of both on the floor.
+
+    A block on smooth-walled sand stays in place, and the floor's pressure is the weight of sand and
+    block.
+    """
     loads, forces, simulations = [], [], []
     for solids in ([box([0.2, 0.2], [0.4, 0.3], 2.0 * DENSITY, friction=0.5)], []):
         simulation = start(
@@ -102,7 +110,7 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
         floor, given = [], []
         for _ in range(20):
             simulation.step(simulation.scene.time.dt_max)
-            # on the floor lies p - s_yy = p + a
+            # The load on the floor is p - s_yy = p + a.
             pressure, deviator = simulation.stress.now.numpy()[:2, 1, 1, 1:-1]
             floor.append(
                 (pressure + deviator).sum()
@@ -117,7 +125,7 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
         simulations.append(simulation)
     weight = 2.0 * DENSITY * 0.2 * 0.1 * G
     assert loads[0] - loads[1] == pytest.approx(weight, rel=0.05)
-    # but for the half cell below the stresses
+    # Without the half cell below the stresses.
     assert loads[1] == pytest.approx(DENSITY * 0.6 * 0.2 * G, rel=0.05)
     np.testing.assert_allclose(forces[0][:2], [0.0, weight], atol=0.01 * weight)
     assert abs(forces[0][2]) < 0.001 * weight * 0.2
@@ -133,7 +141,10 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.25, 0.7])
 def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float) -> None:
-    """On 25 degrees it speeds up by g (sin - mu cos), or stays where friction is more than the slope."""
+    """Block on a slope of firm sand, by Coulomb's law.
+
+    On 25 degrees it accelerates by g (sin - mu cos), or stays where friction exceeds the slope.
+    """
     slope = np.radians(25.0)
     gravity = [G * float(np.sin(slope)), -G * float(np.cos(slope))]
     block = box([0.1, 0.15], [0.4, 0.25], DENSITY, friction=friction)
@@ -158,7 +169,10 @@ def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float)
 
 
 def test_densities_from_a_thousandth_of_sands_to_a_thousand_times_it() -> None:
-    """A ball half sunk needs about as many iterations as a solid that stands there, however light; none is thrown about."""
+    """Density ratios from 1e-3 to 1e3.
+
+    A ball half sunk needs about as many iterations as a fixed solid, however light; none is thrown.
+    """
     iterations, sunk = {}, {}
     for ratio in (None, 1e-3, 1.0, 1e3):
         solid = ball([0.3, 0.2], 0.06, DENSITY * (ratio or 1.0))
@@ -176,7 +190,10 @@ def test_densities_from_a_thousandth_of_sands_to_a_thousand_times_it() -> None:
 
 
 def test_momentum_of_sand_and_body_without_gravity() -> None:
-    """A block of sand that flies into a body in the open gives it what it loses."""
+    """Momentum of sand and body without gravity.
+
+    A block of sand that flies into a free body gives it the momentum that it loses.
+    """
     target = ball([0.42, 0.2], 0.06, DENSITY)
     simulation = start(
         [target],
@@ -201,7 +218,7 @@ def test_momentum_of_sand_and_body_without_gravity() -> None:
 
 
 def test_three_dimensions() -> None:
-    """A light ball rests on sand in 3-D; one pushed sideways rolls forward."""
+    """Bodies in 3-D: a light ball rests on sand, a pushed one rolls forward."""
     simulation = start(
         [ball([0.12, 0.128, 0.1], 0.05, 400.0, velocity=[0.5, 0.0, 0.0], friction=0.8)],
         size=[0.3, 0.2, 0.2],
@@ -224,7 +241,7 @@ def test_three_dimensions() -> None:
 
 
 def test_continues_bit_for_bit() -> None:
-    """A state restored into a fresh simulation goes on as if nothing had happened."""
+    """Resumed simulation, equal bit for bit."""
     solids = [ball([0.3, 0.26], 0.05, 3000.0), box([0.4, 0.21], [0.5, 0.28], 500.0)]
 
     def make() -> SandSimulation:
@@ -243,7 +260,10 @@ def test_continues_bit_for_bit() -> None:
 
 
 def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step whose stresses are not finite gives the bodies neither gravity nor a push."""
+    """Failed solve: bodies get neither gravity nor an impulse.
+
+    The stresses of the step are not finite.
+    """
     simulation = start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
     simulation.step(0.004)
     assert simulation.bodies is not None
@@ -255,7 +275,7 @@ def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.Mo
 
 
 class Misses:
-    """In the place of a solve: stresses that leave a residual."""
+    """Replacement of a solve with stresses that leave a residual."""
 
     def __init__(self, stress: Stress, residual: float) -> None:
         self.stress, self.residual = stress, residual
@@ -279,7 +299,11 @@ class Misses:
 def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The next try is that of a simulation that never failed, bit for bit; stresses that are a little off are taken."""
+    """Retry of a step with a large residual of the stresses.
+
+    The retry is that of a simulation that never failed, bit for bit. Stresses with a small residual
+    are accepted.
+    """
     twins = [
         start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
         for _ in range(2)
@@ -317,7 +341,7 @@ def test_scenes_that_bodies_do_not_go_with(table: dict[str, Any], key: str) -> N
 
 @pytest.mark.parametrize("name", ["balls-on-sand-2d", "carried-box-2d"])
 def test_built_in_scenes(name: str) -> None:
-    """They start, and bodies fall as freely as they should."""
+    """Built-in scenes: they start, and bodies are in free fall."""
     scene = load_scene(name)
     simulation = GranularSimulator().create(scene, device="cpu", folder=Path())
     rows = [simulation.step(0.004) for _ in range(3)]

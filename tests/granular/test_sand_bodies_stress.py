@@ -1,4 +1,7 @@
-"""What sand's stresses do to rigid bodies: third law, signs, and the coupled solve from light bodies to heavy ones."""
+"""Stresses of sand on rigid bodies.
+
+Third law, signs, and the coupled solve from light to heavy bodies.
+"""
 
 from dataclasses import dataclass
 
@@ -34,7 +37,7 @@ class Case:
         return self.packing.grid.dimension
 
     def begin(self, velocity: np.ndarray, inverse_mass: np.ndarray) -> None:
-        """Start a step of the bodies in sand that falls."""
+        """Start a step of the bodies in falling sand."""
         assert self.bodies is not None
         fields = [
             wp.full(self.packing.grid.shape, float(g * DT), dtype=wp.float32)
@@ -65,16 +68,18 @@ def make(
     sand: tuple[int, int] | None = None,
     friction: float = FRICTION,
 ) -> Case:
-    """Return sand of a depth [cells] around blocks of a density ratio; None: they stand still.
+    """Return sand of a depth [cells] around blocks of a density ratio.
+
+    The blocks are fixed if the ratio is None.
 
     Args:
         dimension: 2 or 3.
         counts: cells along x, y (and z).
         blocks: first and one past the last cell (x, y, z) of each, counted from 0.
-        ratio: of the blocks' density to sand's.
+        ratio: ratio of the blocks' density to sand's.
         depth: rows of sand.
-        sand: first and one past the last column that holds sand; None: all.
-        friction: of all walls.
+        sand: first and one past the last column with sand; None for all.
+        friction: friction of all walls.
     """
     grid = StaggeredGrid((*counts, 1)[:3], DX, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)
@@ -125,7 +130,7 @@ def make(
 
 
 def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
-    """Return where the lower faces of an axis are [m], shape (*grid.shape, 3)."""
+    """Return the centers of the lower faces of an axis [m], shape (*grid.shape, 3)."""
     k, j, i = np.indices(grid.shape)
     place = np.stack([i, j, k], axis=-1) - 0.5
     place[..., axis] -= 0.5
@@ -135,7 +140,7 @@ def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
 
 
 def beside_bodies(case: Case, axis: int) -> np.ndarray:
-    """Return which faces of an axis are bodies', shape of the grid's fields."""
+    """Return which faces of an axis belong to bodies, shape of the grid's fields."""
     assert case.bodies is not None and case.bodies.faces is not None
     found, faces = np.zeros(case.packing.grid.size, dtype=bool), case.bodies.faces
     found[faces.face.at[faces.face.axis == axis]] = True
@@ -144,7 +149,11 @@ def beside_bodies(case: Case, axis: int) -> np.ndarray:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
-    """Momentum and angular momentum of sand and two bodies stay what they are under any stresses that reach no wall."""
+    """Momentum that a body gets and sand loses.
+
+    Momentum and angular momentum of sand and two bodies stay constant under any stresses that reach
+    no wall.
+    """
     third = (10,) * (dimension - 2)
     low, high = ((3, 3, 4), (5, 6, 6)), ((5, 5, 3), (8, 7, 6))
     flat = [
@@ -162,13 +171,13 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
     case.stress.now.assign(values)
     case.stress.residual()
     assert case.bodies is not None
-    # as the grid's momenta, in units of a full face's mass
+    # As momenta of the grid, in units of a full face's mass.
     given = case.bodies.impulses() / (DENSITY * grid.cell_volume)
     assert (np.abs(given) > 1e-4).all()  # [m/s, m^2/s]: both bodies are pushed and turned
     push, turn = np.zeros(3), np.zeros(3)
     for axis, u in enumerate(case.stress.checked.u):
         free, mass = case.packing.inverse[axis].numpy() > 0.0, case.packing.mass[axis].numpy()
-        # half a cell before a body moves with it
+        # Half a cell before a body moves with it.
         gained = (u.numpy() - GRAVITY[axis] * DT) * np.where(free, mass, 0.5 * mass)
         gained[~(free | beside_bodies(case, axis))] = 0.0
         push[axis] = gained.sum()
@@ -180,14 +189,17 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
         force[:dimension] = given[number, :dimension]
         torque[(3 - (1 if dimension == 2 else 3)) :] = given[number, dimension:]
         push, turn = push + force, turn + torque + np.cross(center, force)
-    # sums of float32 masses
+    # Sums of float32 masses.
     assert np.abs(push).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
     assert np.abs(turn).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_pressure_pushes_away_and_off_center_pressure_turns(dimension: int) -> None:
-    """A pressure below a block pushes it up; one to the right of its center turns it to the left."""
+    """Direction of the pressure's force and torque.
+
+    A pressure below a block pushes it up; one to the right of its center turns it to the left.
+    """
     third = (9,) * (dimension - 2)
     case = make(
         dimension,
@@ -197,12 +209,12 @@ def test_pressure_pushes_away_and_off_center_pressure_turns(dimension: int) -> N
         depth=9,
     )
     now = np.zeros_like(case.stress.now.numpy())
-    # the cell below the block's right end, one plane of three
+    # The cell below the block's right end, one plane of three.
     now[0, 1 if dimension == 2 else 5, 4, 8] = 0.2
     case.stress.now.assign(now)
     case.stress.residual()
     assert case.bodies is not None
-    # half a cell of sand before each face of the block moves along with it
+    # Half a cell of sand before each face of the block moves with it.
     size = np.array([5.0, 2.0, 3.0])[:dimension]
     mass = np.prod(size) + np.prod(size) / size[1]
     velocity = case.bodies.velocity.numpy()[0]
@@ -214,7 +226,11 @@ def test_pressure_pushes_away_and_off_center_pressure_turns(dimension: int) -> N
 
 
 def test_sand_that_slides_over_a_plate_takes_it_along() -> None:
-    """Friction carries a plate that a smooth floor holds up the way the sand on it goes, by no more than Coulomb allows."""
+    """Friction on a plate below sliding sand.
+
+    A smooth floor holds the plate up. It accelerates in the direction of the sand, within Coulomb's
+    bound.
+    """
     case = make(2, (32, 8), [((3, 0, 0), (29, 2, 1))], ratio=1.0, depth=5, sand=(6, 26))
     speed, start = 3.0 * SCALE, case.packing.start[0].numpy().copy()
     start[case.packing.inverse[0].numpy() > 0.0] = speed
@@ -226,7 +242,7 @@ def test_sand_that_slides_over_a_plate_takes_it_along() -> None:
     vx, vy, spin = case.bodies.velocity.numpy()[0]
     push, load, turn = case.bodies.impulses()[0] / (DENSITY * DX**2)
     assert vx > 0.05 * SCALE and vy == spin == 0.0
-    # the weight of the sand on it, in units of a cell's
+    # Weight of the sand on the plate, in units of a cell's.
     assert -load == pytest.approx(20 * 3 * SCALE, rel=0.1)
     assert FRICTION * -load * 0.95 < push < FRICTION * -load * 21 / 20  # 20 faces have 21 edges
     assert turn < 0.0
@@ -234,7 +250,10 @@ def test_sand_that_slides_over_a_plate_takes_it_along() -> None:
 
 @pytest.mark.parametrize("ratio", [1e-3, 0.05, 1.0])
 def test_number_of_iterations_does_not_depend_on_lightness(ratio: int) -> None:
-    """A block half in the sand comes to rest in nearly the iterations that one that stands still takes."""
+    """Iterations for light bodies: nearly those of a fixed block.
+
+    The block is half in the sand and comes to rest.
+    """
     blocks = [((11, 6, 0), (17, 12, 1))]
     still = make(2, (28, 20), blocks, ratio=None, depth=9).solve()
     case = make(2, (28, 20), blocks, ratio=ratio, depth=9)
@@ -249,7 +268,10 @@ def test_number_of_iterations_does_not_depend_on_lightness(ratio: int) -> None:
 
 
 def test_velocity_is_what_the_impulse_leaves_and_sand_sees_it() -> None:
-    """After a solve V = V* + M^-1 impulse, and the faces beside the body have it."""
+    """Velocity after a solve: V = V* + M^-1 impulse.
+
+    The faces beside the body have it.
+    """
     case = make(2, (28, 20), [((11, 6, 0), (17, 12, 1))], ratio=40.0, depth=9)
     case.solve()
     assert case.bodies is not None
@@ -264,7 +286,11 @@ def test_velocity_is_what_the_impulse_leaves_and_sand_sees_it() -> None:
 
 
 def test_two_light_bodies_in_touch_through_sand() -> None:
-    """Light blocks one cell of sand apart, and under a heavier one: trial steps that ignored either would diverge."""
+    """Two light bodies that interact through sand.
+
+    Light blocks one cell of sand apart, and under a heavier one: trial steps that ignored either
+    would diverge.
+    """
     case = make(
         2,
         (30, 22),
@@ -279,7 +305,10 @@ def test_two_light_bodies_in_touch_through_sand() -> None:
 
 
 def test_bodies_far_from_sand_and_outside_change_nothing() -> None:
-    """A body in the air falls; one that is nowhere in the grid takes no part."""
+    """Bodies far from sand, and outside of the grid.
+
+    A body in the air falls; one outside of the grid has no effect.
+    """
     case = make(2, (28, 24), [((11, 17, 0), (17, 21, 1))], ratio=0.1, depth=9)
     case.solve()
     assert case.bodies is not None
@@ -296,7 +325,11 @@ def test_bodies_far_from_sand_and_outside_change_nothing() -> None:
 
 
 def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodies_matrix() -> None:
-    """Pressure and velocity are those of y = b + (A + R W R') x, built here face by face and solved by Lemke's method."""
+    """Linear complementarity problem without friction, with the bodies' matrix.
+
+    Pressure and velocity are those of y = b + (A + R W R') x, built here face by face and solved by
+    Lemke's method.
+    """
     case = make(2, (7, 6), [((2, 1, 0), (5, 3, 1))], ratio=2.5, depth=4, friction=0.0)
     packing, bodies = case.packing, case.bodies
     assert bodies is not None
@@ -314,7 +347,7 @@ def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodi
         DENSITY * DX**2
     )
     momentum = body @ [0.0, -SCALE, 0.0]
-    # of the pressure's velocity, of the start's, of the body's
+    # Of the pressure's velocity, of the initial one, of the body's.
     div, b, rows = np.zeros((n, n)), np.zeros(n), np.zeros((n, 3))
     for c in cells:
         for axis in range(2):
@@ -357,7 +390,11 @@ def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodi
 
 
 def test_a_step_is_implicit_in_the_bodies_velocity(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With enough trial steps, the stresses of a step leave the bodies the very velocity that the step was taken with."""
+    """Implicit velocity of the bodies in a step.
+
+    With enough trial steps, the stresses of a step give the bodies the velocity that the step
+    assumed.
+    """
     left = []
     for rounds in (1, 60):
         monkeypatch.setattr("warp_lcp.granular.bodies.ROUNDS", rounds)

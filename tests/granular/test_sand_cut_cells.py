@@ -1,4 +1,7 @@
-"""Solids that cut cells for the stresses of sand: their forces, the friction of their surfaces, and sand that slides and rests on them."""
+"""Solids that cut cells, for the stresses of sand.
+
+Forces, friction of their surfaces, and sand that slides and rests on them.
+"""
 
 import math
 from pathlib import Path
@@ -33,7 +36,7 @@ CASES = [(dimension, number) for dimension, tilts in TILTS.items() for number in
 
 
 class Case:
-    """A grid full of sand on one side of a plane, gravity toward the plane."""
+    """Grid full of sand on one side of a plane, gravity toward the plane."""
 
     def __init__(
         self,
@@ -93,12 +96,15 @@ class Case:
 
 
 def along(values: np.ndarray, axis: int, by: int) -> np.ndarray:
-    """Return the values of the cell that many cells on along an axis."""
+    """Return the values of the cell `by` cells further along an axis."""
     return np.roll(values, -by, axis=2 - axis)
 
 
 def test_openings_are_those_of_the_plane() -> None:
-    """Volumes and walls against a count of points of the true half space."""
+    """Open fractions of a plane.
+
+    Volumes and walls against a count of points of the true half space.
+    """
     case = Case(2, TILTS[2][0])
     volume, points = case.walls.volume.numpy()[1], (np.arange(200) + 0.5) / 200
     for j in range(1, case.grid.counts[1] + 1):
@@ -111,13 +117,17 @@ def test_openings_are_those_of_the_plane() -> None:
     assert case.walls.normal == pytest.approx(
         np.tile(-case.normal, (case.walls.count, 1)), abs=2e-3
     )
-    columns = case.walls.area * case.normal[1]  # what a wall covers of the ground
+    columns = case.walls.area * case.normal[1]  # horizontal area of the walls
     assert columns.sum() == pytest.approx(case.grid.counts[0], abs=0.01)
 
 
 @pytest.mark.parametrize(("dimension", "number"), CASES)
 def test_forces_are_the_adjoint_of_what_they_work_on(dimension: int, number: int) -> None:
-    """For any stresses and any velocity v: sum of mass v (u - u*) is minus the power of the stresses in v, written out anew."""
+    """Forces as the adjoint of the rate of strain.
+
+    For any stresses and any velocity v: sum of mass v (u - u*) is minus the power of the stresses
+    in v, written out independently.
+    """
     case = Case(dimension, TILTS[dimension][number])
     shape, random = case.grid.shape, case.random
     case.begin([random.normal(size=shape) for _ in range(dimension)], np.zeros(3))
@@ -141,11 +151,11 @@ def test_forces_are_the_adjoint_of_what_they_work_on(dimension: int, number: int
     for axis in range(dimension):
         low, high = case.openings[axis], along(case.openings[axis], axis, 1)
         ahead = along(v[axis], axis, 1)
-        # pressure: what flows out of the open part
+        # Pressure: the outflow of the open part.
         power += float((now[0] * (high * ahead - low * v[axis])).sum())
         part = (now[1] if axis == 0 else -now[1]) if dimension == 2 else now[1 + axis]
         power -= float((part * case.openings[dimension + axis] * (ahead - v[axis])).sum())
-        # traction: the slip along the wall
+        # Traction: the slip along the wall.
         power += float((now[len(now) - dimension + axis] * (low * v[axis] + high * ahead)).sum())
     for d, (alpha, beta) in enumerate(SHEARS[dimension]):
         rate = v[alpha] - along(v[alpha], beta, -1) + v[beta] - along(v[beta], alpha, -1)
@@ -158,7 +168,10 @@ def test_forces_are_the_adjoint_of_what_they_work_on(dimension: int, number: int
 
 @pytest.mark.parametrize(("dimension", "number"), CASES)
 def test_sliding_along_the_wall_strains_nothing(dimension: int, number: int) -> None:
-    """Neither pressure nor friction has anything to do, but for the wall's: a smooth one lets sand pass."""
+    """No strain of sliding along the wall.
+
+    Pressure and friction vanish, except the wall's: a smooth wall lets sand pass.
+    """
     case = Case(dimension, TILTS[dimension][number], mu=0.0)
     along_wall = np.cross(case.normal, [0.3, 0.4, 1.0] if dimension == 3 else [0.0, 0.0, 1.0])
     case.begin([np.full(case.grid.shape, u) for u in along_wall[:dimension]], np.zeros(3))
@@ -185,7 +198,11 @@ def test_sliding_along_the_wall_strains_nothing(dimension: int, number: int) -> 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
-    """A stiff block, clear of the domain's walls, slips on a plane: its momentum goes into the wall, by Coulomb's law in every cell."""
+    """Momentum that sand loses and the wall gets.
+
+    A stiff block, away from the domain's walls, slides on a plane. Its momentum goes into the wall,
+    by Coulomb's law in every cell.
+    """
     case = Case(dimension, TILTS[dimension][0], mu=0.2, cells=9)
     gravity = np.array([0.0, -G, 0.0])
     filled = np.zeros(case.grid.shape)
@@ -231,7 +248,11 @@ def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
 
 
 def test_a_liquid_at_rest_presses_by_its_depth() -> None:
-    """Without friction the pressure is that of the depth in every cell that a plane cuts, however little of it is left."""
+    """Hydrostatic pressure of a liquid at rest.
+
+    Without friction the pressure is that of the depth in every cell that a plane cuts, however
+    small its open part is.
+    """
     case = Case(2, TILTS[2][0], mu=0.0, k=0.0, cells=9)
     gravity = np.array([0.0, -G, 0.0])
     case.begin([np.full(case.grid.shape, g * DT) for g in gravity[:2]], gravity)
@@ -247,7 +268,10 @@ def test_a_liquid_at_rest_presses_by_its_depth() -> None:
 def on_plane(
     theta: float, mu: Any, *, cells: int, cuts: bool = True, shift: float = 0.0
 ) -> tuple[SandSimulation, np.ndarray]:
-    """Return a block of stiff sand on a plane that falls by theta degrees, and the direction down."""
+    """Return a block of stiff sand on a plane, and the downhill direction.
+
+    The plane falls by theta degrees.
+    """
     depth, t = 0.1, math.radians(theta)
     dx = depth / cells
     down, up = np.array([math.cos(t), -math.sin(t)]), np.array([math.sin(t), math.cos(t)])
@@ -282,7 +306,7 @@ def on_plane(
 
 
 def whole(simulation: SandSimulation) -> SandSimulation:
-    """Return it with solids that are whole cells for the stresses, as the control."""
+    """Return the simulation with solids of whole cells for the stresses, the control."""
     scene = simulation.scene
     solids = SandSolids(
         simulation.grid, simulation.boundary.cut.solids, simulation.boundary, scene.wall_frictions()
@@ -314,7 +338,11 @@ def test_a_block_slides_on_an_oblique_plane_as_coulomb_says(
 
 
 def test_slits_bear_nothing() -> None:
-    """A cell here is open by 2e-3 of one of its faces: a pressure of 8,000 cells' depth used to hold the block back there, unsolved."""
+    """Slits without a load.
+
+    A cell here is open by 2e-3 of one of its faces. A pressure of 8,000 cells' depth held the block
+    back there, with an unsolved problem.
+    """
     t, mu = math.radians(10.3), 0.09
     assert inclined.acceleration(10.3, mu, 11, shift=0.47) == pytest.approx(
         G * (math.sin(t) - mu * math.cos(t)), abs=0.02 * G * math.sin(t)
@@ -322,7 +350,7 @@ def test_slits_bear_nothing() -> None:
 
 
 def test_whole_cells_hold_the_block() -> None:
-    """The control: stairs."""
+    """Block held by the stairs of whole cells, the control."""
     assert acceleration(*on_plane(20.0, 0.2, cells=6, cuts=False)) < 0.1
 
 
@@ -332,7 +360,11 @@ def test_a_block_rests_where_friction_holds_it(mu: Any) -> None:
 
 
 def test_solids_of_whole_cells_stay_so() -> None:
-    """Boxes on the grid's lines need no cut; a diagonal through its corners opens or closes every face, but is no box."""
+    """Solids of whole cells remain whole.
+
+    Boxes on the grid's lines need no cut. A diagonal through cell corners opens or closes every
+    face, but is no box.
+    """
     grid = StaggeredGrid((8, 8, 1), 0.125, 2)
 
     def cut(normal: list[float], point: list[float]) -> CutCells:

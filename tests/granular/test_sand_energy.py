@@ -1,4 +1,7 @@
-"""What friction takes, and the pattern that takes nothing, against the forces on the faces."""
+"""Dissipation of friction, and a pattern without dissipation.
+
+They are compared with the forces on the faces.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +19,10 @@ from warp_lcp.operators.grid_poisson import SOLID
 
 
 def without_trace(case: Case) -> np.ndarray:
-    """Return the stresses with a deviator that is one: normal parts that add up to 0 (in 2-D they do by themselves)."""
+    """Return the stresses with a traceless deviator.
+
+    In 2-D it is always traceless.
+    """
     now = case.stress.now.numpy()
     if case.dimension == 3:
         now[1:4] -= now[1:4].mean(axis=0)
@@ -26,7 +32,10 @@ def without_trace(case: Case) -> np.ndarray:
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", [11, 12])
 def test_dissipation_is_the_power_of_friction(dimension: int, seed: int) -> None:
-    """Sum of s : grad u = - sum over faces of u . div s: a wrong sign, axis or weight in either would part them."""
+    """Dissipation as the power of friction.
+
+    Sum of s : grad u = - sum over faces of u . div s. A wrong sign, axis or weight in either shows.
+    """
     case = make(dimension, seed)
     now = without_trace(case)
     case.stress.now.assign(now)
@@ -50,7 +59,11 @@ def test_dissipation_is_the_power_of_friction(dimension: int, seed: int) -> None
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
-    """Taking the pattern from the pressure and giving it to the shears leaves the velocity of faces amid sand: other signs would not."""
+    """Damped checkerboard without motion.
+
+    Moving the pattern from the pressure to the shears leaves the velocity of inner faces unchanged;
+    other signs would not.
+    """
     grid = StaggeredGrid((10, 10, 10 if dimension == 3 else 1), 0.1, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)
     index[1:-1, 1:-1, 1:-1] = -1
@@ -77,14 +90,18 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     taken = start[0][deep] - stress.now.numpy()[0][deep]
     np.testing.assert_allclose(taken, DAMPED * 0.5 * checkers[deep], rtol=1e-4)
     for old, field in zip(before, stress.checked.u, strict=True):
-        # the checkerboard pushes each face by twice its height
+        # The checkerboard pushes each face by twice its height.
         assert np.abs(old[deep]).max() > 0.9
         np.testing.assert_allclose(field.numpy()[deep], old[deep], atol=1e-5)
 
 
 @pytest.mark.parametrize("until", [5e-3, 0.2])
 def test_crowded_sand_gains_no_energy_in_a_step_of_any_length(until: float) -> None:
-    """A falling block packs a jittered bed; what emptied its over-full cells within the step made 1e3 times the energy in 1e-6 s."""
+    """Energy of dense sand in steps of any length.
+
+    A falling block compresses a jittered bed. Emptying over-full cells within the step made 1e3
+    times the energy in 1e-6 s.
+    """
     blocks = [box([0.0, 0.0], [1.0, 0.3]), box([0.3, 0.5], [0.6, 0.8], velocity=[0.0, -2.0])]
     simulation = create(
         scene(size=[1.0, 1.0], resolution=24, sand=blocks, friction=0.5, particles={"jitter": 1.0})
@@ -96,7 +113,11 @@ def test_crowded_sand_gains_no_energy_in_a_step_of_any_length(until: float) -> N
 
 
 def test_walls_hold_sand_up() -> None:
-    """A silo's walls bear some of what lies between them: sand that pushed itself apart hung on them, and weighed more than it has mass."""
+    """Sand held up by walls.
+
+    A silo's walls bear a part of the sand. Sand that expanded hung on them, and weighed more than
+    its mass.
+    """
     simulation = create(
         scene(
             size=[0.2, 1.0],
@@ -110,7 +131,7 @@ def test_walls_hold_sand_up() -> None:
     depth = 0.9 - (np.arange(60) + 0.5) / 60
     vertical = simulation.stress.now.numpy()[:2, 1, 1:-1, 1:-1].sum(axis=0).mean(axis=1)  # x - s_yy
     load = vertical * simulation.grid.spacing / (simulation.stress.kick_dt * 9.81)
-    # Janssen (1895), K = 1/3 .. 1: 0.73 .. 0.49 and 0.55 .. 0.25 of the weight
+    # Janssen (1895), K = 1/3 .. 1: 0.73 .. 0.49 and 0.55 .. 0.25 of the weight.
     for below, most in ((0.4, 0.75), (0.8, 0.55)):
         row = int((0.9 - below) * 60)
         assert load[row - 2 : row + 3].mean() < most * depth[row]

@@ -1,4 +1,7 @@
-"""Wedges of sand that must stand, and how heaps are measured; heaps at all resolutions are in the suite `validation`."""
+"""Stable wedges of sand, and the measurement of heaps.
+
+Heaps at all resolutions are in the suite `validation`.
+"""
 
 import math
 
@@ -8,11 +11,14 @@ import pytest
 from warp_lcp.benchmarks.validation import sand_heap
 from warp_lcp.benchmarks.validation.scenes import positions, steps
 
-CELLS, STANDS = 40, 0.5  # cells of length; [s]
+CELLS, STANDS = 40, 0.5  # cells of the length; [s]
 
 
 def sinks(friction_angle: float, duration: float = STANDS) -> tuple[float, float]:
-    """Return what a wedge of 27 degrees loses of its height and of its center's."""
+    """Return the relative loss of height, total and of the center, of a wedge.
+
+    The wedge has 27 degrees.
+    """
     simulation = sand_heap.cut_wedge(CELLS, 27.0, material={"friction_angle": friction_angle})
     top, center = sand_heap.height(simulation), positions(simulation)[:, 1].mean()
     for _ in steps(simulation, duration):
@@ -23,7 +29,11 @@ def sinks(friction_angle: float, duration: float = STANDS) -> tuple[float, float
 
 
 def test_a_wedge_flatter_than_a_layer_that_stops_stands() -> None:
-    """Were partly filled cells beside air no part of the pressure's problem, its center would sink by 5 % in a second."""
+    """Rest of a wedge flatter than a layer that stops.
+
+    If partly filled cells beside air were no part of the pressure problem, its center would sink by
+    5 % in a second.
+    """
     top, center = sinks(30.0)
     assert top < sand_heap.SHRINKS
     assert center < 0.015  # loose grains of the cut surface settle once

@@ -1,4 +1,7 @@
-"""Sand that touches nothing goes along its parabola, whatever the steps; sand that touches something is left to its stresses."""
+"""Airborne sand: parabolas, whatever the steps.
+
+Sand in contact is left to its stresses.
+"""
 
 from typing import Any
 
@@ -15,7 +18,7 @@ BODY = {"density": 800.0}
 def thrown(
     dimension: int, cells: int, cfl: float, *, spin: float = 0.0, **tables: Any
 ) -> SandSimulation:
-    """Return a block of sand in flight, which turns about z at `spin` [1/s]."""
+    """Return a block of sand in flight that turns about z at `spin` [1/s]."""
     low, high, velocity = [0.6, 1.0, 0.9], [1.0, 1.3, 1.2], [1.0, 1.5, -0.5]
     sand = [box(low[:dimension], high[:dimension], velocity=velocity[:dimension])]
     simulation = create(
@@ -38,7 +41,11 @@ def thrown(
 def test_thrown_sand_goes_along_its_parabola(
     dimension: int, cells: int, cfl: float, spin: float
 ) -> None:
-    """Its center to 1e-4 of its way (it was up to 8e-2 off), its turning likewise, and no grain is pushed by grains in flight with it."""
+    """Parabola of thrown sand.
+
+    Its center is exact to 1e-4 of its way (it was up to 8e-2 off), its rotation likewise, and no
+    grain is pushed by others in flight with it.
+    """
     simulation = thrown(dimension, cells, cfl, spin=spin)
 
     def measured() -> tuple[np.ndarray, np.ndarray, float]:
@@ -63,7 +70,11 @@ def test_thrown_sand_goes_along_its_parabola(
 
 
 def test_sand_that_touches_a_wall_or_a_body_is_not_in_flight() -> None:
-    """Sand on a floor, on a body in free fall, and that comes down on the floor in the step: the same bits as without the law."""
+    """Sand in contact with a wall or a body is not airborne.
+
+    Sand on a floor, on a body in free fall, and sand that lands in the step: the same bits as
+    without conservation.
+    """
     crate = box([0.2, 0.5], [0.6, 0.7]) | BODY
     cases = [
         {"sand": [box([0.0, 0.0], [0.5, 0.3])]},
@@ -85,7 +96,10 @@ def test_sand_that_touches_a_wall_or_a_body_is_not_in_flight() -> None:
 
 
 def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
-    """A block over a heap: what lies stays with the stresses' result, the block falls as a stone does."""
+    """Conservation for airborne sand alone.
+
+    A block over a heap: the heap keeps the result of the stresses, the block falls rigidly.
+    """
     sand = [box([0.0, 0.0], [1.0, 0.25]), box([0.4, 0.6], [0.6, 0.75], velocity=[0.5, 0.0])]
     kept, left = (create(scene(size=[1.0, 1.0], resolution=32, sand=sand)) for _ in range(2))
     left.flights = None
@@ -96,7 +110,7 @@ def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
     low = x[:, 1] < 0.4
     np.testing.assert_array_equal(x[low], left.particles.position.numpy()[low])
     np.testing.assert_allclose(velocity[~low].mean(axis=0), [0.5, -0.025 * GRAVITY, 0.0], atol=1e-6)
-    # the root of what rounding makes of energies
+    # The root of the rounding error of energies.
     assert np.abs(velocity[~low] - velocity[~low].mean(axis=0)).max() < 1e-3
 
 

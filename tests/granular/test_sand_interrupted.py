@@ -1,4 +1,7 @@
-"""A run of sand that is interrupted and resumed writes the same bytes as one that is not; a state holds all that matters."""
+"""Interrupted and resumed runs of sand: same bytes as uninterrupted ones.
+
+A state holds all relevant data.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,7 @@ DISC = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
 
 
 class Silent:
-    """An observer that counts steps."""
+    """Observer that counts steps."""
 
     def __init__(self) -> None:
         self.steps = 0
@@ -82,7 +85,7 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
     [
         (2, {}),
         (2, {"friction_model": "box"}),
-        # a simulation that is made where the solid is not any more
+        # A simulation that is created after the solid has moved away.
         (2, {"solid": [SLIDER], "density_correction": {}}),
         (2, {"solver": {"method": "interleaved-sweeps", "max_iterations": 60}}),
         (
@@ -100,7 +103,10 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
 def test_nothing_but_the_state_of_sand_is_remembered(
     dimension: int, tables: dict[str, Any]
 ) -> None:
-    """A fresh simulation takes the same step from any state: fields hold nothing of where the sand was before."""
+    """Equal steps of a fresh simulation from any state.
+
+    Fields hold nothing of earlier positions of the sand.
+    """
     tables = dict(tables)
     if "friction_model" in tables:
         tables["friction"] = 0.4
@@ -116,7 +122,7 @@ def test_nothing_but_the_state_of_sand_is_remembered(
         scene(size=[1.0] * dimension, resolution=24 if dimension == 2 else 12, sand=sand, **tables)
     )
     for number in range(12):
-        if number == 8:  # the window jumps and shrinks
+        if number == 8:  # the window moves and shrinks
             position = old.particles.position.numpy().copy()
             position[:, 1] = 0.6 * position[:, 1] + 0.01
             old.particles.position.assign(position)
@@ -148,7 +154,11 @@ def test_a_frame_after_restoring_is_that_before() -> None:
 
 
 def test_sand_goes_on_another_grid() -> None:
-    """Twice the cells along an axis, as many particles a cell, the same mass within the sampling, solids where they are now."""
+    """Sand resumed on another grid.
+
+    It has twice the cells along an axis, as many particles per cell, the same mass within the
+    sampling, and solids at their current places.
+    """
     tables = {"solid": [SLIDER], "solver": {"max_iterations": 60}}
     sand = [box([0.0, 0.0], [0.5, 0.25], velocity=[0.3, 0.0])]
     old = create(scene(size=[1.0, 0.5], resolution=32, sand=sand, **tables))

@@ -1,4 +1,4 @@
-"""Solids that move through sand, come in from outside and leave again."""
+"""Moving solids in sand that enter and leave the domain."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.simulation import StepFailed
 
 SPEED = 0.5  # of a paddle [m/s]
-FEW = {"max_iterations": 60}  # of a solve: enough where nothing depends on its accuracy
+FEW = {"max_iterations": 60}  # of a solve: enough where its accuracy does not matter
 
 
 def push(velocity: list[float], **more: Any) -> dict[str, Any]:
@@ -21,7 +21,7 @@ def push(velocity: list[float], **more: Any) -> dict[str, Any]:
 
 
 def depth_in_solids(simulation: SandSimulation) -> float:
-    """Return how deep the particle that is deepest in a solid is in it, in cells."""
+    """Return the largest depth of a particle in a solid, in cells."""
     dimension, points = simulation.grid.dimension, simulation.particles.position.numpy()
     deepest = -math.inf
     for solid in simulation.scene.solid:
@@ -36,7 +36,11 @@ def depth_in_solids(simulation: SandSimulation) -> float:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_paddle_pushes_sand_and_none_gets_behind_it(dimension: int) -> None:
-    """Momentum goes in: without the solid's velocity in the pressure's problem the sand before it would stay at rest or pile up in it."""
+    """Sand pushed by a paddle; none gets behind it.
+
+    Without the solid's velocity in the pressure problem the sand before it would stay at rest or
+    pile up in it.
+    """
     blade = {
         **box([-0.5, -1.0, -1.0][:dimension], [0.2, 2.0, 2.0][:dimension]),
         "motion": push([SPEED, 0.0, 0.0][:dimension]),
@@ -69,7 +73,10 @@ def test_a_paddle_pushes_sand_and_none_gets_behind_it(dimension: int) -> None:
 
 
 def test_a_plate_that_is_pulled_from_under_sand_lets_it_fall() -> None:
-    """The layer falls by the plate's height onto the floor, and keeps its mass."""
+    """Fall of sand after a plate below it is pulled away.
+
+    The layer falls by the plate's height onto the floor and keeps its mass.
+    """
     plate = {**box([-0.1, -0.1], [1.1, 0.2]), "motion": push([0.0, -4.0])}
     simulation = create(
         scene(
@@ -84,7 +91,7 @@ def test_a_plate_that_is_pulled_from_under_sand_lets_it_fall() -> None:
     before = simulation.particles.position.numpy()[:, 1].mean()
     advance(simulation, 0.1)
     fallen = before - simulation.particles.position.numpy()[:, 1].mean()
-    # the plate is gone faster than sand falls: it does not pull
+    # The plate leaves faster than sand falls: it does not pull.
     assert fallen == pytest.approx(0.5 * GRAVITY * 0.1**2, rel=0.1)
     advance(simulation, 0.45)
     assert before - simulation.particles.position.numpy()[:, 1].mean() == pytest.approx(
@@ -113,7 +120,10 @@ def test_a_plate_that_rises_carries_its_load() -> None:
 
 
 def test_a_belt_drags_sand_along_with_friction_and_not_without() -> None:
-    """A floor that slides along itself: mu g is the acceleration until the sand has its speed."""
+    """Sand on a belt, with and without friction.
+
+    A floor slides along itself: mu g is the acceleration until the sand has its speed.
+    """
     found = []
     for friction in (0.0, 0.3):
         belt = {**box([-3.0, -1.0], [4.0, 0.1]), "motion": push([0.6, 0.0]), "friction": friction}
@@ -177,7 +187,11 @@ def test_solids_that_close_the_domain_end_no_run() -> None:
 
 
 def test_sand_that_a_wall_turns_is_not_taken_for_faster() -> None:
-    """A wall takes the component -1e6 m/s away; float32 ends the solve far above g dt, and the energy falls to 0.6 of itself."""
+    """Sand stopped by a wall at a high speed.
+
+    A wall removes the component -1e6 m/s. float32 ends the solve far above g dt, and the energy
+    falls to 0.6 of itself.
+    """
     sand = [box([0.0, 0.0], [0.375, 0.375], velocity=[-1e6, 1e6])]
     simulation = create(scene(size=[1.0, 0.5], resolution=16, sand=sand))
     simulation.step(simulation.stable_dt())
@@ -186,7 +200,11 @@ def test_sand_that_a_wall_turns_is_not_taken_for_faster() -> None:
 
 
 def test_sand_without_solids_that_finds_no_stresses_says_so() -> None:
-    """At 1e6 m/s for a second a step nothing converges; there is no velocity of solids to compare with."""
+    """Failed stresses without solids are reported.
+
+    At 1e6 m/s with steps of a second nothing converges; there is no velocity of solids to compare
+    with.
+    """
     sand = [box([0.0, 0.0], [0.375, 0.375], velocity=[1e6, 0.0])]
     simulation = create(scene(size=[1.0, 0.5], resolution=16, sand=sand))
     with pytest.raises(StepFailed, match="would add energy to the sand"):

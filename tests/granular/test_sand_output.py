@@ -1,4 +1,4 @@
-"""What runs of sand write, and what the command line says of them."""
+"""Output of runs of sand, and messages of the command line."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ def call(*words: object) -> Any:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short run of the column, with its profile."""
+    """Return a short run of the column, with its profile."""
     out = tmp_path_factory.mktemp("sand") / "run"
     result = call("run", "column-collapse-2d", "--out", out, *SMALL, "--profile")
     assert result.exit_code == 0, result.output
@@ -55,7 +55,7 @@ def test_frames_have_what_sand_bears(folder: Path) -> None:
     last = sorted(folder.glob("frames/particles_*.vtu"))[-1]
     points = meshio.read(last)
     assert points.point_data.keys() >= {"velocity", "speed", "fraction", "pressure", "yield_ratio"}
-    assert 0.0 < points.point_data["fraction"].max() < 0.75  # of space: 0.6 at the densest
+    assert 0.0 < points.point_data["fraction"].max() < 0.75  # of space: 0.6 at the densest packing
     assert points.point_data["pressure"].min() >= 0.0
     assert 0.0 < points.point_data["yield_ratio"].max() <= 1.01
     cells = meshio.read(str(last).replace("particles", "grid"))
@@ -112,7 +112,10 @@ def test_scenes_schema_and_check_know_sand() -> None:
 
 
 def test_a_solid_that_no_cell_feels_is_told() -> None:
-    """Particles stop at it, but stresses know only whole cells."""
+    """Warning about a solid that covers no cell.
+
+    Particles stop at it, but the stresses know only whole cells.
+    """
     plate = box([0.2, 0.19], [0.8, 0.21])
     simulation = create(
         scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.3], [1.0, 0.5])], solid=[plate])
@@ -127,7 +130,7 @@ def test_the_frame_before_the_first_step_shows_the_start() -> None:
     full = (cells.index[:, :2] < [8, 4]).all(axis=1)
     assert full.sum() == 8 * 4
     inner = (cells.index[:, :2] < [7, 3]).all(axis=1)
-    # as the particles' kernels see it
+    # As the particles' kernels see it.
     np.testing.assert_allclose(cells.fields["fraction"][inner], 0.6, rtol=0.1)
-    assert (cells.fields["fraction"][~full] < 0.3).all()  # what reaches over its edge
+    assert (cells.fields["fraction"][~full] < 0.3).all()  # the part that reaches over its edge
     assert not points.fields["pressure"].any()

@@ -1,4 +1,7 @@
-"""Masses of faces, places of shear stresses and faces of walls, against what is counted by hand and by NumPy."""
+"""Masses of faces, places of shear stresses and faces of walls.
+
+Compared with counts by hand and by NumPy.
+"""
 
 from typing import Any
 
@@ -16,7 +19,10 @@ DT, DX = 0.01, 0.1
 
 
 def packed(picture: list[str], **more: Any) -> Packing:
-    """Return the packing of a picture, top row first: '#' solid, '.' empty, 'o' dense sand, ':' sand of 0.4, '+' of 1.5."""
+    """Return the packing of a picture, top row first.
+
+    '#' solid, '.' empty, 'o' dense sand, ':' sand of 0.4, '+' of 1.5.
+    """
     rows = picture[::-1]
     grid = StaggeredGrid((len(rows[0]), len(rows), 1), DX, 2)
     density, base = (
@@ -37,7 +43,7 @@ def packed(picture: list[str], **more: Any) -> Packing:
 
 
 def plane(field: wp.array) -> np.ndarray:
-    """Return the cells of a 2-D field with the domain's upper faces, the lowest row first."""
+    """Return the cells of a 2-D field with the domain's upper faces, lowest row first."""
     return np.asarray(field.numpy()[1, 1:, 1:])
 
 
@@ -45,7 +51,7 @@ def test_a_face_has_the_mean_of_its_cells_as_mass() -> None:
     packing = packed(["o.", "o:", "##"])
     u, v = plane(packing.mass[0]), plane(packing.mass[1])
     np.testing.assert_allclose(u[1:3], [[0.0, 0.7, 0.0], [0.0, 0.5, 0.0]], atol=1e-6)
-    # none on walls
+    # None on walls.
     np.testing.assert_allclose(v[1:4, :2], [[0.0, 0.0], [1.0, 0.2], [0.0, 0.0]], atol=1e-6)
     for mass, inverse, start, given in zip(
         packing.mass, packing.inverse, packing.start, (2.0, 3.0), strict=True
@@ -63,7 +69,7 @@ def test_a_solid_that_moves_sweeps_the_fraction_before_it() -> None:
     moving = [wp.full(shape, 0.5, dtype=wp.float32, device="cpu") for _ in range(2)]
     packing = packed(["o:", "##"], solid=moving)
     np.testing.assert_allclose(plane(packing.mass[1])[1, :2], [1.0, 0.4], atol=1e-6)
-    assert not plane(packing.inverse[1])[1].any()  # no stress moves it
+    assert not plane(packing.inverse[1])[1].any()  # stresses do not move it
     np.testing.assert_array_equal(plane(packing.start[1])[1, :2], [0.5, 0.5])
 
 
@@ -75,13 +81,21 @@ def test_what_is_too_dense_has_its_mass_and_pushes_nothing_out() -> None:
 
 
 def test_surface_cells_count_as_full_and_loose_ones_do_not() -> None:
-    """max(0.95 - phi, 0) dx / dt is what a cell has room for; one partly filled beside air would have no pressure, and so no friction."""
+    """Room of surface cells and of loose cells.
+
+    max(0.95 - phi, 0) dx / dt is the room of a cell. A partly filled one beside air would have no
+    pressure, and so no friction.
+    """
     assert plane(packed(["..", ":o", "oo"]).drive)[1, 0] == 0.0
     assert plane(packed([":::"] * 3).drive)[1, 1] == pytest.approx(0.55 * DX / DT, rel=1e-5)
 
 
 def test_a_gap_that_its_neighbors_fill_is_no_room() -> None:
-    """Free is what a cell and those around it, by halves along each axis, have free in all: 0.95 less the fractions of eight neighbors."""
+    """Gap that its neighbors fill: no room.
+
+    The room is that of a cell and its neighbors, by halves along each axis: 0.95 less the fractions
+    of eight neighbors.
+    """
     assert plane(packed(["+++", "+:+", "+++"]).drive)[1, 1] == 0.0
     assert plane(packed(["ooo", "o:o", "ooo"]).drive)[1, 1] == pytest.approx(
         (0.55 - 3 * 0.05) * DX / DT, rel=1e-5
@@ -91,11 +105,11 @@ def test_a_gap_that_its_neighbors_fill_is_no_room() -> None:
 @pytest.mark.parametrize(
     ("picture", "expected"),
     [
-        # none in the corners of the domain
+        # None in the corners of the domain.
         (["oo", "oo"], [[0.0, -0.5, 0.0], [-0.5, 0.25, -0.5], [0.0, -0.5, 0.0]]),
-        # a loose cell bears no shear, but leans on walls
+        # A loose cell bears no shear, but leans on walls.
         (["oo", ":o"], [[0.0, -0.5, 0.0], [-0.5, 1 / 3, -0.5], [0.0, -0.5, 0.0]]),
-        # the surface itself bears none: the face above is empty
+        # The surface itself bears none: the face above is empty.
         (["..", "oo"], [[0.0, -0.5, 0.0], [-1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),
     ],
 )
@@ -112,7 +126,10 @@ def test_an_edge_of_an_empty_face_bears_no_shear() -> None:
 
 
 def test_copies_weigh_one_together() -> None:
-    """Each edge that carries shear has copies of weight 1 in all, so that equal copies are the edge's stress."""
+    """Total weight 1 of the copies of a shear stress.
+
+    Equal copies are then the edge's stress.
+    """
     random = np.random.default_rng(77)
     rows = ["".join(random.choice(list("ooo:.#"), size=9)) for _ in range(8)]
     packing = packed(rows)
@@ -164,11 +181,11 @@ def test_wall_faces_lie_between_open_cells_and_solids(dimension: int) -> None:
                     )
     assert set(zip(cells.tolist(), sides.tolist(), walls.tolist(), strict=True)) == expected
     assert len(cells) == len(expected)
-    assert (np.diff(cells) >= 0).all()  # so that a cell's faces are one thread's, in one order
+    assert (np.diff(cells) >= 0).all()  # so that a cell's faces belong to one thread, in one order
 
 
 class SomeCells(GridPart):
-    """A process that owns some of the cells."""
+    """Process that owns some of the cells."""
 
     def __init__(self, grid: StaggeredGrid, cells: Window) -> None:
         super().__init__(grid)
@@ -203,7 +220,7 @@ def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
             random.uniform(0.0, 1.2, grid.shape) * (random.random(grid.shape) < 0.5) * (step != 2)
         )
         if step == 3:
-            density = grid.field()  # another array than what is recorded knows
+            density = grid.field()  # another array than the recorded one
         density.assign(host.astype(np.float32))
         packing.update(density, velocity, DT)
         walls.activate(packing.flags)

@@ -1,4 +1,4 @@
-"""What a scene of sand may say, and what is told to whoever says something else."""
+"""Scenes of sand: allowed settings and messages."""
 
 import math
 from typing import Any
@@ -29,7 +29,7 @@ max = [1.0, 0.25]
 
 
 def complaint(tmp_path: Any, *overrides: str) -> str:
-    """Return what is said about a scene with these keys."""
+    """Return the message about a scene with these keys."""
     file = tmp_path / "pile.toml"
     file.write_text(FILE)
     with pytest.raises(SceneError) as caught:
@@ -138,7 +138,7 @@ def test_no_sand_at_all_is_refused() -> None:
 
 
 def test_a_material_gives_what_the_table_does_not() -> None:
-    """Gravel's own density and angle, and a wall friction in place of its own."""
+    """Material with overrides: gravel's own density and angle, another wall friction."""
     data = {
         "scene": {"simulator": "granular"},
         "time": {"duration": 1.0},
@@ -170,9 +170,11 @@ def test_walls_and_solids_have_their_own_friction() -> None:
 
 
 def test_the_slope_of_the_yield_set() -> None:
-    """k = tan 30 of repose, sin 30 in plane strain; in triaxial compression 2 sqrt(3) sin / (3 - sin), the outer cone; 2-D is plane strain.
+    """Slope of the yield set.
 
-    Cohesion counts as such in the first, times cos 30 in the others.
+    k is tan 30 of repose and sin 30 in plane strain. In triaxial compression it is 2 sqrt(3) sin /
+    (3 - sin), the outer cone. 2-D is plane strain. Cohesion counts as such in the first, times cos
+    30 in the others.
     """
     sand = [box([0.0, 0.0], [0.2, 0.2])]
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(
@@ -195,7 +197,11 @@ def test_the_slope_of_the_yield_set() -> None:
 
 
 def test_a_cone_that_would_bear_tension_is_refused() -> None:
-    """The least principal stress is below 0 beyond |s|_F = sqrt(2) sqrt(3) / 2 p where a sample is pulled; in 2-D beyond sqrt(2) p."""
+    """Refusal of a cone that would bear tension.
+
+    The least principal stress is below 0 beyond |s|_F = sqrt(2) sqrt(3) / 2 p where a sample is
+    pulled; in 2-D beyond sqrt(2) p.
+    """
     flat = [box([0.0, 0.0], [0.2, 0.2])]
     with pytest.raises(
         ValueError, match=r"must be at most 45 where material.friction_angle_test = \"repose\""

@@ -1,4 +1,7 @@
-"""The built-in scenes of sand from beginning to end: solved as well as they say, at rest in the end, nothing lost."""
+"""Built-in scenes of sand from begin to end.
+
+The solves meet their tolerance, the sand comes to rest, and nothing is lost.
+"""
 
 import csv
 from pathlib import Path
@@ -11,7 +14,7 @@ from warp_lcp.scene.scene_file import load_scene
 
 
 class Silent:
-    """An observer of nothing."""
+    """Observer that does nothing."""
 
     def note(self, text: str) -> None:
         assert text
@@ -27,7 +30,7 @@ class Silent:
 
 
 def run(name: str, folder: Path, *overrides: str) -> dict[str, np.ndarray]:
-    """Run a scene and return the columns of its log that are numbers."""
+    """Run a scene and return the numeric columns of its log."""
     assert (
         run_into(load_scene(name, list(overrides)), folder, observer=Silent()).status == "finished"
     )
@@ -73,18 +76,26 @@ def test_a_scene_from_beginning_to_end(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_planar_column_runs_as_far_as_experiments_say_and_rests(tmp_path: Path) -> None:
-    """a = 2: 1.2 a to 1.8 a widths [Lube et al. 2005; Lajeunesse et al. 2005], widened by a fifth; in the end next to nothing moves."""
+    """Runout and rest of the planar column, against experiments.
+
+    For a = 2 the runout is 1.2 a to 1.8 a widths [Lube et al. 2005; Lajeunesse et al. 2005],
+    widened by a fifth. In the end almost nothing moves.
+    """
     log = run("column-collapse-2d", tmp_path / "run", "time.duration=2.5")
     assert 0.8 * 2.4 <= log["runout"][-1] / 0.25 <= 1.2 * 3.6
     mass = log["mass"][-1]
-    # [m/s], of a pile from 0.5 m
+    # [m/s], of a pile from 0.5 m.
     assert np.sqrt(2.0 * log["kinetic_energy"][-1] / mass) < 0.01 * 0.5
     assert log["height"][-1] == pytest.approx(0.25, abs=0.05)
 
 
 @pytest.mark.slow
 def test_sand_runs_through_a_funnel_at_a_constant_rate(tmp_path: Path) -> None:
-    """However high it stands, unlike a liquid: the mean rates of equal spans differ by less than a tenth."""
+    """Constant rate of sand through a funnel.
+
+    It does not depend on the height, unlike that of a liquid: the mean rates of equal times differ
+    by less than a tenth.
+    """
     log = run("hourglass-2d", tmp_path / "run", "time.duration=1.0")
     time, fallen = np.cumsum(log["dt"]), np.cumsum(log["flow_rate"] * log["dt"])
     rates = np.diff(np.interp([0.3, 0.45, 0.6, 0.75, 0.9], time, fallen)) / 0.15

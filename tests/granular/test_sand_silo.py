@@ -1,4 +1,7 @@
-"""Sand at rest between walls, small; other widths, 3-D, lids and set-ups that are wrong on purpose are in the suite `validation`."""
+"""Small silos of sand at rest.
+
+Other widths, 3-D, lids and negative controls are in the suite `validation`.
+"""
 
 import math
 
@@ -8,7 +11,7 @@ import pytest
 from warp_lcp.benchmarks.validation import sand_silo
 from warp_lcp.benchmarks.validation.scenes import create_sand
 
-SHORT = 0.125  # [s]: at rest after the first steps
+SHORT = 0.125  # [s] at rest after the first steps
 
 
 def test_janssens_law_is_the_weight_above_without_friction_and_saturates_with_it() -> None:
@@ -48,7 +51,11 @@ def test_sand_that_is_packed_through_its_stresses_misses_the_law(each: sand_silo
 def test_sand_put_down_stays_where_it_is_however_its_particles_lie(
     per_axis: int, jitter: float, tilt: float
 ) -> None:
-    """The surface lies between the cells' faces; with a particle a cell, fractions scatter by 6 %, and gaps used to close by falling."""
+    """Rest of deposited sand, however its particles lie.
+
+    The surface lies between the cells' faces. With one particle per cell, fractions scatter by 6 %,
+    and gaps used to close by falling.
+    """
     angle, height = math.radians(tilt), 0.1347
     gravity = {"gravity": [9.81 * math.sin(angle), -9.81 * math.cos(angle)]}
     particles = {"per_axis": per_axis, "jitter": jitter, "seed": 23}

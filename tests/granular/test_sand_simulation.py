@@ -1,4 +1,4 @@
-"""Sand against answers that are known: free fall, weight, rest, and what no step may do."""
+"""Sand against known results: free fall, weight, rest, and invariants of a step."""
 
 import math
 
@@ -13,7 +13,10 @@ DENSITY = 1600.0
 
 
 def vertical_load(simulation: SandSimulation) -> np.ndarray:
-    """Return -sigma_yy of the cells [Pa], shape (nz, ny, nx): sigma = -p + s, and s_yy = -a in 2-D."""
+    """Return -sigma_yy of the cells [Pa], shape (nz, ny, nx).
+
+    sigma = -p + s, and s_yy = -a in 2-D.
+    """
     now = simulation.stress.now.numpy().astype(float)
     deviator = -now[1] if simulation.grid.dimension == 2 else now[2]
     planes = slice(1, 2) if simulation.grid.dimension == 2 else slice(1, -1)
@@ -27,7 +30,10 @@ def vertical_load(simulation: SandSimulation) -> np.ndarray:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_grain_falls_freely(dimension: int) -> None:
-    """One particle is no packed sand: it has fallen at g, to rounding, until it meets the floor."""
+    """Free fall of a single grain.
+
+    One particle is no packed sand: its acceleration is g, to rounding, until it meets the floor.
+    """
     center = [8.25 / 32, 24.25 / 32, 8.25 / 32][:dimension]
     grain = {"shape": "sphere", "center": center, "radius": 0.004}
     simulation = create(
@@ -54,7 +60,11 @@ def test_a_grain_falls_freely(dimension: int) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_block_falls_freely(dimension: int) -> None:
-    """What moves through a partly filled cell as it is does not compress it: no pressure, no drag on the block's front."""
+    """Free fall of a block.
+
+    Motion through a partly filled cell does not compress it: no pressure, no drag on the block's
+    front.
+    """
     size, low, high = (
         [0.5, 1.0, 0.5][:dimension],
         [0.15, 0.7, 0.15][:dimension],
@@ -71,7 +81,7 @@ def test_a_block_falls_freely(dimension: int) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_sand_lets_go_of_a_ceiling(dimension: int) -> None:
-    """A pressure that could be negative would hold it there."""
+    """Separation of sand from a ceiling; a negative pressure would hold it."""
     sand = [box([0.0, 0.25, 0.0][:dimension], [0.5, 0.5, 0.5][:dimension])]
     simulation = create(scene(size=[0.5] * dimension, resolution=16, sand=sand, friction=0.0))
     advance(simulation, 0.1)
@@ -82,7 +92,7 @@ def test_sand_lets_go_of_a_ceiling(dimension: int) -> None:
 
 
 def settled(dimension: int, **tables: object) -> tuple[SandSimulation, list[dict[str, float]]]:
-    """Return sand that fills a box without friction on its walls to 3/4 and has come to rest."""
+    """Return sand at rest that fills a box with smooth walls to 3/4."""
     high = [0.5, 0.375, 0.5][:dimension]
     model = scene(
         size=[0.5] * dimension,
@@ -97,10 +107,11 @@ def settled(dimension: int, **tables: object) -> tuple[SandSimulation, list[dict
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
-    """Walls that do not rub take no weight, so the load of a row of cells is exactly the weight of what lies above their centers.
+    """Load of each layer.
 
-    How a row shares it among its cells is undetermined in sand with friction, and varies: by a half
-    and more.
+    Smooth walls bear no weight, so that the load of a row of cells is exactly the weight of the
+    sand above their centers. Its distribution over the cells of a row is undetermined in sand with
+    friction, and varies by a half and more.
     """
     simulation, rows = settled(dimension)
     assert rows[-1]["max_speed"] < 0.03
@@ -112,20 +123,24 @@ def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
     weight = DENSITY * GRAVITY * dx * above
     deep = slice(0, int(0.3 / dx))
     np.testing.assert_allclose(load[deep], weight[deep], rtol=0.05)
-    # rho g (h - y), if nothing had settled
+    # rho g (h - y) without settling.
     exact = DENSITY * GRAVITY * (0.375 - (np.arange(len(load)) + 0.5) * dx)
     np.testing.assert_allclose(load[deep], exact[deep], rtol=0.1)
     mean = simulation.pressures()[planes, 1:-1, 1:-1].mean(axis=(0, 2))
-    # Rankine's active state of 30 degrees: a third of the load acts sideways
+    # Rankine's active state of 30 degrees: a third of the load acts sideways.
     least = (1.0 + (dimension - 1) / 3.0) / dimension
     assert (mean[deep] > 0.95 * least * load[deep]).all()
-    # nor more than the load: sand that pushes itself apart would be passive
+    # Nor more than the load: expanding sand would be passive.
     assert (mean[deep] < 1.05 * load[deep]).all()
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_floor_bears_the_weight(dimension: int) -> None:
-    """The load of the lowest cells and the weight of the half cell below their centers, summed over the floor."""
+    """Weight on the floor.
+
+    The load of the lowest cells and the weight of the half cell below their centers, summed over
+    the floor.
+    """
     simulation, _ = settled(dimension)
     dx = simulation.grid.spacing
     floor = (vertical_load(simulation)[:, 0] + 0.5 * DENSITY * GRAVITY * dx).sum() * dx ** (
@@ -145,7 +160,11 @@ def test_the_floor_bears_the_weight(dimension: int) -> None:
 )
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
-    """Mass exactly; pressure only pushes; friction only takes energy; no cell is predicted to be too dense; energy falls."""
+    """Invariants of every step.
+
+    Mass is exact; pressure only pushes; friction only dissipates; no cell is predicted to be too
+    dense; the energy falls.
+    """
     solver = {"method": method, "tolerance": 1e-3, "max_iterations": 1000}
     simulation = (
         column(dimension, friction=0.4, solver=solver, density_correction={})
@@ -172,15 +191,18 @@ def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
         energy = after
         total.append(energy)
     taken = sum(row["dissipation"] for row in rows[1:]) / (total[0] - total[-1])
-    # friction has taken what is lost; the rest is the transfers' and the floor's
+    # Friction has dissipated the loss; the rest is that of transfers and floor.
     assert 0.8 < taken < 1.0
     reached = np.mean([row["coupled_residual"] <= 1e-3 for row in rows])
-    # the box's flow has steps that no method has been seen to solve
+    # The flow of the box has steps that no known method solves.
     assert reached >= (0.4 if model == "box" else 0.9)
 
 
 def boxed(dimension: int, solver: dict[str, object]) -> SandSimulation:
-    """Return the column with Narain's box; `friction` is a table of the scene here, not the domain's key."""
+    """Return the column with Narain's box.
+
+    `friction` is a table of the scene here, not the domain's key.
+    """
     data = column(dimension, solver=solver).scene.model_dump(by_alias=True, exclude_none=True)
     data["friction"] = {"model": "box"}
     data["domain"]["friction"] = 0.4
@@ -192,7 +214,11 @@ def boxed(dimension: int, solver: dict[str, object]) -> SandSimulation:
 
 @pytest.mark.parametrize("degrees", [10.0, 35.0])
 def test_tilted_gravity_moves_a_slab_as_coulomb_says(degrees: float) -> None:
-    """A slab on a floor of friction 0.4 rests at 10 degrees; at 35 it slides with g (sin - mu cos): gravity, load and friction agree."""
+    """Slab under tilted gravity, by Coulomb's law.
+
+    On a floor of friction 0.4 it rests at 10 degrees; at 35 it slides with g (sin - mu cos):
+    gravity, load and friction agree.
+    """
     mu, angle = 0.4, math.radians(degrees)
     gravity = [GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle)]
     model = scene(
@@ -217,7 +243,7 @@ def test_tilted_gravity_moves_a_slab_as_coulomb_says(degrees: float) -> None:
 
 
 def test_a_mirrored_scene_stays_mirrored() -> None:
-    """Nothing prefers a side, as far as the order of additions goes."""
+    """Mirror symmetry of a scene, up to the order of additions."""
     found = []
     for low, high in (([0.0, 0.0], [0.375, 0.375]), ([0.625, 0.0], [1.0, 0.375])):
         simulation = create(
@@ -241,7 +267,7 @@ def test_a_pile_comes_to_rest_and_stays() -> None:
     front, height = simulation._front()
     before = simulation.particles.position.numpy().copy()
     advance(simulation, 1.3)
-    # the order may change: an upper bound only
+    # The order may change: an upper bound only.
     drift = np.linalg.norm(simulation.particles.position.numpy() - before, axis=1).mean()
     later = simulation._front()
     assert later[0] - front < 0.5 * simulation.grid.spacing

@@ -1,4 +1,4 @@
-"""Sand that comes in and goes out, and what of it the log counts."""
+"""Sources and drains of sand, and their log entries."""
 
 from typing import Any
 
@@ -41,7 +41,10 @@ def test_a_source_lets_in_area_times_velocity(dimension: int) -> None:
 
 
 def test_a_source_that_has_stopped_leaves_no_velocity_behind() -> None:
-    """What the source gave the faces of the ceiling would push away sand that is held against it."""
+    """Source that has stopped: no remaining velocity.
+
+    Velocities of the source at the ceiling's faces would push away sand that is held against it.
+    """
     source = {**TAP, "stop": 0.05}
     simulation = create(scene(size=[1.0, 1.0], resolution=16, sand=[], source=[source]))
     advance(simulation, 0.1)
@@ -65,7 +68,11 @@ def test_what_a_drain_swallows_and_what_leaves_is_the_flow() -> None:
 
 
 def test_the_gauge_counts_what_falls_through_it() -> None:
-    """All of a drop falls through in the end; between the times at which its two ends pass, nothing before and nothing after."""
+    """Gauge of sand that falls through it.
+
+    The whole drop falls through in the end: between the times of its two ends, nothing before and
+    nothing after.
+    """
     drop = box([0.25, 0.6], [0.5, 0.8])
     simulation = create(scene(size=[1.0, 1.0], resolution=16, sand=[drop], gauge={"height": 0.4}))
     rows = advance(simulation, 0.4)
@@ -79,7 +86,10 @@ def test_the_gauge_counts_what_falls_through_it() -> None:
 
 
 def test_sand_that_fills_its_box_stops_no_run() -> None:
-    """The source goes on; what has no place is packed too densely, and the log says how much."""
+    """Source in a full box does not stop the run.
+
+    Excess sand is packed too densely, and the log says how much.
+    """
     source = box([0.25, 0.4375], [0.5, 0.5], velocity=[0.0, -0.5])
     simulation = create(
         scene(size=[0.5, 0.5], resolution=8, sand=[box([0.0, 0.0], [0.5, 0.4375])], source=[source])

@@ -1,4 +1,7 @@
-"""Velocity, rates of strain, projection and residual of sand's stresses against NumPy and SciPy, cell by cell from the equations."""
+"""Velocity, strain rates, projection and residual of sand's stresses.
+
+They are compared with NumPy and SciPy, cell by cell from the equations.
+"""
 
 import itertools
 from collections.abc import Callable
@@ -16,11 +19,11 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, GRAVITY = 0.01, np.array([0.0, -9.81, 0.0])
-AXES = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # of the shears xy, xz, yz
-# bits of a copy's place: q & 1 along the first axis, q >> 1 along the second
+AXES = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # pairs of axes of the shears xy, xz, yz
+# Bits of a copy's place: q & 1 along the first axis, q >> 1 along the second.
 OPENING = np.array([0, 1, 3])
 FRICTIONS = [0.3, 1e6]  # of the domain and of the solid, which is rougher than sand
-# of a yield set's radius, by the multiplier of the projection onto it
+# Radius of a yield set as a function of the multiplier of the projection onto it.
 Growth = Callable[[float], float]
 
 
@@ -31,7 +34,7 @@ def step_along(axis: int) -> np.ndarray:
 
 @dataclass
 class Case:
-    """Random sand in a small domain with a solid: a stress that the grid admits, and what it is made of."""
+    """Random sand in a small domain with a solid: an admissible stress, and its parts."""
 
     stress: Stress
     packing: Packing
@@ -60,7 +63,10 @@ def make(
     gain: float = 0.0,
     halfway: float = 0.0,
 ) -> Case:
-    """Return a case: cells that are empty, loose and dense, partly in touch with walls and a solid of two cells."""
+    """Return a case with empty, loose and dense cells.
+
+    Some touch walls and a solid of two cells.
+    """
     random = np.random.default_rng(seed)
     grid = StaggeredGrid((6, 5, 4 if dimension == 3 else 1), 0.1, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)
@@ -90,7 +96,7 @@ def make(
     stress = Stress(packing, Walls(grid, index, FRICTIONS), box=box, rate=gain > 0.0)
     start = random.normal(scale=0.4, size=stress.now.shape)
     start[0] = np.maximum(random.normal(0.4, 0.5, size=grid.shape), 0.0)
-    start[:, index == 0] = 0.0  # nothing is ever written into the domain's ring
+    start[:, index == 0] = 0.0  # the domain's ring is never written
     stress.now.assign(start.astype(np.float32))
     stress.kick_dt = DT
     bound = YieldSet(0.5, cohesion, tension, gain, halfway)
@@ -112,7 +118,10 @@ def first_copy(dimension: int, shear: int) -> int:
 
 
 def edge_of(cell: tuple[int, ...], shear: int, copy: int) -> tuple[int, ...]:
-    """Return the edge that copy 0 to 3 of a cell's shear lies on, stored at the cell whose low side it is."""
+    """Return the edge of copy 0 to 3 of a cell's shear.
+
+    It is stored at the cell whose low side it is.
+    """
     alpha, beta = AXES[3][shear]
     return at(cell, (copy & 1) * step_along(alpha), (copy >> 1) * step_along(beta))
 
@@ -136,7 +145,10 @@ def total_stress(case: Case, axis: int) -> np.ndarray:
 
 
 def velocity(case: Case) -> list[np.ndarray]:
-    """Return u = u* + div(sigma) / m by face: sigma_aa across the face, and the shears on the edges around it."""
+    """Return u = u* + div(sigma) / m by face.
+
+    sigma_aa acts across the face, and the shears on the edges around it.
+    """
     out = []
     shears = [edge_stress(case, d) for d in range(len(AXES[case.dimension]))]
     for axis in range(case.dimension):
@@ -176,20 +188,19 @@ def nearest(
     radius: float,
     grown: Growth | None = None,
 ) -> np.ndarray:
-    """Return the point of { sum of free n^2 + sum over groups of max |z|^2 <= radius^2 } nearest in a metric.
+    """Return the nearest point of the yield set in a metric.
 
-    With a multiplier mu of the set's bound, each group is cut to the size m that minimizes sum
-    metric (|z| - m)_+^2 + mu m^2, and what counts by itself shrinks; SciPy's root finder gives each
-    m, and mu.
+    The set is { sum of free n^2 + sum over groups of max |z|^2 <= radius^2 }. With a multiplier mu
+    of the set's bound, each group is cut to the size m that minimizes sum metric (|z| - m)_+^2 + mu
+    m^2, and free entries shrink. SciPy's root finder gives each m, and mu.
 
     Args:
-        point: to project.
-        groups: entries whose largest magnitude counts.
-        free: weights of the squares of the entries that count by themselves; 0 for those in groups.
-        metric: weights of the squared distance; on the entries that count by themselves equal to
-            `free`.
-        radius: of the set.
-        grown: the radius by the multiplier instead.
+        point: the point to project.
+        groups: groups of entries of which the largest magnitude counts.
+        free: weights of the squares of the free entries; 0 for those in groups.
+        metric: weights of the squared distance; equal to `free` on the free entries.
+        radius: radius of the set.
+        grown: radius as a function of the multiplier, in place of `radius`.
     """
     if radius < 1e-12:
         return np.zeros_like(point)
@@ -231,7 +242,10 @@ def nearest(
 
 
 def growth(radius: float, gain: float, half: float, soft: float) -> Growth:
-    """Return r = radius + gain e / (e + half) by the multiplier mu: a step `soft` that takes mu r leaves the rate e = mu r / soft."""
+    """Return the rate-dependent radius r = radius + gain e / (e + half).
+
+    By the multiplier mu: a step `soft` that subtracts mu r leaves the rate e = mu r / soft.
+    """
 
     def grown(mu: float) -> float:
         if mu == 0.0 or gain == 0.0:
@@ -258,7 +272,7 @@ def cell_move(
         return 0.0, 0.0
     mass, inverse, share = case.field("mass"), case.field("inverse"), case.field("share")
     stretch = []
-    # a full cell counts volume, a loose one mass
+    # A full cell counts volume, a loose one mass.
     full = float(np.clip(1.0 - w * DT / p.grid.spacing / 0.05, 0.0, 1.0))
     for axis in range(dimension):
         low, high = cell, at(cell, step_along(axis))
@@ -277,8 +291,8 @@ def cell_move(
         if dense and stiff > 0.0
         else 0.0
     )
-    # the deviator and the copies, moved against the gradient over `stiff` in the metric |n|^2 / 2 +
-    # sum b^2 / 4 (2-D: n = (a, -a))
+    # The deviator and the copies, moved against the gradient over `stiff` in the metric |n|^2 / 2 +
+    # sum b^2 / 4 (2-D: n = (a, -a)).
     normals = [now[(1, *cell)]] if dimension == 2 else [now[(1 + axis, *cell)] for axis in range(3)]
     soft = 1.0 / stiff if stiff > 0.0 else 0.0
     if dimension == 2:
@@ -322,7 +336,10 @@ def cell_move(
 def wall_move(
     case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int, side: int, friction: float
 ) -> float:
-    """Return the squared natural residual of friction on a face of a cell with a solid: Coulomb's, or the sand's own strength."""
+    """Return the squared natural residual of friction on a face of a solid.
+
+    The friction is Coulomb's, or limited by the sand's own strength.
+    """
     dimension, now, p = case.dimension, case.now, case.packing
     if p.flags.numpy()[cell] == 0:
         return 0.0
@@ -371,7 +388,10 @@ CASES = [(2, 41), (2, 42), (3, 43)]
 
 @pytest.mark.parametrize(("dimension", "seed"), CASES)
 def test_the_velocity_is_the_divergence_of_the_stress(dimension: int, seed: int) -> None:
-    """A wrong sign of a pressure, of a deviator or of one of the shears moves most faces."""
+    """Velocity as the divergence of the stress.
+
+    A wrong sign of a pressure, of a deviator or of one of the shears moves most faces.
+    """
     case = make(dimension, seed)
     case.stress.residual()
     for axis, expected in enumerate(velocity(case)):
@@ -401,7 +421,11 @@ def test_shear_rates_are_differences_around_edges(dimension: int, seed: int) -> 
 
 @pytest.mark.parametrize(("dimension", "seed"), CASES)
 def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
-    """What a stress does to the faces' momentum is minus what it takes per rate of strain: the power of friction has one value."""
+    """Adjointness of stress and strain.
+
+    The effect of a stress on the faces' momentum is minus its power per rate of strain: the power
+    of friction has one value.
+    """
     case = make(dimension, seed)
     now = case.now
     case.stress.residual()
@@ -451,7 +475,11 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
 def test_the_residual_is_how_far_the_projection_moves_the_stress(
     dimension: int, seed: int, options: dict[str, float]
 ) -> None:
-    """Projections by SciPy: another yield set, another metric, or a cell whose copies are others would change the sum."""
+    """Residual as the distance by which the projection moves the stress.
+
+    Projections by SciPy: another yield set, another metric, or copies of other cells would change
+    the sum.
+    """
     case = make(dimension, seed, **options)
     pressure, friction = case.stress.residual()
     u = velocity(case)
@@ -471,7 +499,7 @@ def test_the_residual_is_how_far_the_projection_moves_the_stress(
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_stress_free_fall_has_no_residual(dimension: int) -> None:
-    """Loose sand that moves as one bears nothing."""
+    """Free fall without stress and without residual: loose sand bears nothing."""
     grid = StaggeredGrid((6, 6, 6 if dimension == 3 else 1), 0.1, dimension)
     base, one = grid.field(wp.int8), wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
     packing = Packing(grid, base, one)

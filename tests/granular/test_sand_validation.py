@@ -1,4 +1,7 @@
-"""Collapses, hourglasses and piles at rest, small; all resolutions and negative controls are in the suite `validation`."""
+"""Small collapses, hourglasses and piles at rest.
+
+All resolutions and negative controls are in the suite `validation`.
+"""
 
 import numpy as np
 import pytest
@@ -7,7 +10,10 @@ from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, scenes
 
 
 def test_the_envelope_is_that_of_the_experiments() -> None:
-    """Numbers from the papers' laws; were one read with the other's power, a = 8 would be off by a third."""
+    """Envelope of the experiments, by numbers of the papers' laws.
+
+    With the other paper's power a = 8 would be off by a third.
+    """
     for aspect, low, high in (
         (0.5, 0.6, 0.9),
         (1.0, 1.2, 1.8),
@@ -21,7 +27,10 @@ def test_the_envelope_is_that_of_the_experiments() -> None:
 
 
 def test_the_height_is_that_of_the_experiments() -> None:
-    """Low columns keep theirs; were the power that of round ones, 1/6, a = 4 would be off by a quarter."""
+    """Heights of the experiments.
+
+    Low columns keep theirs. With the power of round ones, 1/6, a = 4 would be off by a quarter.
+    """
     for aspect, height in ((0.5, 0.5), (1.1, 1.1), (2.0, 1.32), (4.0, 1.741), (8.0, 2.297)):
         assert sand_collapse.lube_height(aspect) == pytest.approx(height, abs=1e-3)
 
@@ -38,7 +47,10 @@ def test_half_the_friction_runs_too_far() -> None:
 
 
 def test_sand_runs_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Were the discharge that of a liquid it would fall by 15 % as the fill does."""
+    """Even discharge of sand.
+
+    That of a liquid would fall by 15 % with the fill.
+    """
     monkeypatch.setattr(sand_hourglass, "SPACING", 0.01)
     d = sand_hourglass.sand(8, 1)
     assert d.spread < 8.0
@@ -65,14 +77,18 @@ def test_a_collapse_keeps_its_invariants() -> None:
 def test_a_pile_at_rest_hardly_moves_inside() -> None:
     (_, deep), (whole, later) = sand_collapse.rest(10, 2)
     assert max(deep, later) < sand_collapse.DEEP
-    # few cells have a large share of them in the surface, where at first a grain still slides
+    # Few cells have a large share of the surface, where a grain still slides at first.
     assert whole < sand_collapse.ALL
 
 
 def test_drift_is_the_way_of_each_particle_whatever_their_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Particles move by a rigid shift and are shuffled at every step: were they followed by number, they would seem to go far."""
+    """Drift of particles, independent of their order.
+
+    Particles move by a rigid shift and are shuffled at every step. Tracked by number, they would
+    seem to go far.
+    """
     simulation = scenes.create_sand(
         [0.2, 0.1], 20, [{"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.08]}]
     )

@@ -1,4 +1,7 @@
-"""Steps of sand's stresses that a device takes without its host are those that the host would have taken; emulated, on CUDA too."""
+"""Device-resident iterations of sand's stresses against those led by the host.
+
+They are emulated, and run on CUDA too.
+"""
 
 import math
 import sys
@@ -24,10 +27,10 @@ emulated = pytest.mark.skipif(
 
 
 class Twin:
-    """A problem of drawn sand, and how to solve it again and again from the same stresses.
+    """Problem of random sand, and repeated solves from the same stresses.
 
     Args:
-        rng: draws grid, sand, walls and yield set.
+        rng: random generator of grid, sand, walls and yield set.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -62,7 +65,7 @@ class Twin:
         density = np.where(
             rng.random(shape) < full, rng.uniform(0.55, 1.1, shape), rng.uniform(0.0, 0.3, shape)
         )
-        # sometimes there is nothing to solve
+        # Sometimes there is nothing to solve.
         size = 10.0 ** rng.integers(-4, 1) * (rng.random() > 0.1)
         u = [
             wp.array((size * rng.standard_normal(shape)).astype(np.float32), dtype=wp.float32)
@@ -77,13 +80,13 @@ class Twin:
             DT,
         )
         self._start = self.stress.now.numpy().copy() * rng.choice([0.0, 1.0, 1.0])
-        # the last step's time of forces: cold or warm
+        # Time of forces of the last step: cold or warm.
         self._last = float(rng.choice([0.0, 0.3 * DT, DT]))
 
     def solve(
         self, work: MomentumWorkspace, method: HeavyBallProjectedGradient, **options: Any
     ) -> tuple[Any, ...]:
-        """Solve from the drawn start; return all that is known of it."""
+        """Solve from the drawn start; return all results."""
         stress = self.stress
         stress.now.assign(self._start)
         stress.kick_dt = self._last
@@ -108,7 +111,7 @@ class Twin:
 def workspaces(
     stress: Stress, method: HeavyBallProjectedGradient, patch: pytest.MonkeyPatch
 ) -> tuple[MomentumWorkspace, MomentumWorkspace]:
-    """Return one workspace that the host leads, and one that the device does."""
+    """Return one workspace led by the host and one led by the device."""
     with patch.context() as alone:
         alone.setattr(StressAhead, "suits", lambda stress: False)
         host = method.init(stress)
@@ -119,7 +122,7 @@ def workspaces(
 
 
 def drawn_method(rng: np.random.Generator) -> HeavyBallProjectedGradient:
-    """Return settings with limits, patience and least numbers of steps that a short solve meets."""
+    """Return settings with limits, patience and least step counts of short solves."""
     if rng.random() < 0.3:
         return HeavyBallProjectedGradient()
     calm = tuple(float(v) for v in rng.uniform(0.0, 0.9, int(rng.integers(0, 4))))
@@ -134,7 +137,7 @@ def drawn_method(rng: np.random.Generator) -> HeavyBallProjectedGradient:
 
 
 def drawn_criteria(rng: np.random.Generator) -> wl.StoppingCriteria:
-    """Return an absolute tolerance, loose or beyond reach, and a limit of steps."""
+    """Return an absolute tolerance, loose or unreachable, and a limit of steps."""
     most = int(rng.choice([0, 1, 7, 10, 33, 150, 400]))
     return wl.StoppingCriteria(
         rtol=0.0, atol=SCALE * 10.0 ** rng.integers(-9, 2), max_iterations=most
@@ -143,7 +146,10 @@ def drawn_criteria(rng: np.random.Generator) -> wl.StoppingCriteria:
 
 @pytest.mark.parametrize("seed", range(18))
 def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same stresses, momenta, records and ends, bit for bit, of solves one after another."""
+    """Solves equal to those of the host.
+
+    The same stresses, momenta, records and ends, bit for bit, of solves one after another.
+    """
     rng = np.random.default_rng(7300 + seed)
     twin, method = Twin(rng), drawn_method(rng)
     host, device = workspaces(twin.stress, method, monkeypatch)
@@ -166,7 +172,7 @@ def test_what_is_not_finite_ends_both_alike(
     at = np.flatnonzero(twin.packing.flags.numpy())[0]
     if where == "stress":
         twin._start.reshape(len(twin._start), -1)[0, at] = wrong
-        twin._last = DT  # else they are none to begin with
+        twin._last = DT  # otherwise there are none at the start
     else:
         field = twin.packing.start[1]
         values = field.numpy().copy()
@@ -233,5 +239,5 @@ def test_a_solve_is_read_once() -> None:
         assert status is wl.SolveStatus.CONVERGED
         assert iterations > 0
         assert len(rows) == 2
-    assert counts[-1] == 1 + 3 + twin.grid.dimension  # the solve, and what the test looks at
+    assert counts[-1] == 1 + 3 + twin.grid.dimension  # the solve, and the readbacks of the test
     assert math.isfinite(work.norm)

@@ -1,4 +1,4 @@
-"""Solids thinner than cells among sand: no grain passes, and sand rests on them."""
+"""Solids thinner than cells in sand: no leaks, and sand rests on them."""
 
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,10 @@ def test_sand_rests_on_a_plate(thickness: float, offset: float) -> None:
 
 
 def test_no_grain_passes_the_sides_of_a_funnel() -> None:
-    """Sides of 0.6 cells, steep, with a neck of 5 cells: what is below the funnel is below its neck."""
+    """Sides of a funnel without leaks.
+
+    Steep sides of 0.6 cells, with a neck of 5 cells: all sand below the funnel is below its neck.
+    """
     sides = [
         {
             "shape": "capsule",

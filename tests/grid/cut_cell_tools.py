@@ -1,4 +1,4 @@
-"""What the tests of cut cells share: grids, placed solids, polygons that are clipped by hand."""
+"""Helpers of the tests of cut cells: grids, placed solids, clipped polygons."""
 
 import itertools
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Function:
-    """A solid whose distance is any function of points, shape (m, 3)."""
+    """Solid whose distance is any function of points, shape (m, 3)."""
 
     value: Any
 
@@ -60,14 +60,20 @@ def cut_cells(grid, *geometries, **options):
 
 
 def tilted(dimension, direction):
-    """A plane through a point that is no node, and its unit normal and offset in cells: the open is where n.X > offset."""
+    """Return a plane through a point that is no node, its normal and offset in cells.
+
+    The open side is n.X > offset; the normal is of unit length.
+    """
     normal = np.array(direction) / np.linalg.norm(direction)
     point = SPACING * np.array([3.37, 3.21, 2.83][:dimension])
     return Plane(point=point, normal=normal), normal, float(normal @ (point / SPACING + 1.0))
 
 
 def clip(polygon, normal, offset):
-    """Return the part of a polygon, shape (m, 3), where normal.x > offset (Sutherland & Hodgman)."""
+    """Return the part of a polygon where normal.x > offset, shape (m, 3).
+
+    By Sutherland & Hodgman's algorithm.
+    """
     result = []
     side = polygon @ normal - offset
     for a, b, da, db in zip(
@@ -88,7 +94,10 @@ def area_of(polygon):
 
 
 def face_polygon(axis, i, j, k):
-    """The lower face of cell (k, j, i) in grid coordinates, shape (4, 3); in 2-D its third direction is from 1 to 2."""
+    """Return the lower face of cell (k, j, i) in grid coordinates, shape (4, 3).
+
+    In 2-D its third direction is from 1 to 2.
+    """
     p, q = (other for other in range(3) if other != axis)
     corners = np.tile(np.array([i, j, k], dtype=np.float64), (4, 1))
     corners[1, p] += 1.0
@@ -99,7 +108,7 @@ def face_polygon(axis, i, j, k):
 
 
 def interior_faces(grid, axis):
-    """Yield the (i, j, k) of the faces of a component that lie between two cells."""
+    """Yield the (i, j, k) of the faces of a component between two cells."""
     yield from itertools.product(
         *(range(2 if a == axis else 1, count + 1) for a, count in enumerate(grid.counts))
     )
@@ -108,7 +117,7 @@ def interior_faces(grid, axis):
 MOVING = {
     2: [
         (Sphere(center=[0.3, 0.3], radius=0.17), Translation(velocity=[0.4, 0.1])),
-        # whole cells at times
+        # Whole cells at some times.
         (Box(lower=[0.0, 0.2], upper=[0.2, 0.4]), Translation(velocity=[0.1, 0.0])),
     ],
     3: [

@@ -37,7 +37,11 @@ def uniform(grid: StaggeredGrid, velocity: tuple[float, ...]) -> list[wp.array]:
 
 
 def test_third_order_on_a_rotating_blob() -> None:
-    """A rigid rotation is linear, so the grid interpolates it exactly and what remains is the time step's error."""
+    """Third order on a rotating blob.
+
+    A rigid rotation is linear, so the grid interpolates it exactly; the error is that of the time
+    step.
+    """
     grid = StaggeredGrid((32, 32, 1), 1.0 / 32, 2)
     j, i = np.meshgrid(np.arange(34), np.arange(34), indexing="ij")
     fields = grid.faces()
@@ -117,7 +121,10 @@ def test_a_thin_wall_is_not_jumped() -> None:
 
 
 def test_a_diagonal_gap_is_closed() -> None:
-    """Two solids that touch at an edge let nothing through, whichever face a particle meets first."""
+    """Closed diagonal gap.
+
+    Two solids that touch at an edge let nothing through, whichever face a particle meets first.
+    """
     solid = np.zeros((1, 6, 8), bool)
     solid[0, 2, 4] = solid[0, 3, 3] = True
     starts = [[0.33, 0.22, 0.0], [0.31, 0.24, 0.0], [0.35, 0.25, 0.0]]
@@ -149,7 +156,7 @@ def test_clearance_is_the_distance_to_the_nearest_solid(grid: StaggeredGrid) -> 
     solid = np.random.default_rng(88).random((nz, ny, nx)) < 0.01
     cells = cells_of(grid, solid)
     room = clearance(grid, cells).numpy()
-    # in 2-D no cell beyond the plane counts
+    # In 2-D cells beyond the plane do not count.
     planes = slice(1, 2) if grid.dimension == 2 else slice(None)
     at = np.argwhere(cells.numpy()[planes] == SOLID)
     everywhere = np.argwhere(np.ones(cells.numpy()[planes].shape))
@@ -160,7 +167,11 @@ def test_clearance_is_the_distance_to_the_nearest_solid(grid: StaggeredGrid) -> 
 @pytest.mark.parametrize("grid", [FLAT, StaggeredGrid((20, 9, 11), 0.1, 3)], ids=["2d", "3d"])
 @pytest.mark.parametrize("reach", [0.4, 3.0, 20.0])
 def test_particles_far_from_solids_need_not_walk(grid: StaggeredGrid, reach: float) -> None:
-    """With a clearance of 1 everywhere each particle that leaves its cell walks; both ways lead to the same place."""
+    """Advection of particles far from solids without walking through cells.
+
+    With a clearance of 1 everywhere each particle that leaves its cell walks; both ways have the
+    same result.
+    """
     rng = np.random.default_rng(505)
     nx, ny, nz = grid.counts
     cells = cells_of(grid, rng.random((nz, ny, nx)) < 0.03)
@@ -179,7 +190,8 @@ def test_particles_far_from_solids_need_not_walk(grid: StaggeredGrid, reach: flo
         stopped = wp.zeros(1, dtype=wp.int32, device="cpu")
         advect(grid, fields, clear, reach * grid.spacing / 2, position, stopped)
         found.append((position.numpy(), int(stopped.numpy()[0])))
-    # where a stage ends on another side of a face by rounding, a particle may go elsewhere
+    # Where rounding puts the end of a stage on the other side of a face, a particle may go
+    # elsewhere.
     apart = np.abs(found[0][0] - found[1][0]).max(axis=1) > 1e-4 * grid.spacing
     assert apart.mean() < 2e-3
     assert found[0][1] == pytest.approx(found[1][1], abs=5)

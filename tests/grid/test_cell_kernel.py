@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of cells and pieces, and passes over boxes of stored cells, against NumPy."""
+"""Kernels of cells and row segments, and box passes, against NumPy."""
 
 from pathlib import Path
 
@@ -17,14 +17,14 @@ WINDOW = GRID.window((2, 1, 2), (4, 3, 3))  # stored cells 2 <= k < 4, 1 <= j < 
 
 @cell_kernel("tests.cell_kernel")
 def mark_kernel(k, j, i, factor: float, out: F32):
-    """Write where a cell is."""
+    """Write the position of a cell."""
     if i != 3:  # a comment
         out[k, j, i] = factor * float(100 * k + 10 * j + i)
 
 
 @cell_kernel("tests.cell_kernel")
 def sum_kernel(row, chunk, k, j, first, end, field: F32, out: F32):
-    """Add up a row, and say which."""
+    """Write the sum of a row, and its number."""
     total = float(0.0)
     for i in range(first, end):
         total += field[k, j, i]
@@ -77,7 +77,7 @@ def test_the_cell_below_stays_in_the_array(axis: int) -> None:
 def box_pass(tmp_path_factory) -> RowPass:
     header = tmp_path_factory.mktemp("headers") / "box.h"
     header.write_text(
-        "double total = 0; const int n = 7;\n"  # a name of the pass itself
+        "double total = 0; const int n = 7;\n"  # a name in the pass itself
         "for (int i = first; i < last; ++i) { y[i] = (T)(SCALE*(x[i] + (z ? z[i - s1 - s2] : "
         "(T)n))); total += y[i]; }\n"
         "sums[P.row] = total;\n"
@@ -143,7 +143,11 @@ def test_what_is_said_of_a_box_that_is_wrong(box_pass: RowPass) -> None:
 
 
 def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> None:
-    """Pointers are those of a box, into the first layer of a field that has several; cells that are not listed keep their value."""
+    """Pass over listed cells: same view as in their rows.
+
+    Pointers are those of a box, into the first layer of a field with several; cells that are not
+    listed keep their value.
+    """
     header = tmp_path / "mark.h"
     header.write_text(
         "for (int i = first; i < last; ++i) y[i + s1*given.x.shape[0]] = x[i] + (T)(10000*k + "
@@ -182,7 +186,7 @@ def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> 
 @pytest.mark.cpu_form("how many entries a thread takes")
 @pytest.mark.parametrize("grain", [None, 4])
 def test_a_pass_over_entries(grain: int | None, tmp_path: Path) -> None:
-    """A list is the row of a box; a thread takes some of it."""
+    """Pass over entries: a list is the row of a box, and each thread takes some of it."""
     header = tmp_path / "double.h"
     header.write_text(
         "for (int n = first; n < last; ++n) { y[n] = 2*x[n]; z[n] = last - first; }\n"

@@ -47,9 +47,9 @@ def test_fractions_are_exact_for_planes(dimension, direction):
                 assert computed[k, j, i] == pytest.approx(exact, abs=1e-5)
             assert wall[k, j, i] == (-1 if computed[k, j, i] == 1.0 else 1)
             seen += 0.0 < exact < 1.0
-        assert (computed[outside] == 0.0).all()  # the domain's faces, and what lies outside
+        assert (computed[outside] == 0.0).all()  # the domain's faces, and everything outside
         assert (wall[outside] == 0).all()
-    # a plane between nodes cuts the faces across it in one layer at least
+    # A plane between nodes cuts the faces across it in at least one layer.
     assert seen >= 6
     assert not cut.whole_cells
     assert cut.dropped == 0
@@ -59,7 +59,10 @@ def test_fractions_are_exact_for_planes(dimension, direction):
     ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
 )
 def test_open_faces_and_wall_close_every_cell(dimension, direction):
-    """The area vectors of the open parts of a cell's faces and of the wall within it sum to zero."""
+    """Closure of every cell by open faces and wall.
+
+    The area vectors of the open parts of a cell's faces and of the wall within it sum to zero.
+    """
     grid = grid_of(dimension)
     plane, normal, offset = tilted(dimension, direction)
     cut = cut_cells(grid, plane)
@@ -74,13 +77,16 @@ def test_open_faces_and_wall_close_every_cell(dimension, direction):
         open_area = np.array([upper[a] - fields[a][k, j, i] for a in range(dimension)])
         wall = wall_area(np.array([i, j, k], dtype=np.float64), normal3, offset, dimension)
         walls += wall > 0.0
-        # a dropped face misses 1e-3
+        # A dropped face changes the sum by 1e-3.
         np.testing.assert_allclose(open_area, wall * normal, atol=3e-3 if wall else 1e-6)
     assert walls > 0
 
 
 def wall_area(low, normal, offset, dimension):
-    """The area (in 2-D length) of the plane n.x = offset in the unit cell at `low`: clip a large square of the plane by the cell."""
+    """Return the area (in 2-D length) of the plane n.x = offset in a cell at `low`.
+
+    A large square of the plane is clipped by the cell.
+    """
     across = np.linalg.svd(normal[None])[2][1:]
     center = low + 0.5
     center = center - (normal @ center - offset) * normal
@@ -127,12 +133,17 @@ def test_slices_of_a_ball_converge_with_second_order(dimension):
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("value", [-0.01, 0.01])
 def test_the_mean_decides_saddles(dimension, value):
-    """On faces across z (in 2-D there is none) d = x y + value has open corners across; with a positive mean they meet."""
+    """Resolution of saddles by the mean.
+
+    On faces across z (in 2-D there is none) d = x y + value has open corners across; with a
+    positive mean they are connected.
+    """
     grid = grid_of(dimension, (4, 4, 4), 1.0)
     if dimension == 2:
         saddle = Function(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value)
         cut = cut_cells(grid, saddle)
-        # d at the corners of cell (2, 2): 1/4 + value and -1/4 + value; an edge is open on one side
+        # d at the corners of cell (2, 2): 1/4 + value and -1/4 + value; an edge is open on one
+        # side.
         np.testing.assert_allclose(
             cut.open[0].numpy()[1, 2, 2:4], 0.5 + 2.0 * value * np.ones(2), atol=1e-6
         )
@@ -171,7 +182,7 @@ def test_mesh_agrees_with_samples_of_its_faces():
                 wp.array(grid.to_world(points), dtype=wp.vec3, device="cpu"), distance
             )
             errors.append(computed[k, j, i] - (distance.numpy() > 0.0).mean())
-    # not the largest: a face that the surface grazes between its corners may be off by much
+    # Not the largest: a face that the surface grazes between its corners may be far off.
     assert np.quantile(np.abs(errors), 0.95) < 0.05
     assert np.abs(errors).mean() < 0.01
 
@@ -200,7 +211,7 @@ BOXES = {
 
 
 def in_space(box):
-    """The same box with a limited third direction."""
+    """Return the same box with a limited third direction."""
     lower, upper = (0.1, 0.4) if box.lower[0] > -1.0 else (-1.0, 2.0)
     placement = Placement(rotation=box.placement.rotation, translation=box.placement.translation)
     return Box(
@@ -212,7 +223,10 @@ def in_space(box):
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("size", [1.0, 1.0 / 7.0, 12.7])
 def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
-    """The cells and faces are those of `voxelize`: rounding of the nodes' places must not show."""
+    """Boxes of whole cells: cells and faces of `voxelize`.
+
+    Rounding of the nodes' positions must not show.
+    """
     solids = [box if dimension == 2 else in_space(box) for box in BOXES[name]]
     if size != 1.0:
         scaled = [
@@ -242,7 +256,7 @@ def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
         open_face = (index < 0) & (below < 0)
         computed, wall = cut.open[axis].numpy(), cut.wall[axis].numpy()
         np.testing.assert_array_equal(computed[inside], open_face[inside])
-        # a face between an open cell and a solid one is that solid's
+        # A face between an open cell and a solid one belongs to that solid.
         owner = np.where(
             index < 0, below, np.where(below < 0, index, np.where(index == below, index, -5))
         )
@@ -255,7 +269,10 @@ def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
 
 
 def kernel_sums(open_cells, dimension):
-    """The quadratic B-spline's integral over cells marked open: 1/6, 2/3, 1/6 along each axis."""
+    """Return the quadratic B-spline's integral over open cells.
+
+    Its weights are 1/6, 2/3, 1/6 along each axis.
+    """
     result = open_cells.astype(np.float64)
     for axis in range(3 - dimension, 3):
         result = (np.roll(result, 1, axis) + np.roll(result, -1, axis)) / 6.0 + result * (2.0 / 3.0)
@@ -263,7 +280,10 @@ def kernel_sums(open_cells, dimension):
 
 
 def line_distribution(normal, offset, points=240):
-    """The open share {n.x > offset} of a kernel about the origin: the exact integral along one axis, the midpoint rule across."""
+    """Return the open share {n.x > offset} of a kernel about the origin.
+
+    It is the exact integral along one axis and the midpoint rule across.
+    """
     dimension, main = len(normal), int(np.argmax(np.abs(normal)))
     at = (np.arange(points) + 0.5) * (3.0 / points) - 1.5
     across = np.meshgrid(*[at] * (dimension - 1), indexing="ij")
@@ -308,7 +328,7 @@ def test_capacity_of_planes(dimension, direction):
 
 def test_capacity_of_a_disc_and_the_walls_beside_it():
     grid = grid_of(2, (20, 16), 0.05)
-    disc = Sphere(center=[0.12, 0.31], radius=0.22)  # cut off by the domain's left wall
+    disc = Sphere(center=[0.12, 0.31], radius=0.22)  # cut by the domain's left wall
     capacity = cut_cells(grid, disc).capacity.numpy()[1, 1:-1, 1:-1]
     fine = 20
     x, y = (0.05 * ((np.arange(n * fine) + 0.5) / fine) for n in (20, 16))
@@ -318,19 +338,23 @@ def test_capacity_of_a_disc_and_the_walls_beside_it():
         for n, at in ((20, x), (16, y))
     ]
     exact = kernels[1] @ open_part @ kernels[0].T
-    # chords instead of arcs leave 1 / (12 radius) open too much along the wall
+    # Chords in place of arcs leave 1 / (12 radius) too much open area along the wall.
     assert np.abs(capacity - exact).max() < 0.02
     assert np.abs(capacity - exact).mean() < 2e-3
 
 
 def table():
-    """The quadratic B-spline over distances [m] of a grid of 0.05 m, finely tabulated."""
+    """Return the quadratic B-spline over distances [m] of a grid of 0.05 m."""
     r = np.linspace(0.0, 1.6, 3201)
     return 0.05 * r, np.where(r < 0.5, 0.75 - r**2, np.where(r < 1.5, 0.5 * (1.5 - r) ** 2, 0.0))
 
 
 def test_capacities_add_up_to_the_open_volume():
-    """The kernels of all cells, the ring's included, sum to 1 everywhere; a mesh's volume is known from its triangles."""
+    """Sum of capacities: the open volume.
+
+    The kernels of all cells, including the ring, sum to 1 everywhere; a mesh's volume is known from
+    its triangles.
+    """
     errors = []
     for cells in (20, 40):
         grid = grid_of(3, (cells, cells, cells // 2), 1.2 / cells)
@@ -356,7 +380,10 @@ def test_a_mesh_is_cut_in_two_dimensions():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_thread_a_cell_finds_the_same(dimension):
-    """As CUDA runs the kernels: no thread may rely on what another of its row has done."""
+    """Equal results with one thread per cell.
+
+    CUDA runs the kernels so: no thread may rely on another of its row.
+    """
     solids = [geometry for geometry, _ in MOVING[dimension]]
     grid = grid_of(dimension, (12, 9, 7), 0.1)
     with pytest.MonkeyPatch.context() as patch:
@@ -437,7 +464,7 @@ def test_faces_belong_to_the_solid_nearest_to_their_centers():
         assert ((wall >= 1) == (cut.open[axis].numpy()[inside] < 1.0)).all()
         chosen = np.take_along_axis(distances, np.maximum(wall - 1, 0)[None].astype(int), axis=0)[0]
         closed = wall >= 1
-        # a third of a cell: those are equally near
+        # Distances within a third of a cell count as equal.
         assert (chosen - distances.min(axis=0))[closed].max() < 0.03
         counts += np.bincount(wall[closed], minlength=4)
     assert (counts[1:] > 20).all()
@@ -454,7 +481,10 @@ def test_an_empty_domain():
 
 
 def test_slivers_are_dropped_and_counted():
-    """The plane leaves 5e-4 of a cell open above nodes: closed, and never more than it was."""
+    """Slivers, dropped and counted.
+
+    The plane leaves 5e-4 of a cell open above nodes: closed, and never more open than before.
+    """
     grid = grid_of(2, (6, 5))
     cut = cut_cells(grid, Plane(point=[0.0, 0.29995], normal=[0.0, 1.0]))
     x = cut.open[0].numpy()[1]
@@ -462,7 +492,7 @@ def test_slivers_are_dropped_and_counted():
     assert (x[4, 2:7] == 1.0).all()
     assert cut.dropped == 5
     assert cut.notes == ("5 faces are less than 0.001 open and count as closed",)
-    # their cells keep the open faces above and are not SOLID
+    # Their cells keep the open faces above and are not SOLID.
     assert (cut.base.numpy()[1, 3, 1:7] == wl.AIR).all()
     assert (cut.base.numpy()[1, 2, 1:7] == wl.SOLID).all()
 

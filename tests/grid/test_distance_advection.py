@@ -13,7 +13,7 @@ from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((24, 20, 1), 0.1, 2)
 SPACE = StaggeredGrid((18, 16, 14), 0.1, 3)
-# of points in cells from the domain's corner, shape (..., 3), in cells
+# Distances of points, shape (..., 3), both in cells from the domain's corner.
 Distance = Callable[[np.ndarray], np.ndarray]
 
 
@@ -86,7 +86,7 @@ def open_points(
     rng: np.random.Generator,
     least: float = MARGIN,
 ) -> np.ndarray:
-    """Return points [m] among walls, a third of them as near as may be."""
+    """Return points [m] between walls, a third of them as near as allowed."""
     x = rng.uniform(0, 1, (20 * count, 3)) * np.array(grid.counts) * grid.spacing
     x[:, 2] *= grid.dimension == 3
     s = between_nodes(grid, distance, x)
@@ -127,7 +127,11 @@ def test_away_from_walls_it_is_the_step_among_whole_cells(grid: StaggeredGrid) -
 
 
 def test_third_order_on_a_rotation() -> None:
-    """A rigid rotation is linear, so the grid interpolates it exactly and what remains is the time step's error."""
+    """Third order on a rotation.
+
+    A rigid rotation is linear, so the grid interpolates it exactly; the error is that of the time
+    step.
+    """
     grid = StaggeredGrid((32, 32, 1), 1.0 / 32, 2)
     angle = np.linspace(0, 6, 40)
     start = np.stack([0.5 + 0.3 * np.cos(angle), 0.5 + 0.3 * np.sin(angle), 0 * angle], axis=1)
@@ -150,7 +154,10 @@ def test_third_order_on_a_rotation() -> None:
 def test_a_plane_stops_the_normal_part_and_lets_the_tangential_part_go(
     normal: tuple[float, float, float], cells: float
 ) -> None:
-    """What an inclined plane leaves of a straight way is known: start + way, less the normal part beyond the wall."""
+    """Inclined plane: the normal part stops, the tangential part continues.
+
+    The end is start + way, less the normal part beyond the wall.
+    """
     grid = FLAT if normal[2] == 0 else StaggeredGrid((24, 20, 24), 0.1, 3)
     n = np.array(normal) / np.linalg.norm(normal)
     tangent = np.array([n[1], -n[0], 0.0]) / np.hypot(n[0], n[1])
@@ -204,14 +211,14 @@ def test_nobody_ends_inside_a_wall(grid: StaggeredGrid, random_seed: int, cells:
 def test_a_thin_plate_is_not_tunnelled(
     grid: StaggeredGrid, thickness: float, x0: float, sine: float
 ) -> None:
-    """At CFL 8 a particle would end far beyond."""
+    """Thin plate without tunnelling; at CFL 8 a particle would end far beyond."""
     rng = np.random.default_rng(616)
     distance = at_nodes(grid, plate(x0, thickness))
     start = open_points(grid, distance, 500, rng)
     start = start[start[:, 0] < x0 * grid.spacing]
     points, stopped = move(grid, velocities(grid, (8.0, 8.0 * sine)), distance, grid.spacing, start)
     assert stopped > 0.5 * len(start)
-    # a node behind the middle measures to the far side
+    # A node behind the middle measures to the far side.
     assert (points[:, 0] / grid.spacing < x0 - 0.5 * thickness + 0.05).all()
     free = (start[:, 0] / grid.spacing + 8.0 < x0 - thickness) & (
         start[:, 1] / grid.spacing + 8 * sine < grid.counts[1] - 1
@@ -221,7 +228,10 @@ def test_a_thin_plate_is_not_tunnelled(
 
 @pytest.mark.parametrize("grid", [FLAT, SPACE], ids=["2d", "3d"])
 def test_a_sphere_is_flown_around(grid: StaggeredGrid) -> None:
-    """A uniform wind blows particles along a sphere until its equator, and off there."""
+    """Flow around a sphere.
+
+    A uniform wind blows particles along a sphere to its equator, and away from it there.
+    """
     center = np.array([10.0, 9.0, 7.0 * (grid.dimension == 3)])
     distance = at_nodes(grid, sphere(tuple(center), 3.0))
     rows = np.array([0.1, 0.5, 1.5, 2.5, 3.5])
@@ -242,7 +252,10 @@ def test_a_sphere_is_flown_around(grid: StaggeredGrid) -> None:
 
 
 def test_corners_of_the_domain_hold_particles() -> None:
-    """In the edge between walls the interpolated distance is a product, whose gradient vanishes."""
+    """Particles in corners of the domain.
+
+    In the edge between walls the interpolated distance is a product, whose gradient vanishes.
+    """
     for grid, way in ((FLAT, (3.0, -2.0)), (SPACE, (3.0, -2.0, 4.0))):
         sign = np.sign([*way, 0.0][:3])
         corner = np.where(sign > 0, grid.counts, 0.0) * [1, 1, grid.dimension == 3]
@@ -259,7 +272,11 @@ def test_corners_of_the_domain_hold_particles() -> None:
 
 
 def test_a_wall_ahead_of_a_floor_does_not_send_particles_up() -> None:
-    """A particle that slides along the floor into a wall of the domain stops there: the rounded edge is no ramp."""
+    """Wall ahead of a floor: particles do not rise.
+
+    A particle that slides along the floor into a wall of the domain stops there: the rounded edge
+    is no ramp.
+    """
     start = np.array([[20.3, 1.2 * MARGIN, 0.0], [21.7, 0.4, 0.0]]) * FLAT.spacing
     points, stopped = move(FLAT, velocities(FLAT, (5.0, -0.5)), at_nodes(FLAT), FLAT.spacing, start)
     assert stopped == 2
@@ -279,7 +296,10 @@ def test_a_ramp_on_the_floor_is_climbed() -> None:
 
 
 def test_who_slid_over_a_ledge_goes_on_along_it() -> None:
-    """What the wall has taken from the way stays taken where the wall ends."""
+    """Slide over a ledge.
+
+    The part of the way that the wall has removed stays removed where the wall ends.
+    """
 
     def ledge(x: np.ndarray) -> np.ndarray:
         out = np.stack([x[..., 0] - 12.0, x[..., 1] - 8.0], axis=-1)
@@ -294,7 +314,10 @@ def test_who_slid_over_a_ledge_goes_on_along_it() -> None:
 
 
 def test_a_wedge_stops_particles() -> None:
-    """Between two walls there is nowhere to slide to: the particle ends in the wedge, in the open."""
+    """Wedge between two walls.
+
+    There is no direction to slide: the particle ends in the wedge, in the open.
+    """
 
     def wedge(x: np.ndarray) -> np.ndarray:
         return np.minimum(
@@ -312,7 +335,10 @@ def test_a_wedge_stops_particles() -> None:
 
 
 def test_where_there_is_no_way_out_a_particle_stays() -> None:
-    """A field without a gradient inside the wall, as of a distance that was cut off."""
+    """Field without a gradient inside the wall: the particle stays.
+
+    As of a distance that was cut off.
+    """
     host = at_nodes(FLAT).numpy().copy()
     host[1, :, 12:] = -1.0
     host[1, :, 11] = 0.5
@@ -355,7 +381,10 @@ def test_velocities_that_are_not_finite_do_not_crash() -> None:
 def test_particles_are_pushed_out_along_the_normal(
     grid: StaggeredGrid, normal: tuple[float, float, float]
 ) -> None:
-    """Out of a plane the way is known; beyond PUSH cells nobody is moved."""
+    """Push-out of particles along the normal.
+
+    Out of a plane the way is known; beyond PUSH cells no particle moves.
+    """
     n = np.array(normal)
     at = np.array([9.0, 8.0, 7.0 * (grid.dimension == 3)])
     depths = np.array([-2.0, -MARGIN, 0.0, 0.3, 1.7, 2.8, PUSH + 0.5])
@@ -364,7 +393,7 @@ def test_particles_are_pushed_out_along_the_normal(
     moved, left = (wp.zeros(1, dtype=wp.int32, device="cpu") for _ in range(2))
     push_out(grid, at_nodes(grid, plane(tuple(at), normal)), position, moved, left)
     end = position.numpy() / grid.spacing
-    # at MARGIN itself rounding decides
+    # At MARGIN itself rounding decides.
     assert (int(moved.numpy()[0]), int(left.numpy()[0])) in ((4, 1), (5, 1))
     assert end[[0, 6]] == pytest.approx(start[[0, 6]], abs=1e-5)
     assert end[1:6] == pytest.approx(np.broadcast_to(at + 1.1 * MARGIN * n, (5, 3)), abs=1.5e-4)
@@ -390,5 +419,5 @@ def test_a_sphere_that_moved_leaves_nobody_inside(random_seed: int) -> None:
     assert (between_nodes(SPACE, after, end) >= 0.99 * MARGIN).all()
     away = between_nodes(SPACE, after, start) > 1.01 * MARGIN
     assert end[away] == pytest.approx(start[away], abs=1e-6)
-    # near its middle a sphere's gradient is off
+    # Near its middle a sphere's gradient is inexact.
     assert np.linalg.norm(end - start, axis=1).max() < (2.0 + 0.5) * SPACE.spacing

@@ -44,7 +44,7 @@ def test_layers_are_means_of_known_neighbors(
     rng = np.random.default_rng(random_seed)
     known = rng.choice([BLOCKED, UNKNOWN, 1], size=grid.shape, p=[0.3, 0.6, 0.1]).astype(np.int8)
     if grid.dimension == 2:
-        known[[0, 2]] = BLOCKED + UNKNOWN - fill  # planes not in use are left alone
+        known[[0, 2]] = BLOCKED + UNKNOWN - fill  # planes not in use are unchanged
     field = rng.normal(size=grid.shape).astype(np.float32)
     marks, values = (
         wp.array(known, dtype=wp.int8, device="cpu"),

@@ -1,4 +1,7 @@
-"""The level set against planes, balls and walls whose density is an integral known in closed form, and against sums taken one by one."""
+"""Level set of particles.
+
+Against planes, balls and walls with a density integral in closed form, and against plain sums.
+"""
 
 import itertools
 
@@ -27,7 +30,10 @@ def on_device(host: np.ndarray) -> wp.array:
 
 
 def fill(grid: StaggeredGrid, low: list[float], high: list[float], per_cell: int) -> np.ndarray:
-    """Return points at the centers of parts of a box [cells]; the parts are as near 1 / per_cell as divides the box."""
+    """Return points at the centers of parts of a box [cells].
+
+    The size of the parts is the nearest to 1 / per_cell that divides the box.
+    """
     axes = []
     for axis in range(3):
         n = round((high[axis] - low[axis]) * per_cell) if axis < grid.dimension else 1
@@ -49,7 +55,10 @@ def level_set(
     smoothing: int = 0,
     indexed: bool = False,
 ) -> LevelSet:
-    """Return the level set of points in cells, `a_cell` of them at rest; without a capacity that of whole cells."""
+    """Return the level set of points in cells, with `a_cell` of them at rest.
+
+    By default the capacity is that of whole cells.
+    """
     cells = on_device(box_of(grid) if base is None else base)
     particles = Particles(
         grid, points * grid.spacing, np.zeros_like(points), affine=False, indexed=indexed
@@ -66,14 +75,17 @@ def level_set(
 
 
 def centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
-    """Return the coordinate [cells] of the interior cells' centers, shaped for broadcasting."""
+    """Return the coordinate [cells] of interior cell centers, for broadcasting."""
     shape = [1, 1, 1]
     shape[2 - axis] = -1
     return (np.arange(grid.counts[axis]) + 0.5).reshape(shape)
 
 
 def share_below(s: np.ndarray) -> np.ndarray:
-    """Return the share of the quadratic B-spline below s, by numerical integration of its definition as three boxes convolved."""
+    """Return the share of the quadratic B-spline below s.
+
+    Its definition, a convolution of three boxes, is integrated numerically.
+    """
     n = 400
     box = np.full(n, 1.0 / n)
     kernel = np.convolve(np.convolve(box, box), box)
@@ -87,10 +99,11 @@ def share_below(s: np.ndarray) -> np.ndarray:
 def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(
     grid: StaggeredGrid, axis: int, side: int
 ) -> None:
-    """Sampled as densely as here (16 or 10 points an axis) a lattice is a continuum to 5e-3 cells; the domain's walls do not show.
+    """Distance to a plane, wherever it lies in a cell.
 
-    A wrong sign, a center off by half a cell or a capacity without the walls are all errors of a
-    tenth of a cell or more.
+    At this density (16 or 10 points along an axis) a lattice is a continuum to 5e-3 cells; the
+    domain's walls have no effect. A wrong sign, a center off by half a cell or a capacity without
+    the walls are errors of a tenth of a cell or more.
     """
     if axis >= grid.dimension:
         pytest.skip("no such axis")
@@ -102,8 +115,8 @@ def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(
             high[axis] = surface
         else:
             low[axis] = surface
-        # whole layers from the surface on, so that the density is right there; what is left over is
-        # at the far wall
+        # Whole layers from the surface on, so that the density is right there; the remainder is at
+        # the far wall.
         layers = int((high[axis] - low[axis]) * per_cell) / per_cell
         if side > 0:
             low[axis] = high[axis] - layers
@@ -123,7 +136,11 @@ def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(
 def test_particles_as_a_liquid_has_them_put_the_surface_within_a_tenth_of_a_cell(
     grid: StaggeredGrid,
 ) -> None:
-    """The seeding of a scene: 2 an axis, moved by a quarter of their spacing. Mean and scatter of phi in cells beside the surface."""
+    """Surface of a scene's particles, within a tenth of a cell.
+
+    A scene has 2 particles along an axis of a cell, moved by a quarter of their spacing. The test
+    measures mean and scatter of phi in cells beside the surface.
+    """
     points = (
         np.concatenate([lattice(grid, 2, 0.25, 515, plane) for plane in range(grid.counts[2])])
         / grid.spacing
@@ -139,7 +156,11 @@ def test_particles_as_a_liquid_has_them_put_the_surface_within_a_tenth_of_a_cell
 
 @GRIDS
 def test_a_surface_that_meets_cut_walls_at_right_angles_is_not_biased(grid: StaggeredGrid) -> None:
-    """Solid where x < 2.3 and x > 8.6 cells: the capacity is a product of half-space distributions, given in closed form."""
+    """Surface that meets cut walls at right angles, without bias.
+
+    Solid where x < 2.3 and x > 8.6 cells: the capacity is a product of half-space distributions in
+    closed form.
+    """
     low_wall, high_wall, surface = 2.3, 8.6, 6.37
     per_cell = 20 if grid.dimension == 2 else 10
     top = [high_wall, surface, float(grid.counts[2])]
@@ -177,7 +198,11 @@ def test_a_surface_that_meets_cut_walls_at_right_angles_is_not_biased(grid: Stag
 def test_the_density_is_the_sum_of_the_particles_kernels(
     grid: StaggeredGrid, indexed: bool
 ) -> None:
-    """Against every pair of cell and particle in float64, each kernel evaluated from its distance."""
+    """Density as the sum of the particles' kernels.
+
+    The sum is over every pair of cell and particle in float64, each kernel evaluated from its
+    distance.
+    """
     rng = np.random.default_rng(31415)
     points = rng.random((400, 3)) * np.array(grid.counts)
     points[0] = 1e-3  # a corner
@@ -210,7 +235,7 @@ def test_gathered_and_scattered_surfaces_agree(grid: StaggeredGrid) -> None:
         level_set(grid, points, 2**grid.dimension, indexed=indexed).phi.numpy()
         for indexed in (False, True)
     ]
-    # the cube root near 1.5 magnifies rounding
+    # The cube root near 1.5 magnifies rounding.
     assert fields[0] == pytest.approx(fields[1], abs=2e-2)
     near = np.abs(fields[0]) < 1.0
     assert fields[0][near] == pytest.approx(fields[1][near], abs=1e-5)
@@ -218,7 +243,10 @@ def test_gathered_and_scattered_surfaces_agree(grid: StaggeredGrid) -> None:
 
 @GRIDS
 def test_a_lone_particle_is_spray(grid: StaggeredGrid) -> None:
-    """It is no liquid anywhere, wherever it is in its cell, and encloses nothing."""
+    """Lone particle as spray.
+
+    It is no liquid anywhere, wherever it is in its cell, and encloses nothing.
+    """
     for shift in (0.0, 0.25, 0.5):
         point = np.array([[5.0 + shift, 5.0 + shift, 0.0 if grid.dimension == 2 else 5.0 + shift]])
         made = level_set(grid, point, 2**grid.dimension)
@@ -228,7 +256,10 @@ def test_a_lone_particle_is_spray(grid: StaggeredGrid) -> None:
 
 @GRIDS
 def test_nothing_stays_behind_when_the_window_moves(grid: StaggeredGrid) -> None:
-    """Bit for bit what a fresh one finds, smoothed or not."""
+    """Moved window without remains of the last one.
+
+    It is equal bit for bit to a fresh level set, smoothed or not.
+    """
     base = on_device(box_of(grid))
     room = grid.field()
     whole_cell_capacity(grid, base, room)
@@ -254,7 +285,10 @@ def test_nothing_stays_behind_when_the_window_moves(grid: StaggeredGrid) -> None
 def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(
     grid: StaggeredGrid,
 ) -> None:
-    """An independent Jacobi sweep; what a sweep finds it does not use before the next."""
+    """Solid cells take the mean of their neighbors, layer by layer.
+
+    Compared with an independent Jacobi sweep; a sweep does not use its own results.
+    """
     rng = np.random.default_rng(1618)
     base = box_of(grid)
     base[rng.random(grid.shape) < 0.4] = SOLID
@@ -285,7 +319,11 @@ def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(
 def test_the_capacity_of_whole_cells_is_what_a_continuum_in_the_open_ones_weighs(
     grid: StaggeredGrid,
 ) -> None:
-    """Particles 12 an axis in every open cell: their density is the midpoint rule for the kernel's integral."""
+    """Capacity of whole cells: the weight of a continuum in the open ones.
+
+    With 12 particles along an axis in every open cell, the density is the midpoint rule of the
+    kernel's integral.
+    """
     rng = np.random.default_rng(6283)
     base = box_of(grid)
     base[rng.random(grid.shape) < 0.3] = SOLID
@@ -317,7 +355,11 @@ def ball(
 @pytest.mark.parametrize("smoothing", [0, 2])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_ball_of_twelve_cells_has_its_volume(dimension: int, smoothing: int) -> None:
-    """Within 1 %: the kernel's width makes a ball of radius R smaller by (dimension - 1)/(8 R) cells, and more so when smoothed."""
+    """Volume of a ball of twelve cells, within 1 %.
+
+    The kernel's width makes a ball of radius R smaller by (dimension - 1)/(8 R) cells, and more
+    when smoothed.
+    """
     grid = StaggeredGrid((36, 36, 1 if dimension == 2 else 36), 0.05, dimension)
     radius, center = 12.0, [18.2, 17.9, 18.1][:dimension]  # out of the walls' reach
     made = level_set(grid, ball(grid, center, radius, 2, 99), 2**dimension, smoothing=smoothing)
@@ -331,7 +373,11 @@ def test_a_ball_of_twelve_cells_has_its_volume(dimension: int, smoothing: int) -
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_volume_ends_at_a_wall_that_cuts_cells(dimension: int) -> None:
-    """All cells are full, the wall is a plane across them: what is left is a half of the domain, whatever phi is within the solid."""
+    """Volume up to a wall that cuts cells.
+
+    All cells are full and the wall is a plane: the result is half of the domain, whatever phi is
+    within the solid.
+    """
     nx, ny, nz = 16, 20, 1 if dimension == 2 else 14
     grid = StaggeredGrid((nx, ny, nz), 0.125, dimension)
     points = fill(grid, [0.0] * 3, [float(c) for c in grid.counts], 2)
@@ -348,16 +394,19 @@ def test_volume_ends_at_a_wall_that_cuts_cells(dimension: int) -> None:
     assert made.volume(on_device(walls.astype(np.float32)), grid.everywhere) == pytest.approx(
         whole, rel=1e-6
     )
-    # some is lost where the plane meets the domain's walls: there the distance is not linear
-    # between the nodes
+    # Some is lost where the plane meets the domain's walls: there the distance is not linear
+    # between the nodes.
     assert made.volume(distance, grid.everywhere) == pytest.approx(whole / 2, rel=6e-3)
-    # only what the window holds
+    # Only the contents of the window.
     assert made.volume(distance, grid.window((1, 1, 1), (8, 20, 14))) < whole / 2
     assert made.volume(None, Window((0, 0, 0), (1, 1, 1), grid.device)) == 0.0
 
 
 def test_smoothing_quiets_a_surface_and_keeps_its_place() -> None:
-    """Particles as random as rain: phi scatters less after two passes, and a plane stays where it is."""
+    """Smoothed surface with less noise in the same place.
+
+    Particles are uniformly random: phi scatters less after two passes, and a plane stays in place.
+    """
     rng = np.random.default_rng(77)
     surface = 7.4
     points = rng.random((round(16 * 14 * surface), 3)) * [14.0, surface, 0.0]
@@ -370,7 +419,7 @@ def test_smoothing_quiets_a_surface_and_keeps_its_place() -> None:
     made = level_set(FLAT, dense, 400, smoothing=2)
     expected = np.arange(16) + 0.5 - surface
     near = np.abs(expected) < 1.0
-    # the kernel is not quite normal
+    # The kernel is not quite normal.
     assert FLAT.interior(made.phi.numpy())[0, near, 3] == pytest.approx(expected[near], abs=0.04)
 
 

@@ -1,4 +1,4 @@
-"""Marching cubes and squares: closed whatever the field, with the volume of shapes known in closed form."""
+"""Marching cubes and squares: closed surfaces, and known volumes of shapes."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def centers(grid: StaggeredGrid) -> np.ndarray:
 
 
 def mesh_of(grid: StaggeredGrid, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and corners of phi = 0; the ring is made air."""
+    """Return points and corners of phi = 0; the ring is air."""
     closed = np.abs(phi) + 1.0
     inner = (slice(1, -1) if grid.dimension == 3 else slice(None), slice(1, -1), slice(1, -1))
     closed[inner] = phi[inner]
@@ -33,7 +33,10 @@ def mesh_of(grid: StaggeredGrid, phi: np.ndarray) -> tuple[np.ndarray, np.ndarra
 @GRIDS
 @pytest.mark.parametrize("seed", [3, 17, 291])
 def test_noise_has_a_closed_surface(grid, seed):
-    """Random signs show all 256 cases, the ambiguous ones next to each other."""
+    """Closed surface of noise.
+
+    Random signs include all 256 cases, with ambiguous ones next to each other.
+    """
     phi = np.random.default_rng(seed).standard_normal(grid.shape)
     points, corners = mesh_of(grid, phi)
     assert_closed(corners)
@@ -43,7 +46,7 @@ def test_noise_has_a_closed_surface(grid, seed):
 
 @GRIDS
 def test_a_ball_has_its_volume_and_faces_outward(grid):
-    center, radius = np.array([3.1, 2.3, 3.8 * (grid.dimension - 2)]), 1.5  # clear of the sides
+    center, radius = np.array([3.1, 2.3, 3.8 * (grid.dimension - 2)]), 1.5  # away from the sides
     phi = np.linalg.norm(centers(grid) - center, axis=-1) - radius
     points, corners = mesh_of(grid, phi)
     assert_closed(corners)
@@ -52,7 +55,7 @@ def test_a_ball_has_its_volume_and_faces_outward(grid):
     out = (points - center) / radius
     assert np.abs(np.linalg.norm(out, axis=1) - 1.0).max() < 0.03
     assert pieces(points, corners) == 1
-    # Euler's number of a sphere; of a loop 0
+    # Euler characteristic of a sphere; 0 for a loop.
     assert len(points) - len(corners) / 2 == (2 if grid.dimension == 3 else len(points) / 2)
 
 
@@ -68,7 +71,10 @@ def test_a_plane_is_exact():
 
 @GRIDS
 def test_what_fills_the_domain_is_cut_on_its_sides(grid):
-    """However deep the last cells are, the surface lies on the sides."""
+    """Cut on the sides of a domain full of material.
+
+    However deep the last cells are, the surface lies on the sides.
+    """
     points, corners = mesh_of(grid, np.full(grid.shape, -7.0))
     size = np.array(grid.counts) * grid.spacing
     assert_closed(corners)
@@ -95,7 +101,7 @@ def test_a_layer_of_one_cell_is_a_cell_thick():
     grid = StaggeredGrid((6, 5, 1), 0.5, 3)
     points, corners = mesh_of(grid, np.full(grid.shape, -1.0))
     assert_closed(corners)
-    # its edges are cut off where the centers lie
+    # Its edges are cut off where the centers lie.
     assert enclosed(points, corners) > 0.5 * 3.0 * 2.5 * 0.5
 
 

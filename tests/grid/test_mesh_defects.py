@@ -1,4 +1,4 @@
-"""What defects of a mesh do to its inside: each is healed and told with its place, or refused; none passes without a word."""
+"""Defects of a mesh: each is repaired and reported with its place, or refused."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def repeated_and_flipped(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def on_two_sides(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every triangle in both orientations, as modelers without an inside export them."""
+    """Return every triangle in both orientations, as some modelers export them."""
     return VERTICES, np.concatenate([TRIANGLES, TRIANGLES[:, ::-1]])
 
 
@@ -128,7 +128,10 @@ def test_a_part_inside_another_is_told() -> None:
 
 
 def test_a_part_that_is_turned_out_of_itself_is_refused() -> None:
-    """A figure of eight: one of its halves has a winding number of -1, and would be missing."""
+    """Refusal of an inverted part.
+
+    One half of a figure of eight has a winding number of -1 and would be missing.
+    """
     vertices = VERTICES.copy()
     vertices[:, 0] *= vertices[:, 2] + 0.3
     surface = close_surface(vertices, TRIANGLES, "eight")

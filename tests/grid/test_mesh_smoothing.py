@@ -1,4 +1,4 @@
-"""Smoothing of closed surfaces: rough ones become smooth, neither volume nor walls move."""
+"""Smoothing of closed surfaces, with constant volume and fixed walls."""
 
 import numpy as np
 import pytest

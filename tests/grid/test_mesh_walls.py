@@ -1,4 +1,4 @@
-"""The surface of material that fills what solids leave of a domain ends at their true walls, anyhow placed."""
+"""Surfaces of material up to the true walls of solids in any position."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,10 @@ def turned(rng: np.random.Generator, dimension: int) -> np.ndarray:
 
 
 def some_solid(kind: str, seed: int, dimension: int) -> tuple[Geometry, float | None]:
-    """Return a solid, and the volume [cells] within `OVERLAP` around what it leaves of the domain, if that has a formula."""
+    """Return a solid, and the volume [cells] of its complement in the domain.
+
+    The complement is widened by `OVERLAP`. The volume is None if there is no formula.
+    """
     rng = np.random.default_rng(seed)
     middle = np.zeros(3)
     middle[:dimension] = 0.5 * COUNT + rng.uniform(-1.0, 1.0, dimension)
@@ -69,7 +72,11 @@ def distance(solid: Geometry, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_surface_ends_at_the_true_wall(kind, dimension, seed):
-    """Without the fit boxes miss by up to 0.5 cells at their edges, and bowls and planes by 0.1 to 0.2 at the domain's sides."""
+    """Surface up to the true wall.
+
+    Without the fit boxes miss by up to 0.5 cells at their edges, and bowls and planes by 0.1 to 0.2
+    at the domain's sides.
+    """
     solid, volume = some_solid(kind, seed, dimension)
     grid = StaggeredGrid((COUNT, COUNT, COUNT if dimension == 3 else 1), DX, dimension)
     cut = CutCells(
@@ -100,7 +107,7 @@ def test_a_surface_ends_at_the_true_wall(kind, dimension, seed):
     assert on_solid.sum() > 10
     assert np.median(gap[on_solid]) == pytest.approx(-OVERLAP, abs=0.01)
     if volume is not None:
-        # of edge e within a ball they lie e^2 / (8 R) inside of it
+        # Facets of edge e within a ball lie e^2 / (8 R) inside of it.
         facets = 0.015 if kind in ("ball", "bowl") else 0.005
         assert enclosed(points / DX, corners) == pytest.approx(volume, rel=facets)
 
@@ -124,7 +131,10 @@ def test_a_boundary_has_the_shapes_where_its_solids_are():
 
 
 def test_no_point_leaves_the_domain_where_a_solid_ends_at_its_corner():
-    """Points on a side move along it to the wall, which lies beyond the side's end here."""
+    """Points inside the domain where a solid ends at its corner.
+
+    Points on a side move along it to the wall, which here lies beyond the side's end.
+    """
     normal = np.array([-0.476027, 0.879431, 0.0])
     solid = Plane(point=0.0917 * DX * normal, normal=normal)
     grid = StaggeredGrid((COUNT, COUNT, 1), DX, 2)

@@ -1,4 +1,7 @@
-"""Poses against formulas and 4 x 4 matrices; motions against their velocities, known in closed form."""
+"""Poses against formulas and 4 x 4 matrices; motions against their velocities.
+
+The velocities are known in closed form.
+"""
 
 import dataclasses
 import math
@@ -33,7 +36,10 @@ def cross_matrix(axis):
 
 
 def turn(axis, degrees):
-    """The rotation matrix as the series of exp(angle [axis]x), which knows nothing of Rodrigues or quaternions."""
+    """Return the rotation matrix as the series of exp(angle [axis]x).
+
+    It is independent of Rodrigues' formula and of quaternions.
+    """
     generator = math.radians(degrees) * cross_matrix(np.asarray(axis) / np.linalg.norm(axis))
     term, total = np.eye(3), np.eye(3)
     for order in range(1, 60):
@@ -54,7 +60,10 @@ def any_pose(seed):
 
 
 def velocity(motion, time, points=POINTS):
-    """The velocity of material points that are at `points` at `time`, by central differences of the poses."""
+    """Return the velocity of material points that are at `points` at `time`.
+
+    It follows from central differences of the poses.
+    """
     back = motion.pose(time).inverse().apply(points)
     return (motion.pose(time + STEP).apply(back) - motion.pose(time - STEP).apply(back)) / (
         2 * STEP
@@ -62,7 +71,7 @@ def velocity(motion, time, points=POINTS):
 
 
 def rigid(points, linear, angular, center):
-    """v = linear + angular x (p - center), with the angular velocity in degrees/s."""
+    """Return v = linear + angular x (p - center); angular velocity in degrees/s."""
     return np.asarray(linear) + np.cross(np.radians(angular), points - center)
 
 
@@ -115,7 +124,7 @@ def test_flat_rotations_are_counterclockwise_and_do_not_drift():
     np.testing.assert_allclose(
         motion.pose(1.0).apply(np.array([[2.0, 0.0, 0.0]])), [[1.0, 1.0, 0.0]], atol=1e-15
     )
-    # a thousand turns
+    # A thousand turns.
     np.testing.assert_allclose(matrix(motion.pose(4000.0)), np.eye(4), atol=1e-12)
 
 
@@ -189,7 +198,11 @@ def test_linear_keyframes_have_constant_velocities_between():
 
 
 def test_smooth_keyframes_rest_at_their_ends_and_do_not_overshoot_or_jump():
-    """A plain cubic spline through these places overshoots the plateau by 6 %; one without clamped ends sets off at 2 m/s."""
+    """Smooth keyframes: rest at the ends, no overshoot, no jump.
+
+    A plain cubic spline through these places overshoots the plateau by 6 %; one without clamped
+    ends starts at 2 m/s.
+    """
     motion = Keyframes(
         times=[0.0, 1.0, 2.0, 3.0],
         translate=[[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [2.0, 1.0]],
@@ -213,7 +226,7 @@ def test_turns_in_space_are_about_fixed_axes(smooth):
         center=[0.1, 0.2, 0.3],
         smooth=smooth,
     )
-    # x first, then y
+    # x first, then y.
     for time, expected in (
         (1.0, turn([1, 0, 0], 90)),
         (3.0, turn([0, 1, 0], 90) @ turn([1, 0, 0], 90)),
@@ -286,14 +299,14 @@ def test_top_speeds(dimension):
     drive = Translation(velocity=[3.0, -4.0], start=1.0, stop=1.1)
     assert top_speed(drive, rod, size, 1.02, 0.01) == pytest.approx(5.0)
     assert top_speed(drive, rod, size, 0.0, 0.5) == 0.0
-    # it sets off within the span
+    # The motion starts within the interval.
     assert top_speed(drive, rod, size, 0.99, 0.04) == pytest.approx(5.0)
     turn_about_end = Rotation(rate=math.degrees(2.0), center=[0.9, 0.5, 0.5])
     radius = math.hypot(0.6, 0.1)  # the far corners of the rod; z is along the axis
     assert (
         2.0 * radius * 0.99 < top_speed(turn_about_end, rod, size, 0.0, 0.02) < 2.0 * radius * 1.1
     )
-    # the room's corner
+    # Distance to the room's corner.
     assert top_speed(turn_about_end, None, size, 0.0, 0.02) == pytest.approx(
         2.0 * math.hypot(1.1, 0.5), rel=1e-3
     )
@@ -330,7 +343,7 @@ def test_top_speed_is_the_mean_one_of_the_fastest_sampled_point():
                 way = np.linalg.norm(ends[1] - ends[0], axis=1)
                 fastest = max(fastest, float(way[inside].max(initial=0.0)) * 4 / span)
         found = Motions(motions).top_speed(corners, size, 0.0, span)
-        # boxes around turned solids are larger
+        # Boxes around turned solids are larger.
         assert fastest * (1 - 1e-12) <= found <= 1.3 * fastest
     assert Motions([]).top_speed([], size, 0.0, 0.1) == 0.0
 

@@ -10,7 +10,10 @@ from warp_lcp.grid.solids import Box, Plane, Sphere
 
 
 def open_volume(grid, normal, offset, cell):
-    """The part of a cell, in 2-D of its area, where n.X > offset, by sampling lines along x."""
+    """Return the part of a cell, in 2-D of its area, where n.X > offset.
+
+    It is found by sampling lines along x.
+    """
     i, j = cell
     y = j + (np.arange(2000) + 0.5) / 2000
     x = np.clip((offset - normal[1] * y) / normal[0], i, i + 1)
@@ -18,7 +21,11 @@ def open_volume(grid, normal, offset, cell):
 
 
 def test_a_moving_plane_sweeps_what_its_velocity_says():
-    """The open volume of a cell grows by the sum of s_f (1 - a_f) u_f over its faces; cells that the domain's faces bound included."""
+    """Swept volume of a moving plane against its velocity.
+
+    The open volume of a cell grows by the sum of s_f (1 - a_f) u_f over its faces, including cells
+    at the domain's faces.
+    """
     grid, velocity, dt = grid_of(2, (9, 7), 0.1), np.array([0.3, -0.2]), 1e-3
     direction = np.array([0.8, 0.6])
     plane = Plane(point=[0.33, 0.27], normal=direction)
@@ -38,15 +45,19 @@ def test_a_moving_plane_sweeps_what_its_velocity_says():
         before, after = (open_volume(grid, direction, o, (i, j)) for o in offset)
         swept[j - 1, i - 1] = (after - before) / dt  # cells/s
     flux_x, flux_y = (1.0 - a) * u / 0.1, (1.0 - b) * v / 0.1
-    # on the domain's faces the fraction is 0 and the velocity holds the solid's part
+    # On the domain's faces the fraction is 0 and the velocity is the solid's part.
     result = flux_x[1:-1, 2:] - flux_x[1:-1, 1:-1] + flux_y[2:, 1:-1] - flux_y[1:-1, 1:-1]
     np.testing.assert_allclose(result, swept, atol=2e-3 * np.abs(swept).max())
     assert np.abs(swept).max() > 1.0
-    assert u[3, 1] == pytest.approx(0.3)  # it comes in through the domain's left face
+    assert u[3, 1] == pytest.approx(0.3)  # the solid enters through the domain's left face
 
 
 def test_velocity_is_that_of_the_way_between_two_times():
-    """A quarter turn about a point: a point's way, not its speed, so that the swept volume is exact; open faces have none."""
+    """Velocity of the way between two times.
+
+    A quarter turn about a point: a point's way, not its speed, so that the swept volume is exact;
+    open faces have none.
+    """
     grid = grid_of(2, (10, 10), 0.1)
     box = Box(lower=[0.32, 0.31], upper=[0.68, 0.69])
     cut = CutCells(
@@ -76,7 +87,7 @@ def test_velocity_is_that_of_the_way_between_two_times():
             assert velocity[j, i] == pytest.approx(way[axis] if wall[j, i] == 2 else 0.0, abs=1e-5)
             faces += wall[j, i] == 2
     assert faces > 20
-    cut.move(1.5, 0.5)  # the same two times, but at a face is now the point that the way ends at
+    cut.move(1.5, 0.5)  # the same two times, but now at a face the point is the end of the way
     x = np.array([0.6, 0.55]) - 0.5
     way = (
         np.array([x[0] - cosine * x[0] - cosine * x[1], x[1] + cosine * x[0] - cosine * x[1]]) / 0.5
@@ -90,7 +101,10 @@ def test_velocity_is_that_of_the_way_between_two_times():
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("which", [0, 1])
 def test_moving_solids_are_as_if_placed_there(dimension, which):
-    """After going to and fro nothing remains of where a solid was."""
+    """Moving solids equal to solids placed there.
+
+    After moving back and forth nothing remains of former positions.
+    """
     grid = grid_of(dimension, (12, 9, 7), 0.1)
     geometry, motion = MOVING[dimension][which]
     still = [
@@ -121,7 +135,7 @@ def test_moving_solids_are_as_if_placed_there(dimension, which):
             moving.velocity, moving.wall, moving.open, alone.open, strict=True
         ):
             as_before = (open_.numpy() == before.numpy()) & (wall.numpy() != 0)
-            # of a dropped fraction, at most
+            # At most the velocity of a dropped fraction.
             assert (np.abs(velocity.numpy()[as_before]) < 2e-3).all()
 
 
@@ -149,9 +163,12 @@ def test_a_solid_may_come_in_later():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_a_moving_solid_covers_of_a_resting_one_does_not_move(dimension):
-    """A piston slides over a floor 0.37 cells above faces: 0.63 of its front's lowest faces displace liquid, nothing of what lies in the
-    floor. If the whole face moved, the liquid would be pushed at 1.6 times the piston's speed
-    there."""
+    """No motion of the part of a resting solid that a moving one covers.
+
+    A piston slides over a floor 0.37 cells above faces: 0.63 of its front's lowest faces displace
+    liquid, and nothing within the floor does. If the whole face moved, the liquid would be pushed
+    at 1.6 times the piston's speed there.
+    """
     grid = grid_of(dimension, (12, 9, 7), 0.1)
     piston = Box(lower=[-9.0] * dimension, upper=[0.44, 9.0, 9.0][:dimension])
     floor = Box(lower=[-9.0] * dimension, upper=[9.0, 0.237, 9.0][:dimension])
@@ -171,7 +188,11 @@ def test_what_a_moving_solid_covers_of_a_resting_one_does_not_move(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_solid_may_be_near_the_ring_alone(dimension):
-    """A node outside the domain is near it, but no face inside: there is nothing to fill, and nothing to divide by."""
+    """Solid near the ring alone.
+
+    A node outside the domain is near it, but no face inside: nothing is filled, and there is no
+    division by 0.
+    """
     grid = grid_of(dimension, (6, 5, 4), 0.1)
     for corner in ([-1.0, 0.2, 0.2], [0.3, 0.9 + 0.05, 0.2], [0.3, 0.2, -0.55]):
         ball = placed(

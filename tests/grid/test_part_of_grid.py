@@ -1,4 +1,4 @@
-"""A part of a grid has the bits of the whole grid, but for what its sides change near them."""
+"""Part of a grid: the bits of the whole grid, except near its sides."""
 
 import numpy as np
 import pytest
@@ -23,14 +23,14 @@ PAIRS = [(WHOLE, PART), (FLAT, FLAT_PART)]
 
 
 def stored(part: StaggeredGrid) -> tuple[slice, ...]:
-    """Return where a part's stored cells lie in the whole grid's stored cells."""
+    """Return the position of a part's stored cells in those of the whole grid."""
     return tuple(
         slice(low, low + n) for low, n in zip(reversed(part.origin), part.shape, strict=True)
     )
 
 
 def away(part: StaggeredGrid, layers: int) -> tuple[slice, ...]:
-    """Return the stored cells of a part that are some layers from its stored ends along the axes that are cut."""
+    """Return the stored cells of a part some layers away from cut ends."""
     cut = [n != m for n, m in zip(reversed(part.counts), reversed(part.whole), strict=True)]
     return tuple(
         slice(layers, n - layers) if c else slice(None)

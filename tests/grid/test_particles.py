@@ -60,7 +60,10 @@ def test_sort_orders_by_cell_and_keeps_particles_whole(
 def test_keys_are_sorted_as_numpy_sorts_them(
     count: int, bits: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In pieces of 100 keys, on any number of threads; what lies behind the keys is scratch memory."""
+    """Sorted keys against NumPy.
+
+    In parts of 100 keys, on any number of threads; memory beyond the keys is scratch.
+    """
     monkeypatch.setattr("warp_lcp.grid.particles.CPU_GRAIN", 100)
     monkeypatch.setattr("warp_lcp.rows.team.CELLS", 1)
     rng, before = np.random.default_rng([count, bits]), wl.get_threads()

@@ -1,4 +1,7 @@
-"""Meshes and gaps of one cell, measured without the host: as by the sampler, which the host leads."""
+"""Meshes and gaps of one cell, measured on the device.
+
+The results are those of the sampler that the host leads.
+"""
 
 import numpy as np
 import pytest
@@ -46,12 +49,12 @@ def test_a_mesh_has_the_distances_of_the_sampler(dimension: int) -> None:
 
 
 def compare_gaps(seed: int, dimension: int) -> int:
-    """Mark the gaps between plates on faces of cells by both; return how many there are."""
+    """Mark the gaps between plates on faces of cells by both; return their number."""
     rng = np.random.default_rng(seed)
     n = 12
     grid = grid_of(dimension, (n,) * dimension, 1.0 / n)
     solids = []
-    # plates and blocks, some next to a gap of one cell, some one cell thick
+    # Plates and blocks, some next to a gap of one cell, some one cell thick.
     for number in range(1, 7):
         low = rng.integers(1, n - 3, dimension)
         high = low + rng.integers(1, 4, dimension)
@@ -75,7 +78,11 @@ def test_gaps_of_one_cell_are_marked_as_by_the_sampler(dimension: int) -> None:
 
 
 def test_a_plate_that_a_mesh_fills_is_no_gap() -> None:
-    """A cell between two plates is a gap until a mesh lies in it, whose surface leaves the corners at distance 0."""
+    """Plate filled by a mesh: no gap.
+
+    A cell between two plates is a gap until a mesh lies in it, whose surface has distance 0 at the
+    corners.
+    """
     n = 12
     grid = grid_of(3, (n,) * 3, 1.0 / n)
     plates = [
@@ -89,7 +96,7 @@ def test_a_plate_that_a_mesh_fills_is_no_gap() -> None:
     torus = TriangleMesh(
         surface=builtin_mesh("torus"), placement=Placement(scale=0.01, translation=np.full(3, 2.5))
     )
-    for inverted in (False, True):  # far away: outside of it, or inside what is not it
+    for inverted in (False, True):  # far away: outside of it, or inside its complement
         mesh = TriangleMesh(surface=torus.surface, placement=torus.placement, invert=inverted)
         marks = wp.zeros(grid.shape, dtype=wp.int8, device=grid.device)
         tables = tables_of(grid, [*plates, (3, mesh)])

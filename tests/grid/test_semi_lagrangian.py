@@ -1,4 +1,4 @@
-"""Fields carried along the grid's velocity."""
+"""Semi-Lagrangian advection of fields."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,10 @@ CELLS = 32
 
 
 def coordinates(grid: StaggeredGrid, axis: int) -> list[np.ndarray]:
-    """Return x, y, z [m] of a component's faces, or of cell centers, in the stored shape."""
+    """Return x, y, z [m] of a component's faces or of cell centers.
+
+    They are in the stored shape.
+    """
     K, J, I = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
     return [(c + (0.0 if a == axis else 0.5)) * grid.spacing for a, c in enumerate((I, J, K))]
 
@@ -54,7 +57,10 @@ def carried(
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("axis", [0, 1, CENTERS])
 def test_a_linear_field_goes_with_the_flow(dimension, axis):
-    """f = a . x becomes a . (x - u dt): the sign of the way back, and the places of faces and centers."""
+    """Linear field in a uniform flow.
+
+    f = a . x becomes a . (x - u dt): the sign of the way back, and the places of faces and centers.
+    """
     counts = (12, 10, 8 if dimension == 3 else 1)
     grid = StaggeredGrid(counts, 0.1, dimension, "cpu")
     x = coordinates(grid, axis)
@@ -68,7 +74,11 @@ def test_a_linear_field_goes_with_the_flow(dimension, axis):
 
 
 def test_waves_keep_their_height_and_their_place():
-    """A wave of 16 cells, carried two wavelengths in 80 steps; linear interpolation would leave 23 % of it."""
+    """Height and place of waves.
+
+    A wave of 16 cells moves by two wavelengths in 80 steps; linear interpolation would leave 23 %
+    of it.
+    """
     grid = StaggeredGrid((96, 4, 1), 1.0, 2, "cpu")
     x = coordinates(grid, 1)[0]
     inside = (x > 12.0) & (x < 60.0)
@@ -84,7 +94,10 @@ def test_waves_keep_their_height_and_their_place():
 
 
 def test_third_order_around_a_turn():
-    """Points of a rigid rotation come from where the rotation says, to the third order in the step."""
+    """Third order around a turn.
+
+    Starting points of a rigid rotation are exact to the third order in the step.
+    """
     errors = []
     for steps in (1, 2):
         grid = StaggeredGrid((CELLS, CELLS, 1), 1.0 / CELLS, 2, "cpu")
@@ -104,25 +117,28 @@ def test_third_order_around_a_turn():
 
 
 def test_new_extrema_do_not_appear():
-    """A step stays between its values."""
+    """No new extrema: a step function stays between its values."""
     grid = StaggeredGrid((CELLS, CELLS, 1), 1.0, 2, "cpu")
     x, y, _ = coordinates(grid, 0)
     values = ((x > 10.0) & (y > 12.0)).astype(np.float32)
     for _ in range(7):
         values = carried(grid, uniform(grid, (0.37, 0.61)), 1.0, values, 0)
-    inside = values[1, 12:-1, 12:-1]  # what comes from the domain, and not from the ring
+    inside = values[1, 12:-1, 12:-1]  # inflow from the domain, not from the ring
     assert inside.min() >= 0.0 and inside.max() <= 1.0
     assert 0.0 < values[1, 18, 14] < 1.0
 
 
 def test_places_without_the_level_are_left_alone():
-    """Faces keep their velocity, centers get 0; a face has the mean level of its two cells."""
+    """Places without the level remain unchanged.
+
+    Faces keep their velocity, centers get 0; a face has the mean level of its two cells.
+    """
     grid = StaggeredGrid((8, 8, 1), 1.0, 2, "cpu")
     level = np.zeros(grid.shape)
     level[:, :, 5:] = 0.9
     x = coordinates(grid, 0)[0]
     out = carried(grid, uniform(grid, (0.5, 0.0)), 1.0, x, 0, level)
-    # face 5 lies at the mean of 0 and 0.9
+    # Face 5 lies at the mean of 0 and 0.9.
     assert np.array_equal(out[1, 1:9, 1:6], x.astype(np.float32)[1, 1:9, 1:6])
     assert np.allclose(out[1, 1:9, 6:9], x[1, 1:9, 6:9] - 0.5)
     out = carried(grid, uniform(grid, (0.5, 0.0)), 1.0, x, CENTERS, level)

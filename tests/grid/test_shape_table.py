@@ -1,4 +1,4 @@
-"""Solids entered by one launch have the distances that they have one after the other."""
+"""Solids entered by one launch: distances as by entering them in sequence."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def turn(rng, dimension):
 
 
 def random_solid(rng, dimension, parts=True):
-    """A shape of any kind, or a union: turned, scaled, now and then inverted."""
+    """Return a shape of any kind, or a union: turned, scaled, sometimes inverted."""
     kind = rng.integers(5 if parts else 4)
     if kind == 4:
         return Union(
@@ -44,7 +44,10 @@ def random_solid(rng, dimension, parts=True):
 
 
 def differences(rng, dimension):
-    """Largest difference of distances [cells], and whether owners agree where no other solid is as near."""
+    """Return the largest difference of distances [cells], and agreement of owners.
+
+    Owners must agree where no other solid is as near.
+    """
     counts = (14, 11) if dimension == 2 else (9, 8, 7)
     grid = grid_of(dimension, counts, 1.0 / counts[0])
     solids = [(number, random_solid(rng, dimension)) for number in range(1, rng.integers(2, 7))]

@@ -1,4 +1,4 @@
-"""Distances to meshes that processes measure together are those that one process measures."""
+"""Distances to meshes measured by several processes: equal to those of one."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,10 @@ COUNTS, DX = (18, 14, 11), 0.05
 
 
 class Ranks:
-    """Several ranks in turn: `everyone` has what each has given, which `gather` returns."""
+    """Several ranks in turn.
+
+    `everyone` maps each rank to its values; `gather` returns them.
+    """
 
     def __init__(self, rank, size, everyone):
         self.rank, self.size, self.everyone = rank, size, everyone
@@ -48,7 +51,7 @@ def test_ranks_have_the_distances_of_one_process(size, seed):
         )
         for key, scale in ((4, 0.3), (7, 0.5))
     }
-    # no node is near
+    # No node is near.
     meshes[9] = TriangleMesh.from_file(
         "builtin:torus", placement=Placement(scale=0.2, translation=[5.0, 5.0, 5.0])
     )
@@ -57,7 +60,7 @@ def test_ranks_have_the_distances_of_one_process(size, seed):
     for key, mesh in meshes.items():
         NodeSampler(whole).enter(expected, key, mesh)
     everyone: dict[int, np.ndarray] = {}
-    for rank in range(size):  # each measures; what others have measured comes in the next round
+    for rank in range(size):  # each measures; the measurements of others come in the next round
         measure_together(NodeSampler(part_of(rank, size, everyone)), meshes)
     for rank in range(size):
         grid = part_of(rank, size, everyone)

@@ -29,14 +29,17 @@ def distances(geometry, points, device="cpu"):
 
 
 def box_oracle(points, lower, upper):
-    """Distance to the nearest point of the box outside, to the nearest face inside."""
+    """Return the distance to the nearest point of the box outside, or face inside."""
     to_faces = np.concatenate([points - lower, upper - points], axis=1)
     outside = np.linalg.norm(points - np.clip(points, lower, upper), axis=1)
     return np.where((to_faces > 0).all(axis=1), -to_faces.min(axis=1), outside)
 
 
 def capsule_oracle(points, start, end, radius):
-    """The nearest of the segment's two ends and, where its foot lies between them, the perpendicular."""
+    """Return the distance to the nearer end, or the perpendicular.
+
+    The perpendicular counts where its foot lies between the segment's ends.
+    """
     length = np.linalg.norm(end - start)
     unit = (end - start) / length
     along = (points - start) @ unit
@@ -125,7 +128,7 @@ def test_flat_shapes(angle):
 
 def test_rotations_follow_x_then_y_then_z():
     rotation = Placement.from_degrees(1.0, [90.0, 90.0, 0.0], [0.0, 0.0, 0.0], 3).rotation
-    # about x to z, about y to x
+    # About x to z, about y to x.
     np.testing.assert_array_equal(rotation @ [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
     turned = Placement.from_degrees(1.0, 30.0, [0.0, 0.0], 2).rotation
     np.testing.assert_allclose(turned @ [1.0, 0.0, 0.0], [np.sqrt(0.75), 0.5, 0.0], atol=1e-15)

@@ -1,4 +1,7 @@
-"""The surface around particles against shapes whose volume and place are known, with walls, solids, drops and sheets."""
+"""Surface around particles against shapes of known volume and place.
+
+The scenes have walls, solids, drops and sheets.
+"""
 
 import itertools
 
@@ -26,7 +29,7 @@ SEED = 8812
 
 
 def fill(grid, inside, *, per_axis=2, jitter=0.25):
-    """Return particles on a jittered lattice where `inside` says so of points [cells]."""
+    """Return particles on a jittered lattice where `inside` of points [cells] holds."""
     planes = [
         lattice(grid, per_axis, jitter, SEED, plane) / grid.spacing
         for plane in range(grid.counts[2])
@@ -40,7 +43,7 @@ def on_device(x):
 
 
 def surface_of(grid, x, interior=None, **settings):
-    """Return points [cells] and corners of the surface around particles [m], closed for sure."""
+    """Return points [cells] and corners of the closed surface of particles [m]."""
     mesh = SurfaceMesh(grid, **({"per_axis": 2} | settings)).find(on_device(x), interior)
     points, corners = mesh.points.numpy() / grid.spacing, mesh.corners.numpy()
     assert_closed(corners)
@@ -109,7 +112,7 @@ def test_a_box_in_a_corner_touches_its_walls(corner):
         side = points[np.abs(points[:, axis] - wall) < 1e-4]
         across = np.delete(side, axis, axis=1)
         span = across.max(axis=0) - across.min(axis=0)
-        # up to the free edges, which are round
+        # Up to the free edges, which are round.
         assert span == pytest.approx(np.delete(extent, axis), abs=0.3)
 
 
@@ -138,18 +141,25 @@ def test_a_sheet_of_one_layer_has_no_holes(smoothing):
     )
     points, corners = surface_of(DEEP, x * DX, smoothing=smoothing)
     assert pieces(points, corners) == 1
-    assert len(points) - len(corners) / 2 == 2  # Euler's number of a sphere: each hole would take 2
+    # Euler characteristic of a sphere; each hole would take 2
+    assert len(points) - len(corners) / 2 == 2
     assert enclosed(points, corners) == pytest.approx(len(x) / 8.0, rel=0.35)
 
 
 def cylinder(x):
-    """Distance [cells] to an upright cylinder, a disk in 2-D; no multiple of a cell anywhere."""
+    """Return the distance [cells] to an upright cylinder, a disk in 2-D.
+
+    No size is a multiple of a cell.
+    """
     return np.hypot(x[..., 0] - 14.3, x[..., 2] - 14.7) - 6.2
 
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_pool_ends_at_a_solid_that_cuts_cells(moves):
-    """As the pool meets the cylinder at a right angle it is as high there as elsewhere."""
+    """Pool at a solid that cuts cells.
+
+    Since it meets the cylinder at a right angle, its height is the same there.
+    """
     x = fill(DEEP, lambda p: (p[:, 1] < 14.0) & (cylinder(p) > 0.0))
     far = wp.full(DEEP.shape, 10.0, dtype=wp.float32, device="cpu")
     distance = far if moves else node_distances(DEEP, cylinder)
@@ -243,7 +253,10 @@ def test_the_same_particles_have_the_same_surface_again():
 
 @GRIDS
 def test_points_move_with_the_particles_around_them(grid):
-    """A turning flow with a gradient: the velocity at the surface is that of the flow there."""
+    """Velocity of surface points by the particles around them.
+
+    A turning flow with a gradient: the velocity at the surface is that of the flow there.
+    """
     x = fill(grid, lambda p: np.linalg.norm((p - 14.0)[:, : grid.dimension], axis=1) < 8.0)
 
     def flow(at):

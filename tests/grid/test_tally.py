@@ -1,4 +1,7 @@
-"""Sums and largest values over windows, against NumPy; the emulation of CUDA takes their other form."""
+"""Sums and maxima over windows, against NumPy.
+
+The emulation of CUDA runs their other form.
+"""
 
 import numpy as np
 import pytest

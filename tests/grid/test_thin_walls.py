@@ -1,4 +1,4 @@
-"""Thin solids as exact shapes: no path passes them, and particles slide on at their surface."""
+"""Thin solids as exact shapes: no leaks, and sliding along their surface."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from warp_lcp.grid.triangle_mesh import close_surface
 from warp_lcp.grid.voxelize import PlacedSolid
 
 CELL = 1.0 / 32
-LOW, HIGH = 0.3, 0.7  # of the inside of a closed box
+LOW, HIGH = 0.3, 0.7  # ends of the inside of a closed box
 
 
 def grid(dimension):
@@ -52,7 +52,7 @@ def thin_walls(g, shapes, motion=None):
 
 
 def flung(walls, points, ways, *, still=True, between=lambda: None):
-    """Return where particles end that would go some ways, float64 of shape (n, 3)."""
+    """Return the ends of particles that move by some ways, float64, shape (n, 3)."""
     position = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
     walls.remember(position)
     position.assign((points + ways).astype(np.float32))
@@ -81,7 +81,7 @@ def test_nothing_leaves_a_closed_box(dimension, thickness, kind):
     free = ((points + ways)[:, :dimension] > LOW + CELL).all(axis=1) & (
         (points + ways)[:, :dimension] < HIGH - CELL
     ).all(axis=1)
-    # nothing was in their way
+    # No wall was in their way.
     assert free.sum() > 100 and np.allclose(
         ends[free], (points + ways)[free, :dimension], atol=1e-6
     )
@@ -113,7 +113,11 @@ def test_nothing_leaves_a_closed_box_that_moves(dimension, motion):
     ],
 )
 def test_particles_slide_along_the_true_surface(shape):
-    """What meets a surface keeps the part of its way along it, and a thousandth of a cell from it."""
+    """Sliding along the true surface.
+
+    A particle that meets a surface keeps the part of its way along it, at a thousandth of a cell
+    from it.
+    """
     rng = np.random.default_rng(52)
     walls = thin_walls(grid(2), [shape])
     points = np.zeros((4000, 3))

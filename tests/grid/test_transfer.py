@@ -1,4 +1,7 @@
-"""Particle-grid transfers: what they reproduce, conserve and lose. validation.md 6."""
+"""Transfers between particles and grid: consistency, conservation and losses.
+
+The tests are those of validation.md 6.
+"""
 
 from dataclasses import dataclass
 
@@ -21,7 +24,7 @@ GRIDS = {"2d": StaggeredGrid((9, 7, 1), 0.125, 2), "3d": StaggeredGrid((8, 7, 6)
 
 @dataclass
 class Cloud:
-    """Particles away from the walls, and what they are transferred to."""
+    """Particles away from the walls, and the target fields of their transfers."""
 
     grid: StaggeredGrid
     position: wp.array
@@ -67,7 +70,7 @@ def cloud(
 
 
 def node_points(grid: StaggeredGrid, axis: int) -> np.ndarray:
-    """Return where the nodes of a component lie [m], shape (*grid.shape, 3); z = 0 in 2-D."""
+    """Return the nodes of a component [m], shape (*grid.shape, 3); z = 0 in 2-D."""
     k, j, i = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
     points = np.stack([i, j, k], axis=-1) - 0.5
     points[..., axis] -= 0.5
@@ -82,7 +85,10 @@ def momentum(c: Cloud) -> np.ndarray:
 
 
 def angular_momentum(c: Cloud) -> np.ndarray:
-    """Sum over particles and components of the spread momentum: the affine part carries its share, f (1 - f) dx^2 along each axis."""
+    """Return the angular momentum: a sum over particles and components.
+
+    The affine part contributes f (1 - f) dx^2 along each axis.
+    """
     x, v = c.position.numpy().astype(np.float64), c.velocity.numpy().astype(np.float64)
     total = np.cross(x, v).sum(axis=0)
     dx = c.grid.spacing
@@ -112,7 +118,7 @@ def grid_momenta(c: Cloud) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("dimension", GRIDS)
 def test_apic_conserves_linear_and_angular_momentum(dimension: str, real: str) -> None:
     c = cloud(GRIDS[dimension], real, affine=True)
-    # relative to what could cancel; arms are about 1 m
+    # Relative to the sum without cancellation; arms are about 1 m.
     tolerance = REALS[real][3] * float(np.linalg.norm(c.velocity.numpy(), axis=1).sum())
     before = momentum(c), angular_momentum(c)
     c.to_faces()
@@ -245,7 +251,7 @@ def test_a_window_that_holds_the_particles_changes_nothing() -> None:
 
 
 def sorted_cloud(grid: StaggeredGrid, *, affine: bool, n: int = 4000) -> Particles:
-    """Return sorted particles all over the domain, some of them exactly on boundaries between cells."""
+    """Return sorted particles all over the domain, some on boundaries between cells."""
     rng = np.random.default_rng(613)
     size = np.array(grid.counts) * grid.spacing
     position = np.clip(rng.random((n, 3)) * size, 1e-3 * grid.spacing, size - 1e-3 * grid.spacing)
@@ -316,7 +322,11 @@ PLACES = {
 def test_threads_add_up_in_the_order_of_one(
     dimension: int, places: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However particles lie, and however many share them: the bits of one thread, and the weights of a plain loop."""
+    """Sums of several threads in the order of one.
+
+    However particles lie, and however many threads there are: the bits of one thread, and the
+    weights of a plain loop.
+    """
     monkeypatch.setattr("warp_lcp.grid.particle_loops.CPU_GRAIN", 64)
     n, rng, before = 1500, np.random.default_rng([dimension, len(places)]), wl.get_threads()
     grid = StaggeredGrid((6, 60, 1) if dimension == 2 else (6, 5, 60), 0.5, dimension, "cpu")

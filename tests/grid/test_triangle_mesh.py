@@ -26,7 +26,10 @@ CUBE_TRIANGLES = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]])
 
 
 def icosphere(levels):
-    """Vertices on the unit sphere and outward triangles: an icosahedron, each triangle cut in four `levels` times."""
+    """Return vertices on the unit sphere and outward triangles.
+
+    They are those of an icosahedron, each triangle divided into four `levels` times.
+    """
     g = (1.0 + np.sqrt(5.0)) / 2.0
     vertices = np.array(
         [
@@ -74,7 +77,10 @@ def distances(geometry, points):
 
 
 def parity_inside(points, surface, direction):
-    """Count the triangles that a ray meets (Moeller and Trumbore), for each point."""
+    """Return the number of triangles that a ray meets (Moeller and Trumbore).
+
+    There is one number for each point.
+    """
     a, b, c = (surface.vertices[surface.triangles[:, corner]] for corner in range(3))
     e1, e2 = b - a, c - a
     h = np.cross(direction, e2)
@@ -171,7 +177,7 @@ def test_winding_number_counts():
 
 def test_thickness():
     surface = close_surface(CUBE * [1.0, 0.05, 1.0], CUBE_TRIANGLES, "plate")
-    # all but the narrow sides
+    # All but the narrow sides.
     assert surface.thin_fraction(0.05002, CPU) == pytest.approx(2.0 / 2.2, abs=1e-3)
     assert surface.thin_fraction(0.04998, CPU) == 0.0
 
@@ -433,7 +439,7 @@ def test_degenerate_triangles_are_dropped():
 
 
 def test_a_seam_may_be_closed_by_a_triangle_without_area():
-    # the first face's diagonal, split on one of its sides only
+    # The first face's diagonal, split on one of its sides only.
     a, c, b = QUADS[0][0], QUADS[0][2], 8
     vertices = np.concatenate([CUBE, [[0.5, 0.5, 0.0]]])
     halves = [[a, QUADS[0][1], b], [b, QUADS[0][1], c]]
@@ -539,8 +545,8 @@ def test_touching_part_inside_out_is_turned():
 
 
 def test_tangled_edges_are_refused():
-    # every second cube of a block whose sides are joined: four squares meet at every edge; where
-    # the vertices are does not matter
+    # Every second cube of a block whose sides are joined: four squares meet at every edge. The
+    # places of the vertices do not matter.
     n = 4
     cells = [cell for cell in np.ndindex(n, n, n) if sum(cell) % 2 == 0]
     corners = np.array(cells)[:, None] + CUBE[None].astype(int)
@@ -554,8 +560,8 @@ def test_tangled_edges_are_refused():
 
 
 def test_one_sided_surface_is_refused():
-    # a Klein bottle as an n x n grid whose last row is joined to the first one reversed; its shape
-    # does not matter
+    # A Klein bottle as an n x n grid whose last row is joined to the first one reversed. Its shape
+    # does not matter.
     n = 12
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
 

@@ -1,4 +1,4 @@
-"""Cells that particles reach, as pieces of rows: against NumPy and SciPy."""
+"""Active row segments, the cells that particles reach, against NumPy and SciPy."""
 
 import numpy as np
 import pytest
@@ -24,14 +24,14 @@ def count_kernel(k, j, i, out: F32):  # type: ignore[no-untyped-def]
 
 @cell_kernel("tests.vicinity")
 def visit_rows_kernel(k, j, first, end, out: F32):  # type: ignore[no-untyped-def]
-    """Write where a row's cells begin and end."""
+    """Write the begin and the end of a row's cells."""
     out[k, j, 0] = float(first)
     out[k, j, 1] = float(end)
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Visit small boxes in part as well, and boxes of which hardly anything is left out."""
+    """Skip cells in small boxes too, and in boxes where almost none can be skipped."""
     monkeypatch.setattr(module, "LEAST_CELLS", 0)
     monkeypatch.setattr(module, "MOST", 1.0)
 
@@ -93,7 +93,10 @@ def test_marks_spread_as_far_as_asked(cells: int) -> None:
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
 @pytest.mark.parametrize("grid", [GRID, PLANE])
 def test_all_cells_that_particles_reach_are_near(grid: StaggeredGrid, small: None) -> None:
-    """Now and in the step before, however often a step is tried; along x to the end of a segment."""
+    """Near cells: all cells that particles reach.
+
+    Now and in the step before, however often a step is repeated; along x to the end of a segment.
+    """
     random, grow = np.random.default_rng(3), 4
     looked, box = Vicinity(grid), grid.everywhere
     reached = []

@@ -149,7 +149,10 @@ def test_a_solid_outside_the_domain_is_refused(geometry, dimension):
 
 
 def test_a_solid_that_has_moved_may_be_anywhere():
-    """Outside the domain, or over all of it: without remarks neither is refused, and nothing is noted."""
+    """Moved solids anywhere: outside the domain, or over all of it.
+
+    With remarks off neither is refused, and nothing is noted.
+    """
     outside = PlacedSolid(
         geometry=Sphere(center=[9.0, 9.0], radius=0.2), separating=True, name="ball"
     )

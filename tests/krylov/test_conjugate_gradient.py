@@ -1,4 +1,7 @@
-"""Conjugate gradients against NumPy's: the same iterations, counted on the device or by the host, and every reason to stop."""
+"""Conjugate gradients against NumPy.
+
+The same iterations, counted on the device or by the host, and every reason to stop.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +30,7 @@ SHAPE = (5, 6, 7)
 
 
 class Jacobi:
-    """z = r / d, as a program or launch by launch."""
+    """Preconditioner z = r / d, as a program or launch by launch."""
 
     def __init__(self, A, recorded):
         stencil = A.stencil
@@ -52,7 +55,10 @@ def cells():
 
 
 def numpy_iterations(A, b, d, tolerance, most):
-    """Preconditioned conjugate gradients, textbook form: iterations, norm and x."""
+    """Return iterations, norm and x of preconditioned conjugate gradients.
+
+    In textbook form.
+    """
     x, r, p, rz = np.zeros_like(b), b.copy(), np.zeros_like(b), np.inf
     iteration = 0
     while iteration < most and np.linalg.norm(r) > tolerance:
@@ -67,7 +73,10 @@ def numpy_iterations(A, b, d, tolerance, most):
 
 @pytest.fixture(params=["recorded", "launches", "device loop"])
 def krylov(request, cells, device, monkeypatch):
-    """The three ways to loop; a CPU graph stands for the GPU's where there is none."""
+    """Return the solver in three ways to loop.
+
+    A CPU graph stands for the GPU's where there is no GPU.
+    """
     if request.param == "device loop":
         monkeypatch.setattr(program, "loops_on_device", lambda _: True)
         monkeypatch.setattr(team.STATE, "team", None)
@@ -125,10 +134,10 @@ def test_a_right_side_that_is_no_number_stops_at_once(krylov, cells):
     ("norm", "best", "iterations", "going"),
     [
         (2.0, 3.0, 5, True),
-        (1.0, 3.0, 5, False),  # as small as wanted
-        (2.0, 3.0, 9, False),  # the last one allowed
+        (1.0, 3.0, 5, False),  # at the tolerance
+        (2.0, 3.0, 9, False),  # at the limit
         (2.9e3, 3.0, 5, True),
-        (3.1e3, 3.0, 5, False),  # a carried residual that has grown so far is worth nothing
+        (3.1e3, 3.0, 5, False),  # a carried residual that has grown so far is meaningless
         (np.nan, 3.0, 5, False),
         (np.inf, np.inf, 0, False),
         (2.0, np.inf, 0, True),

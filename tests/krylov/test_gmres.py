@@ -1,4 +1,7 @@
-"""GMRES against SciPy's: the same iterations, true residuals, restarts, weights, and every reason to stop."""
+"""GMRES against SciPy.
+
+The same iterations, true residuals, restarts, weights, and every reason to stop.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from warp_lcp.krylov import GMRES
 
 
 class Scaling:
-    """z = s r, on the host."""
+    """Preconditioner z = s r, on the host."""
 
     def __init__(self, s, real, device):
         self.r, self.z = (wp.zeros(len(s), dtype=real, device=device) for _ in range(2))
@@ -22,7 +25,7 @@ class Scaling:
 
 
 def convection_diffusion(m, peclet):
-    """Central differences with a wind of both axes."""
+    """Return central differences with a wind along both axes."""
     T = scipy.sparse.diags_array(
         [-1.0 - peclet, 2.0, -1.0 + peclet], offsets=[-1, 0, 1], shape=(m, m)
     )
@@ -47,7 +50,7 @@ def test_iterations_are_scipys(restart, scaled, device):
     krylov, M = make(matrix, device, scale=scale, restart=restart)
     M.r.assign(b)
     count, norm = krylov.solve(1e-8 * float(np.linalg.norm(b)), 1000)
-    # from the right: A M u = b, x = M u
+    # From the right: A M u = b, x = M u.
     seen = []
     right = scipy.sparse.linalg.LinearOperator((144, 144), matvec=lambda u: matrix @ (scale * u))
     u, info = scipy.sparse.linalg.gmres(
@@ -68,7 +71,10 @@ def test_iterations_are_scipys(restart, scaled, device):
 
 
 def test_a_weight_measures_the_residual(device):
-    """Without it the stiff rows decide: 1e8 of them would take all of the tolerance."""
+    """Weight of the residual norm.
+
+    Without it the stiff rows decide: 1e8 of them would use up the tolerance.
+    """
     rng = np.random.default_rng(5)
     stiff = 10 ** rng.uniform(0, 8, 100)
     matrix = (convection_diffusion(10, 0.3) + scipy.sparse.diags_array(stiff)).tocsr()
@@ -90,7 +96,7 @@ def test_single_precision_reports_the_true_residual(device):
     b = np.random.default_rng(7).standard_normal(144)
     krylov, M = make(matrix, device, real=wp.float32)
     M.r.assign(b)
-    count, norm = krylov.solve(1e-12, 400)  # out of reach: restarts must end, not run on
+    count, norm = krylov.solve(1e-12, 400)  # unreachable: restarts must end
     assert count < 400
     assert norm == pytest.approx(
         np.linalg.norm(matrix @ krylov.x.numpy().astype(np.float64) - b), rel=0.5

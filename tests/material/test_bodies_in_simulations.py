@@ -1,4 +1,7 @@
-"""Rigid bodies in simulations of liquid and sand: their step, log, frames and checkpoints."""
+"""Rigid bodies in simulations of liquid and sand.
+
+The tests cover steps, log, frames and checkpoints.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -46,12 +49,12 @@ def test_a_body_falls_and_turns_in_air_as_mechanics_says(simulator: str) -> None
     time = simulation.time
     assert row["body0_x"] == pytest.approx(0.5 + 0.5 * time)
     assert row["body0_y"] == pytest.approx(0.65 - 0.5 * GRAVITY * time**2)
-    # in the middle of the step
+    # In the middle of the step.
     assert row["body0_vy"] == pytest.approx(-GRAVITY * (time - 0.5 * dt))
     assert row["body0_angle"] == pytest.approx(90.0 * time)
     assert row["body0_spin"] == pytest.approx(90.0)
     assert tuple(row) == simulation.columns()
-    # its solid is where it is
+    # Its solid is at its position.
     distance = simulation.boundary.distance.numpy()[1] * simulation.grid.spacing
     j, i = np.unravel_index(distance[1:-1, 1:-1].argmin(), (16, 16))
     assert np.hypot(i / 16 - row["body0_x"], j / 16 - row["body0_y"]) < 0.08
@@ -68,7 +71,7 @@ def test_what_no_scene_asks_for_is_not_there() -> None:
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_a_run_goes_on_from_a_state_bit_for_bit(simulator: str) -> None:
-    """From the middle of an impact on the floor."""
+    """Resumed run, equal bit for bit, from the middle of an impact on the floor."""
     solids = [
         {**BLOCK, "translate": [0.2, -0.55], "rotate": 3.0, "velocity": [0.0, -3.0]},
         {**BLOCK, "translate": [0.0, 0.1]},
@@ -128,7 +131,11 @@ def test_a_step_that_fails_leaves_the_bodies_as_they_were(monkeypatch: pytest.Mo
 def test_contacts_that_are_not_solved_fail_the_step(
     simulator: str, when: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before or after the material's solve: the message has the residual, a shorter step may follow, and the state is as it was."""
+    """Unsolved contacts: the step fails.
+
+    Before or after the material's solve: the message has the residual, a shorter step may follow,
+    and the state is unchanged.
+    """
     simulation, twin = (
         make({**BLOCK, "translate": [0.0, -0.6]}, simulator=simulator) for _ in range(2)
     )
@@ -145,7 +152,7 @@ def test_contacts_that_are_not_solved_fail_the_step(
         with pytest.raises(StepFailed, match=r"contacts.* relative residual of 8.30e-01"):
             simulation.step(0.01)
     row, expected = simulation.step(0.005), twin.step(0.005)
-    for name in expected:  # the pressure starts from the one that the failed step has found
+    for name in expected:  # the pressure starts from the one of the failed step
         if name.startswith(("body", "contacts", "center")):
             assert row[name] == pytest.approx(expected[name], rel=1e-4, abs=1e-9), name
 
@@ -164,7 +171,11 @@ def test_the_log_says_how_well_contacts_are_solved(simulator: str) -> None:
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_a_body_leaves_by_an_open_side(simulator: str, tmp_path: Path) -> None:
-    """It slides out over the floor, whose plane does not end outside; the other stays, and a run goes on from any state bit for bit."""
+    """Body that leaves by an open side.
+
+    It slides out over the floor, whose plane continues outside; the other stays, and a run resumes
+    from any state bit for bit.
+    """
     solids = [
         {**BLOCK, "translate": [0.2, -0.6], "velocity": [3.0, 0.0], "friction": 0.0},
         {**BLOCK, "translate": [0.0, 0.1]},
@@ -236,7 +247,7 @@ def test_time_steps_count_the_bodies_speed() -> None:
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_a_body_comes_to_rest_on_the_floor(simulator: str) -> None:
-    """On a dry floor, beside the material, which a sill keeps away."""
+    """Rest of a body on a dry floor, separated from the material by a sill."""
     sill = {"shape": "box", "min": [0.25, 0.0], "max": [0.45, 0.5]}
     simulation = make({**BLOCK, "translate": [0.2, -0.55]}, sill, simulator=simulator)
     while simulation.time < 0.3:

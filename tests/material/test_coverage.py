@@ -1,4 +1,4 @@
-"""A grid that covers the material alone, or all of the domain: the same run."""
+"""Grid window around the material or the whole domain: the same run."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -57,7 +57,7 @@ CASES = [*LIQUIDS, *SANDS]
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lay grids even in small domains, and often."""
+    """Use grid windows even in small domains, and rebuild them often."""
     for name, value in {"LEAST_CELLS": 0, "MOST": 1.0, "ALIGNED": 8, "SPARE": 1}.items():
         monkeypatch.setattr(module, name, value)
 
@@ -84,7 +84,11 @@ def run(simulation: ParticleSimulation, steps: int) -> list[Mapping[str, Any]]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small: None) -> None:
-    """Sums run in another order on grids of other sizes, coarse levels of the solver may differ: no bits, but rounding."""
+    """Moving window against a grid of the domain.
+
+    Sums have another order on grids of other sizes, and coarse levels of the solver may differ:
+    results are equal up to rounding, not bit for bit.
+    """
     part, whole, grids = made(name, follow=True), made(name, follow=False), set()
     for n in range(24):
         dt = 0.008 if n % 3 else 0.004
@@ -135,7 +139,7 @@ def test_visiting_what_particles_reach_leaves_the_same_bits(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = made(name, follow=False)
-    # segments end beyond a small box
+    # Segments end beyond a small box.
     for setting, value in {"LEAST_CELLS": 0, "MOST": 9.0}.items():
         monkeypatch.setattr(vicinity, setting, value)
     part = made(name, follow=False)
@@ -147,7 +151,7 @@ def test_visiting_what_particles_reach_leaves_the_same_bits(
 
 
 def test_it_pays_for_what_there_is() -> None:
-    """The same liquid in 512 times the domain: as many cells."""
+    """Number of cells of the same liquid in 512 times the domain: equal."""
     sizes = []
     for n in (64, 512):
         drop = {"shape": "sphere", "center": [0.05 * n] * 3, "radius": 1.2}
@@ -166,15 +170,16 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
     first = laid.around([40, 40, 20], [70, 60, 40])
     assert all(low % module.ALIGNED == 0 for low in first.origin)
     moving = laid.around([40, 40, 20], [70, 60, 40], pace=(np.zeros(3), np.array([0.25, 9.0, 0.0])))
-    assert moving.covers([40, 40, 20], [74, 68, 40])  # and some to spare, where it goes
+    assert moving.covers([40, 40, 20], [74, 68, 40])  # with a margin in the direction of motion
     assert moving.origin == first.origin
     assert laid.around([41, 40, 20], [69, 60, 40], first) is first
     assert (
         laid.around([40, 40, 20], [first.origin[0] + first.counts[0], 60, 40], first) is not first
     )
     assert laid.around([50, 40, 20], [51, 41, 21], first).size < first.size / module.LOOSE
-    assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of it
-    assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts  # beyond it
+    assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of the domain
+    # Beyond the domain.
+    assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts
     assert Coverage(DOMAIN, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
     always = Coverage(DOMAIN, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])
     kept = always.around([40, 40, 20], [50, 50, 30])
@@ -186,7 +191,7 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
 
 
 def test_fields_go_along_where_both_grids_know_them() -> None:
-    """Rings too, where they are the domain's."""
+    """Transfer of fields where both grids have them, including domain rings."""
     old = StaggeredGrid((32, 96, 64), 0.1, 3, "cpu", origin=(16, 0, 0), whole=DOMAIN.counts)
     new = StaggeredGrid((32, 96, 32), 0.1, 3, "cpu", origin=(32, 0, 16), whole=DOMAIN.counts)
     numbers = np.arange(np.prod(DOMAIN.shape)).reshape(DOMAIN.shape)

@@ -1,4 +1,7 @@
-"""Scenes drawn at random: a grid that follows finds what one of the domain does, and goes on from a state bit for bit."""
+"""Moving window against a grid of the domain, on random scenes.
+
+Runs also resume from a state bit for bit.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -30,7 +33,7 @@ def drawn_shape(
 
 
 def drawn(seed: int) -> dict[str, Any]:
-    """Return a scene of one or two lumps that fly, of any model that may be there."""
+    """Return a scene of one or two flying lumps, with any allowed model."""
     draw = np.random.default_rng(seed)
     flat, sand = draw.random() < 0.7, draw.random() < 0.3
     size = ([3.0, 1.5, 1.5] if draw.random() < 0.5 else [2.0, 2.0, 1.0])[: 2 if flat else 3]
@@ -117,7 +120,7 @@ def test_a_drawn_scene(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     data = drawn(seed)
     try:
         part, whole = made(data, follow=True), made(data, follow=False)
-    except ValueError as refused:  # a lump lies in a solid, say
+    except ValueError as refused:  # for example, a lump lies in a solid
         pytest.skip(str(refused))
     lengths, state = [], {}
     for step in range(STEPS):

@@ -15,12 +15,15 @@ from warp_lcp.material.wall import extend_velocity, extend_velocity_cut
 
 FLAT = StaggeredGrid((24, 22, 1), 0.1, 2)
 SPACE = StaggeredGrid((12, 13, 11), 0.1, 3)
-Faces = Sequence[np.ndarray]  # one field a component
-JUNK = 1e3  # on faces that are neither projected nor carry weight
+Faces = Sequence[np.ndarray]  # one field for each component
+JUNK = 1e3  # on faces that are neither projected nor have weight
 
 
 def points(grid: StaggeredGrid, offset: Sequence[float]) -> np.ndarray:
-    """Return the points (x, y, z) in cells from the domain's corner that lie at an offset from the cells' low corners."""
+    """Return the points (x, y, z) at an offset from the cells' low corners.
+
+    They are in cells from the domain's corner.
+    """
     k, j, i = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
     return np.stack(
         [i + offset[0], j + offset[1], (k + offset[2]) * (grid.dimension == 3)], axis=-1
@@ -32,14 +35,16 @@ def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
 
 
 class Slope:
-    """Liquid or air over a plane; every open face has been projected to one velocity, unless told otherwise.
+    """Liquid or air over a plane.
+
+    By default every open face has been projected to one velocity.
 
     Args:
         grid: the grid.
-        normal: of the plane, into the open.
-        kind: of the open cells.
-        contact: of the open cells that the plane cuts.
-        shift: how far the plane lies from the domain's center along its normal, in cells.
+        normal: normal of the plane, into the open.
+        kind: kind of the open cells.
+        contact: contact state of the open cells that the plane cuts.
+        shift: distance of the plane from the domain's center along its normal [cells].
     """
 
     def __init__(
@@ -68,7 +73,7 @@ class Slope:
             outside[(slice(1, -1),) * (2 - axis) + (1,)] = True  # the domain's lower wall
             fraction[outside] = 0.0
             self.open.append(fraction)
-            # the plane is the nearest wall, or it would not matter
+            # The plane must be the nearest wall.
             inner = self.signed(face_centers(grid, axis)) < 0.5
             self.wall.append(
                 np.where(fraction == 1.0, -1, np.where(inner & ~outside, 1, 0)).astype(np.int16)
@@ -87,9 +92,9 @@ class Slope:
         self.speed = np.zeros(3)
 
     def move(self, velocity: np.ndarray) -> None:
-        """Let the plane move [m/s]."""
+        """Set the velocity of the plane [m/s]."""
         self.speed = velocity
-        # open faces have no wall's velocity
+        # Open faces have no wall velocity.
         self.moving = [np.where(f < 1, velocity[axis], np.nan) for axis, f in enumerate(self.open)]
 
     def signed(self, x: np.ndarray) -> np.ndarray:
@@ -164,7 +169,10 @@ class Slope:
         )
 
     def judged(self, axis: int) -> np.ndarray:
-        """Return the closed faces that a particle's tent can reach, away from the domain's walls."""
+        """Return the closed faces in reach of a particle's tent function.
+
+        Faces near the domain's walls are left out.
+        """
         x = face_centers(self.grid, axis)
         away = np.all(
             [
@@ -215,7 +223,11 @@ def test_closed_faces_along_a_slope(
     separating: int,
     holds: bool,
 ) -> None:
-    """Tangential flow stays whole; what leaves is held back only where the wall holds, what goes in is stopped everywhere."""
+    """Closed faces along a slope.
+
+    Tangential flow stays whole. Outflow is held back only where the wall holds; inflow is stopped
+    everywhere.
+    """
     slope = Slope(grid, normal, kind, contact)
     slope.separating[1] = separating
     tangent = np.array([slope.normal[1], -slope.normal[0], 0.0])
@@ -231,7 +243,10 @@ def test_closed_faces_along_a_slope(
 
 @pytest.mark.parametrize("towards", [-1.0, 1.0])
 def test_closed_faces_take_the_normal_velocity_of_a_wall_that_moves(towards: float) -> None:
-    """Liquid that is held follows a wall both ways, and nothing of the wall's tangential velocity."""
+    """Closed faces with a moving wall: its normal velocity.
+
+    Held liquid follows a wall in both directions, and has nothing of its tangential velocity.
+    """
     slope = Slope(*SLOPES[-1])
     wall = np.array([0.4, -0.2, 0.7]) + 2.0 * towards * slope.normal
     slope.move(wall)
@@ -256,7 +271,11 @@ def test_released_liquid_is_pushed_by_a_wall_that_overtakes_it() -> None:
 def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(
     contact: int, speed: float
 ) -> None:
-    """The wall cell under a ceiling is open for a fifth, the cell below it touches no wall: nothing may hang from that one."""
+    """Released sliver decides, not the cell behind it.
+
+    The wall cell under a ceiling is open for a fifth, and the cell below it touches no wall:
+    nothing may hang from that one.
+    """
     slope = Slope(FLAT, (0.0, -1.0, 0.0), contact=contact, shift=-0.2)
     row = FLAT.counts[1] // 2 + 1  # of the wall cells
     assert slope.open[0][1, row, 9] == pytest.approx(0.2, abs=0.02)
@@ -273,7 +292,11 @@ def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(
 def test_a_box_is_treated_as_one_of_whole_cells(
     counts: tuple[int, int, int], random_seed: int
 ) -> None:
-    """Without solids the walls are those of the domain, along the grid: what `warp_lcp.material.wall` does is an oracle."""
+    """Box as one of whole cells.
+
+    Without solids the walls are those of the domain, along the grid: `warp_lcp.material.wall` is an
+    oracle.
+    """
     grid = StaggeredGrid(counts, 0.1, 2 if counts[2] == 1 else 3)
     rng = np.random.default_rng(random_seed)
     inner = (slice(1, -1),) * 3
@@ -335,7 +358,7 @@ def test_a_box_is_treated_as_one_of_whole_cells(
         reached = results[0][1][axis] > 0
         if grid.dimension == 2:
             reached[[0, 2]] = False
-        # no tent reaches a face behind the domain's lower wall
+        # No tent function reaches a face behind the domain's lower wall.
         np.moveaxis(reached, 2 - axis, 0)[0] = False
         assert smooth[reached] == pytest.approx(voxel[reached], abs=1e-6)
 
@@ -365,7 +388,11 @@ def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
 def test_what_rests_at_a_cut_wall_is_not_thrown_after_what_leaves_it(
     grid: StaggeredGrid, normal: tuple[float, float, float], contact: int
 ) -> None:
-    """Liquid leaves the plane at 3 m/s; what has weight on closed faces leaves it at 0.06 m/s, and none of them lies in another cell."""
+    """Material at rest on a cut wall is not dragged along by leaving liquid.
+
+    Liquid leaves the plane at 3 m/s; material on closed faces leaves it at 0.06 m/s, and none of
+    them lies in another cell.
+    """
     slope = Slope(grid, normal, contact=contact)
     away = slope.normal[: grid.dimension]
     weights = [np.where(fraction == 0, 1.0, 0.0) for fraction in slope.open]

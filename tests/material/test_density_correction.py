@@ -1,4 +1,7 @@
-"""The density correction: its problem against a dense one, the way it moves particles, and what it keeps of a liquid."""
+"""Density correction: its problem, the displacements, and conservation.
+
+The problem is compared with a dense one.
+"""
 
 import itertools
 import math
@@ -35,7 +38,7 @@ def tank(dimension: int = 2, resolution: int = 12, **tables: Any) -> tuple[Any, 
 
 
 def lattice(grid: Any, boundary: Boundary, per_axis: int = 2) -> np.ndarray:
-    """Return the points of a lattice that fills what is open [m], shape (n, 3)."""
+    """Return the points of a lattice that fills the open part [m], shape (n, 3)."""
     axes = [
         (np.arange(n * per_axis) + 0.5) * grid.spacing / per_axis
         for n in grid.counts[: grid.dimension]
@@ -57,7 +60,7 @@ def correction(grid: Any, boundary: Boundary, **settings: Any) -> DensityCorrect
 
 
 def particles_of(grid: Any, points: np.ndarray, indexed: bool = False) -> Particles:
-    """Return particles with a velocity of their own each."""
+    """Return particles with individual velocities."""
     velocity = np.random.default_rng(77).standard_normal((len(points), 3)).astype(np.float32)
     return Particles(grid, points.astype(np.float32), velocity, affine=True, indexed=indexed)
 
@@ -69,7 +72,10 @@ def spline(d: np.ndarray) -> np.ndarray:
 
 
 def density_of(grid: Any, points: np.ndarray) -> np.ndarray:
-    """Return the density of points at the cells' centers, in the stored shape: every cell looks at every particle."""
+    """Return the density of points at cell centers, in the stored shape.
+
+    By a sum over all pairs of cells and particles.
+    """
     result = np.zeros(grid.shape)
     dimension = grid.dimension
     for cell in itertools.product(*(range(1, n + 1) for n in grid.counts)):
@@ -82,10 +88,10 @@ def density_of(grid: Any, points: np.ndarray) -> np.ndarray:
 def dense_solution(
     boundary: Boundary, density: np.ndarray, most: float, sweeps: int = 20000
 ) -> np.ndarray:
-    """Return x >= 0 that is complementary to sum a_f (x_i - x_nb) + most capacity - density, in the stored shape, by projected sweeps.
+    """Return x >= 0 of the correction's complementarity problem, by sweeps.
 
-    A face of whole cells is open where no cell beside it is SOLID; x is 0 where there is no
-    density.
+    x is complementary to sum a_f (x_i - x_nb) + most capacity - density, in the stored shape. A
+    face of whole cells is open where no cell beside it is SOLID; x is 0 where there is no density.
     """
     base, capacity = boundary.base.numpy(), boundary.capacity.numpy().astype(float)
     wet = (base != wl.SOLID) & (density > 0)
@@ -121,7 +127,10 @@ def dense_solution(
 
 @pytest.mark.parametrize("solid", [[], [box([0.25, 0.25], [0.5, 0.5])], [BALL]])
 def test_the_solution_is_that_of_a_dense_problem(solid: list[dict[str, Any]]) -> None:
-    """Density, capacity beside walls, open fractions and signs enter it: one of them wrong, and x is another one."""
+    """Solution against that of a dense problem.
+
+    Density, capacity beside walls, open fractions and signs all affect x.
+    """
     grid, boundary = tank(resolution=8, solid=solid)
     points = lattice(grid, boundary)
     points = points[points[:, 1] < 0.8]
@@ -142,7 +151,10 @@ def test_the_solution_is_that_of_a_dense_problem(solid: list[dict[str, Any]]) ->
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("indexed", [False, True])
 def test_an_over_full_cell_pushes_its_neighbors_outward(dimension: int, indexed: bool) -> None:
-    """With the sign of [Book] eq. (1.116) they would be drawn in, and the density would rise."""
+    """Over-full cell: it pushes its neighbors outward.
+
+    With the sign of [Book] eq. (1.116) they would be drawn in, and the density would rise.
+    """
     grid, boundary = tank(dimension, 9)
     points = lattice(grid, boundary)
     points = points[points[:, 1] < 7.0 / 9.0]
@@ -176,7 +188,10 @@ def test_an_over_full_cell_pushes_its_neighbors_outward(dimension: int, indexed:
 
 @pytest.mark.parametrize("solid", [[], [BALL]])
 def test_nobody_moves_more_than_half_a_cell_or_into_a_wall(solid: list[dict[str, Any]]) -> None:
-    """Ten times too many particles on the floor and around a ball."""
+    """Displacements of at most half a cell, and not into a wall.
+
+    There are ten times too many particles on the floor and around a ball.
+    """
     grid, boundary = tank(resolution=16, solid=solid)
     points = np.random.default_rng(5).uniform(0.001, 0.999, (9000, 3)) * [1.0, 0.3, 0.0]
     points = points[boundary.admits(points)]
@@ -187,7 +202,7 @@ def test_nobody_moves_more_than_half_a_cell_or_into_a_wall(solid: list[dict[str,
         assert corrected.apply(particles, grid.everywhere).result is not None
         after = particles.position.numpy().astype(float)
         moved = np.linalg.norm(after - before, axis=1).max() / grid.spacing
-        assert 0.3 < moved <= LONGEST + 2e-3  # and what a wall pushes
+        assert 0.3 < moved <= LONGEST + 2e-3  # plus the displacement by a wall
         assert (after[:, :2] >= 0).all()
         assert (after[:, :2] <= 1).all()
         if solid:
@@ -196,7 +211,10 @@ def test_nobody_moves_more_than_half_a_cell_or_into_a_wall(solid: list[dict[str,
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_lattice_at_rest_is_left_alone(dimension: int) -> None:
-    """Also beside walls, where a cell's kernel holds less: nothing is solved, no bit changes."""
+    """Lattice at rest: unchanged.
+
+    Also beside walls, where a cell's kernel holds less: there is no solve, and no bit changes.
+    """
     grid, boundary = tank(dimension, 8)
     particles = particles_of(grid, lattice(grid, boundary))
     before = particles.position.numpy().copy()
@@ -207,7 +225,10 @@ def test_a_lattice_at_rest_is_left_alone(dimension: int) -> None:
 
 
 def test_a_layer_squeezed_against_a_wall_counts_although_half_of_its_kernel_is_wall() -> None:
-    """A cell at the floor holds 5/6: without the capacity 1.2 times that would pass for rest."""
+    """Layer squeezed against a wall, where half of the kernel is in the wall.
+
+    A cell at the floor holds 5/6: without the capacity 1.2 times that would count as rest.
+    """
     grid, boundary = tank(resolution=8)
     points = lattice(grid, boundary)
     points = points[points[:, 1] < 1.0 / 8.0]
@@ -224,7 +245,10 @@ def test_a_layer_squeezed_against_a_wall_counts_although_half_of_its_kernel_is_w
 
 
 def test_a_closed_room_that_is_too_full_is_left_alone() -> None:
-    """Whole cells and nowhere to go: no exception, no motion, and the log says so."""
+    """Closed room that is too full: unchanged.
+
+    Whole cells without a way out: no exception, no motion, and the log says so.
+    """
     grid, boundary = tank(resolution=8)
     points = np.repeat(lattice(grid, boundary), 2, axis=0)
     particles = particles_of(grid, points)
@@ -236,7 +260,10 @@ def test_a_closed_room_that_is_too_full_is_left_alone() -> None:
 
 
 def test_a_closed_pocket_that_is_too_full_stops_nobody_else() -> None:
-    """Where solids cut cells the problem of a pocket without a way out is solvable too."""
+    """Closed pocket that is too full, without effect on others.
+
+    Where solids cut cells the problem of a pocket without a way out is solvable too.
+    """
     walls = [box([0.3, 0.3], [0.7, 0.4], rotate=3.0), box([0.3, 0.6], [0.7, 0.7], rotate=3.0)]
     walls += [box([0.3, 0.3], [0.4, 0.7], rotate=3.0), box([0.6, 0.3], [0.7, 0.7], rotate=3.0)]
     grid, boundary = tank(resolution=24, solid=walls)
@@ -265,7 +292,11 @@ def pool(**tables: Any) -> Any:
 
 
 def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
-    """A column that collapses calls for it, a pool at rest does not, and keeps its bits: no solve, no field, no column filled."""
+    """Default correction only where particles are too dense.
+
+    A collapsing column needs it. A pool at rest does not and keeps its bits: no solve, no field, no
+    filled column.
+    """
     quiet, off = pool(), pool(density_correction={"every": 0})
     rows = advance(quiet, 0.6)
     advance(off, 0.6)
@@ -286,7 +317,11 @@ def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
 
 
 def test_what_it_lifts_by_itself_is_in_proportion_to_the_step() -> None:
-    """A tenth of the step, a tenth of the way; at most all of it. With a table the scene says when, and a step takes out everything."""
+    """Displacement by default: in proportion to the step.
+
+    A tenth of the step gives a tenth of the way, at most all of it. With a table the scene decides
+    when, and a step removes all excess.
+    """
 
     def lift(dt: float, **tables: Any) -> float:
         squeezed = pool(**tables)
@@ -303,7 +338,11 @@ def test_what_it_lifts_by_itself_is_in_proportion_to_the_step() -> None:
 
 @pytest.mark.parametrize("table", [{}, {"density_correction": {"every": 0}}])
 def test_a_collapsed_column_has_the_volume_that_it_had(table: dict[str, Any]) -> None:
-    """By an oracle of its own, from particles alone; without the correction it falls into itself by a tenth."""
+    """Volume of a collapsed column.
+
+    The volume is that of an independent oracle, from particles alone. Without the correction it
+    shrinks by a tenth.
+    """
     simulation = dam(**table)
     counts = tuple(simulation.grid.counts[:2])
 
@@ -325,7 +364,11 @@ def test_a_collapsed_column_has_the_volume_that_it_had(table: dict[str, Any]) ->
 
 
 def test_resuming_across_its_first_step_gives_the_same_bits() -> None:
-    """The state before it has nothing of it, the one after has its solution; either goes on as the run did."""
+    """Resumed runs across the first correction: the same bits.
+
+    The state before it has no data of it, the one after has its solution; both continue as the run
+    did.
+    """
     straight = dam()
     states = []
     while len(states) < 30:
@@ -335,7 +378,7 @@ def test_resuming_across_its_first_step_gives_the_same_bits() -> None:
     first = has.index(True)
     assert 0 < first < 25
     used = dam()
-    # the last one forgets what the simulation has made for itself
+    # The last one discards the simulation's own default.
     for start in (first - 1, first + 3, first - 2):
         used.restore(states[start])
         for _ in range(start, len(states)):
@@ -352,7 +395,10 @@ def void(grid: Any, points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("even", [True, False])
 def test_voids_inside_close_where_the_material_keeps_its_volume(even: bool) -> None:
-    """Their liquid comes from the surface; and nothing is drawn to a wall that lets go."""
+    """Voids inside close, with constant volume.
+
+    Their liquid comes from the surface, and nothing is drawn to a separating wall.
+    """
     grid, boundary = tank(resolution=16)
     points = lattice(grid, boundary)
     particles = particles_of(grid, void(grid, points[points[:, 1] < 0.9]))
@@ -372,7 +418,10 @@ def test_voids_inside_close_where_the_material_keeps_its_volume(even: bool) -> N
 
 @pytest.mark.parametrize("lets_go", [True, False])
 def test_liquid_that_lets_go_of_a_wall_is_not_drawn_back(lets_go: bool) -> None:
-    """A gap of .3 cells under a ceiling: a wall that holds its liquid has a void there, one that lets go a surface."""
+    """Liquid that separates from a wall is not drawn back.
+
+    A gap of 0.3 cells under a ceiling: a holding wall has a void there, a separating one a surface.
+    """
     grid, boundary = tank(resolution=16)
     points = lattice(grid, boundary)
     points = points[points[:, 1] > 0.4] - [0.0, 0.3 * grid.spacing, 0.0]
@@ -392,7 +441,10 @@ def test_liquid_that_lets_go_of_a_wall_is_not_drawn_back(lets_go: bool) -> None:
 def test_a_scene_without_it_launches_none_of_its_kernels(
     tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor does it allocate: fields are made when the simulation is."""
+    """Scene without the correction: no launches of its kernels.
+
+    It does not allocate either: fields are made with the simulation.
+    """
     launched, launch, entry, prepared = set(), wp.launch, Form.entry, program.prepared
 
     def note(kernel: wp.Kernel, *arguments: Any, **named: Any) -> Any:
@@ -437,7 +489,10 @@ def test_every_third_step() -> None:
     "tables", [{}, {"solid": [box([0.5, 0.0], [0.7, 0.11], rotate=20)]}, {"dimension": 3}]
 )
 def test_a_liquid_that_has_splashed_keeps_its_density(tables: dict[str, Any]) -> None:
-    """Without the correction cells at the floor fill up beyond 1.5."""
+    """Density of liquid after a splash.
+
+    Without the correction cells at the floor fill up beyond 1.5.
+    """
     plain, corrected = (
         dam(density_correction={"every": 0}, **tables),
         dam(density_correction={}, **tables),

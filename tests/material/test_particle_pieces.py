@@ -1,4 +1,4 @@
-"""States of particles in pieces and as a whole."""
+"""States of particles in parts and as a whole."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from warp_lcp.material.particle_pieces import fields_of, piece_of, state_of
 
 
 def cut(piece, at):
-    """Return a piece cut into two at a plane of cells across x."""
+    """Return a part split into two at a plane of cells across x."""
     spacing = piece["signature"][4]
     left = piece["position"][:, 0] < at * spacing
     parts = []

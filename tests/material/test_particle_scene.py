@@ -1,4 +1,4 @@
-"""A scene of a material of one's own: what it inherits, and the tables that it may replace."""
+"""Scene of a user-defined material: inherited and replaced tables."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,34 +24,34 @@ BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 
 
 class GrainBox(MaterialProperties, BoxTable):
-    """A box of grains."""
+    """Box of grains."""
 
     size: float = Field(default=1.0, gt=0, description="of a grain [mm]")
 
 
 class RoughBox(SolidBox):
-    """A solid box with friction."""
+    """Solid box with friction."""
 
     rubs = True
     friction: float | None = Field(default=None, ge=0)
 
 
 class RoughPlane(SolidPlane):
-    """A solid half space with friction."""
+    """Solid half space with friction."""
 
     rubs = True
     friction: float | None = Field(default=None, ge=0)
 
 
 class GrainDomain(Domain):
-    """A domain whose walls have friction, or are not there."""
+    """Domain whose walls have friction, or are open."""
 
     friction: float = Field(default=0.5, ge=0)
     periodic: list[bool] | None = None
 
 
 class GrainScene(ParticleScene):
-    """A scene of grains."""
+    """Scene of grains."""
 
     domain: GrainDomain
     solid: list[Annotated[RoughBox | RoughPlane, Field(discriminator="shape")]] = Field(
@@ -64,7 +64,7 @@ class GrainScene(ParticleScene):
         return "grain", self.grain
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return what a model of grains takes."""
+        """Return the memory of a model of grains."""
         return {"grains": 10 * self.counted_cells, "nothing": 0}
 
 
@@ -138,7 +138,10 @@ def test_its_plan_counts_its_own_memory() -> None:
 
 
 def test_it_is_made_of_the_shared_parts() -> None:
-    """Counts and owners by arithmetic: 16 x 16 cells of the first box, 8 x 16 more of the second, the rest of which the first covers."""
+    """Shared parts of a scene, with counts and owners by arithmetic.
+
+    16 x 16 cells of the first box, 8 x 16 more of the second, the rest of which the first covers.
+    """
     second = {"shape": "box", "min": [0.2, 0.0], "max": [0.6, 0.4], "velocity": [1.0, -2.0]}
     source = {"shape": "box", "min": [1.0, 0.7], "max": [1.1, 0.8], "velocity": [0.0, -1.0]}
     scene = build(
@@ -164,7 +167,7 @@ def test_it_is_made_of_the_shared_parts() -> None:
     assert sources is not None
     assert outlets is not None
     assert sources.emit(particles, None, 0.0) == 4 * 4 * 4
-    # the drain lies where the first box does
+    # The drain lies in the first box.
     assert outlets.apply(particles, 0.0, 0.0)[0] == 16 * 16 * 4
 
 

@@ -1,4 +1,7 @@
-"""A simulation without a solve: dust that falls. What all simulations of particles do must hold for it."""
+"""Minimal particle simulation without a solve: falling dust.
+
+Properties of all particle simulations must hold for it.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,11 +32,11 @@ BLOCK = {"shape": "box", "min": [0.25, 0.5], "max": [0.75, 0.75], "velocity": [0
 
 
 class DustBox(MaterialProperties, BoxTable):
-    """A box of dust."""
+    """Box of dust."""
 
 
 class DustScene(ParticleScene):
-    """A scene of dust."""
+    """Scene of dust."""
 
     dust: list[DustBox] = []
 
@@ -43,7 +46,7 @@ class DustScene(ParticleScene):
 
 
 class Dust(ParticleSimulation):
-    """Particles that do not press on each other."""
+    """Simulation of particles without interaction."""
 
     def __init__(self, scene: DustScene, **parts: Any) -> None:
         super().__init__(scene, **parts)
@@ -105,7 +108,11 @@ def make(resolution: int = 16, **tables: Any) -> Dust:
 
 
 def test_it_falls_as_a_stone_does() -> None:
-    """Whatever the steps are: the center falls by g t^2 / 2, and v = -g t in the middle of the last step, exactly, in every particle."""
+    """Free fall, whatever the steps.
+
+    The center falls by g t^2 / 2, and v = -g t in the middle of the last step, exactly, in every
+    particle.
+    """
     simulation = make()
     center = simulation.particles.totals().center
     for dt in (0.02, 0.03, 1e-6, 0.04, 0.01, 0.002, 0.058):
@@ -153,7 +160,7 @@ def test_it_goes_on_from_a_state_bit_for_bit() -> None:
     assert all(
         np.array_equal(value, later.state()[name]) for name, value in through.state().items()
     )
-    # some have left, so lengths differ from those at the start
+    # Some have left, so that lengths differ from the initial ones.
     assert 0 < through.particles.count < 128
     with pytest.raises(ValueError, match="lacks cells"):
         later.restore({name: value for name, value in saved.items() if name != "cells"})
@@ -172,7 +179,7 @@ def test_it_goes_on_on_a_finer_grid() -> None:
     assert "512 particles replace 128" in fine.resample(coarse.state())[0]
     assert fine.time == coarse.time
     held = fine.particles.cells_of(fine.particles.position.numpy())[:, ::-1] + 1
-    # marked anew: it has moved by a cell
+    # The marks are updated: it has moved by a cell.
     assert (np.argwhere(fine.kind.numpy() == wl.FLUID) == np.unique(held, axis=0)).all()
     assert fine.step(0.01)["mass"] == pytest.approx(125.0)
 

@@ -1,4 +1,7 @@
-"""A run that goes on on another grid: mass, momentum and a linear velocity stay, and the run says what was done."""
+"""Run resumed on another grid: mass, momentum and a linear velocity stay.
+
+The run reports the resampling.
+"""
 
 import csv
 import json
@@ -21,7 +24,7 @@ GRADIENT = np.array([[0.0, 3.0, 0.0], [-2.0, 1.0, 0.0], [0.0, 0.0, 0.0]])  # of 
 
 
 def dam(resolution: int, **tables: Any) -> Any:
-    """Return a dam beside a ball, on a grid whose walls are elsewhere for every resolution."""
+    """Return a dam beside a ball, on a grid whose walls differ for each resolution."""
     return create(
         scene(
             size=[1.0, 0.5],
@@ -53,11 +56,10 @@ def test_mass_momentum_and_a_linear_velocity_stay(resolution):
     mass = old.particles.count * old.particle_mass
     assert abs(count * new.particle_mass - mass) <= 0.5001 * new.particle_mass
     np.testing.assert_allclose(arrays["velocity"].mean(axis=0), velocity.mean(axis=0), atol=1e-6)
-    # Where a velocity that is linear in space is continued by its gradient, it is that velocity at
-    # every new place.
+    # A velocity linear in space, continued by its gradient, is exact at every new position.
     error = arrays["velocity"] - (np.array([1.0, -0.5, 0.0]) + arrays["position"] @ GRADIENT.T)
     assert np.abs(error - error.mean(axis=0)).max() < 1e-5
-    # A uniform shift makes up for the center of mass, which moves by far less than a cell.
+    # A uniform shift corrects the center of mass, which moves by far less than a cell.
     center = arrays["position"].mean(axis=0) - state["position"].mean(axis=0)
     np.testing.assert_allclose(error.mean(axis=0), -GRADIENT @ center, atol=1e-5)
     assert np.abs(center).max() < 0.1 * new.grid.spacing
@@ -68,7 +70,11 @@ def test_mass_momentum_and_a_linear_velocity_stay(resolution):
 
 
 def test_a_finer_grid_is_filled_evenly():
-    """Twice the resolution: four for one, so each new cell inside the liquid holds about four again, and none is empty."""
+    """Even filling of a finer grid.
+
+    At twice the resolution there are four for one: each new cell inside the liquid holds about four
+    again, and none is empty.
+    """
     old, new = dam(16, solid=[]), dam(32, solid=[])
     arrays, _ = resampled(
         old.state(), new.grid, everywhere, spacing=old.grid.spacing, per_axis=2, random_seed=7
@@ -79,7 +85,7 @@ def test_a_finer_grid_is_filled_evenly():
     inside = counts[:11, :11]
     assert inside.min() >= 1
     assert 0.9 * 4 < inside.mean() < 1.1 * 4
-    assert counts[13:].sum() == 0  # none beyond the share of a particle at the surface
+    assert counts[13:].sum() == 0  # at most the share of a particle at the surface
 
 
 @pytest.mark.parametrize(("before", "after"), [(16, 24), (24, 16), (16, 32), (32, 20)])
@@ -103,7 +109,7 @@ def test_a_simulation_goes_on(before, after, tables):
     rows = advance(new, 0.35)
     assert rows[-1]["mass"] == pytest.approx(old.particles.count * old.particle_mass, rel=2e-3)
     again = dam(after, **tables)
-    again.restore(new.state())  # what is resampled is a state like any other
+    again.restore(new.state())  # a resampled state is a state like any other
     assert again.step(0.005) == new.step(0.005)
 
 
@@ -140,7 +146,7 @@ def test_a_run_is_resumed_on_another_grid_and_says_so(tmp_path):
     with open(out / "log.csv", newline="") as file:
         mass = {int(row["step"]): float(row["mass"]) for row in csv.DictReader(file)}
     assert mass[9] == pytest.approx(mass[8], rel=2e-3)
-    # its own checkpoints are on the new grid
+    # Its own checkpoints are on the new grid.
     again = go(out, "domain.resolution=32", "time.duration=0.35", resume=True)
     assert again.resampled_from_resolution is None
     with pytest.raises(OutputError, match=r"domain.size: .* before"):

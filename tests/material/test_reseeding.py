@@ -1,4 +1,4 @@
-"""Reseeding: who moves where, what is conserved, and what is left alone."""
+"""Reseeding: moved particles, conservation, and unchanged regions."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ CELLS = 12
 
 
 def pool(dimension: int, solid: list[dict[str, Any]] | None = None) -> Any:
-    """Return a simulation of a box, of which grid and boundary are used."""
+    """Return a simulation of a box, for its grid and boundary."""
     size = [1.0] * dimension
     return create(
         scene(size=size, resolution=CELLS, liquid=[box([0.0] * dimension, size)], solid=solid or [])
@@ -27,7 +27,10 @@ def pool(dimension: int, solid: list[dict[str, Any]] | None = None) -> Any:
 def uneven(
     simulation: Any, *, bubble: bool = False, top: float = 0.75, seed: int = 12
 ) -> Particles:
-    """Return particles at random places below `top`, on average as many as at rest, each with a velocity of its own."""
+    """Return random particles below `top`, on average as many as at rest.
+
+    Each has a velocity of its own.
+    """
     grid, random = simulation.grid, np.random.default_rng(seed)
     size = np.array([1.0, top, 1.0 if grid.dimension == 3 else 0.0])
     points = (
@@ -51,7 +54,7 @@ def counts(grid: Any, particles: Particles) -> np.ndarray:
 
 
 def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
-    """Return one that is sure of its arguments."""
+    """Return a reseeding that checks its arguments."""
     return Reseeding(
         simulation.grid,
         simulation.boundary,
@@ -63,7 +66,10 @@ def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
 
 
 def test_nothing_is_sought_beyond_an_open_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ring there is open as cells are, and a look at its neighbors would leave the memory."""
+    """Search for neighbors beside an open side.
+
+    The ring there is open as cells are, and its neighbors would lie outside the memory.
+    """
     simulation = dam(
         3,
         particles={"reseed": {"every": 1}},
@@ -97,7 +103,7 @@ def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: 
     for step in range(4):
         moved = reseed.apply(particles, grid.everywhere, step)
     after = counts(grid, particles)
-    # a thin region around one stays thin
+    # A thin region around one stays thin.
     assert (after[deep] < least).sum() <= 0.15 * (before[deep] < least).sum()
     assert after.sum() == before.sum() == particles.count
     assert moved <= 2
@@ -105,7 +111,10 @@ def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_each_keeps_its_velocity_and_goes_to_a_neighboring_cell(dimension: int) -> None:
-    """So momentum and energy are the same to the last bit; positions tell who moved."""
+    """Velocities stay, and particles move to a neighboring cell at most.
+
+    So momentum and energy are the same to the last bit; positions show which particles moved.
+    """
     simulation = pool(dimension)
     grid, particles = simulation.grid, uneven(simulation)
     particles.sort()
@@ -124,7 +133,10 @@ def test_each_keeps_its_velocity_and_goes_to_a_neighboring_cell(dimension: int) 
 
 
 def test_the_surface_bubbles_and_walls_are_left_alone() -> None:
-    """A bubble of four cells is air; a cell at the surface has half of its surroundings empty."""
+    """Surface, bubbles and walls: unchanged.
+
+    A bubble of four cells is air; a cell at the surface has half of its surroundings empty.
+    """
     ball = {"shape": "sphere", "center": [0.1, 0.1], "radius": 0.13}
     simulation = pool(2, [ball])
     grid, particles = simulation.grid, uneven(simulation, bubble=True)
@@ -135,7 +147,7 @@ def test_the_surface_bubbles_and_walls_are_left_alone() -> None:
     assert (after[9:] == 0).all()
     touched = np.zeros(after.shape, dtype=bool)
     touched[0], touched[:, 0], touched[:, -1] = True, True, True
-    assert (after[touched] <= before[touched]).all()  # they may give
+    assert (after[touched] <= before[touched]).all()  # they may give particles away
     assert simulation.boundary.admits(particles.position.numpy()).all()
 
 

@@ -1,4 +1,4 @@
-"""Sources and drains: how much comes in, where, when, and what is taken out."""
+"""Sources and drains: amount, place and time of inflow and outflow."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ BALL = {"shape": "sphere", "center": [0.8, 0.1], "radius": 0.1}
 
 
 def tap(source: list[dict[str, Any]] | None = None, **tables: Any) -> LiquidSimulation:
-    """Return a basin with a tap."""
+    """Return a basin with a source."""
     return create(
         scene(
             size=[1.0, 1.0],
@@ -40,14 +40,17 @@ def to_frame(simulation: LiquidSimulation, end: float) -> list[dict[str, Any]]:
 
 
 def emitted(rows: list[dict[str, Any]]) -> int:
-    """Return how many particles came in."""
+    """Return the number of emitted particles."""
     return sum(row["emitted"] for row in rows)
 
 
 @pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 def test_the_rate_is_area_times_velocity(solids: str, surface: str) -> None:
-    """Beside it a splash is under way, which would be corrected and its particles' places with it."""
+    """Rate of a source: area times velocity.
+
+    No splash is near: it would be corrected, and the positions of the particles with it.
+    """
     simulation = tap(
         solids=solids, solid=[BALL], pressure={"surface": surface}, density_correction={"every": 0}
     )
@@ -77,7 +80,7 @@ def test_the_rate_in_three_dimensions() -> None:
     kind = simulation.projection.kind.numpy()
     expected = np.zeros((12, 16, 16), dtype=bool)
     expected[4:8, 8:12, :4] = True
-    # no pressure where velocities are given
+    # No pressure where velocities are given.
     np.testing.assert_array_equal(simulation.grid.interior(kind) == SOLID, expected)
     assert simulation.projection.counted() == (kind == FLUID).sum() > 0
 
@@ -87,7 +90,7 @@ def test_any_direction_in_free_fall(velocity: list[float]) -> None:
     source = box([0.4375, 0.4375], [0.5625, 0.5625], velocity=velocity)
     rows = advance(tap([source], physics={"gravity": [0.0, 0.0]}), 0.15, 0.005)
     across = 0.125 * np.abs(velocity).sum()  # of the square's shadow, times the speed
-    # of particles: where in its lattice the way begins and ends
+    # Tolerance in particles: the places in the lattice where the way begins and ends.
     row = across / np.linalg.norm(velocity) * 32 * 2
     assert emitted(rows) == pytest.approx(across * 0.15 * 32**2 * 4, abs=0.5 * row)
 
@@ -95,7 +98,10 @@ def test_any_direction_in_free_fall(velocity: list[float]) -> None:
 def pour(
     draw: np.random.Generator, source: dict[str, Any], longest: float, stop: float
 ) -> LiquidSimulation:
-    """Let a source run in free fall, in steps of random lengths that know nothing of its times, until `stop`."""
+    """Run a source in free fall, in random steps, until `stop`.
+
+    The steps do not depend on the times of the source.
+    """
     simulation = tap([source], physics={"gravity": [0.0, 0.0]}, particles={"seed": 20261})
     while simulation.time < stop:
         row = simulation.step(min(longest * draw.uniform(0.02, 1.0), stop - simulation.time))
@@ -104,14 +110,18 @@ def pour(
 
 
 @pytest.mark.parametrize("cells", [0.25, 1.0, 3.0])
-# one cell thick, and four
+# One cell thick, and four.
 @pytest.mark.parametrize(
     ("low", "high"), [([0.25, 0.5], [0.28125, 0.625]), ([0.125, 0.5], [0.25, 0.59375])]
 )
 def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(
     low: list[float], high: list[float], cells: float
 ) -> None:
-    """Every place of the lattice that has passed the source is taken once: area times velocity times time, to the particle."""
+    """Exact inflow, whatever the time steps.
+
+    Every place of the lattice that has passed the source is emitted once: area times velocity times
+    time, to the particle.
+    """
     draw = np.random.default_rng(int(1000 * cells))
     distance, speed = 1.0 / 64, 2.0
     start, rows = draw.uniform(0.0, 0.02), int(draw.integers(12, 20))
@@ -125,7 +135,7 @@ def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(
     expected = {(x, y) for x in range(left - rows, right) for y in range(bottom, top)}
     assert len(taken) == len(expected)
     assert set(map(tuple, taken.tolist())) == expected
-    # a jet flies on
+    # A jet flies on.
     np.testing.assert_allclose(
         simulation.particles.velocity.numpy(), [[speed, 0.0, 0.0]] * len(taken), atol=1e-4
     )
@@ -154,7 +164,10 @@ def mixed(word: np.ndarray) -> np.ndarray:
 def lattice_points(
     sources: Sources, number: int, low: np.ndarray, counts: np.ndarray
 ) -> np.ndarray:
-    """Return jittered points of a source's lattice before it moves [m], x fastest, shape (n, 3)."""
+    """Return jittered points of a source's lattice before it moves [m].
+
+    They are in the order x fastest, with shape (n, 3).
+    """
     k, j, i = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
     lattice = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=1) + low
     with np.errstate(over="ignore"):
@@ -174,7 +187,11 @@ def lattice_points(
 
 @pytest.mark.parametrize("seed", range(6))
 def test_points_enter_cells_as_a_fine_look_along_their_way_tells(seed: int) -> None:
-    """The kernel's cells at both ends and its numbers of entries are those of 4000 places along each point's way."""
+    """Cells that points enter, against dense samples of their way.
+
+    The kernel's cells at both ends and its numbers of entries are those of 4000 positions along
+    each point's way.
+    """
     draw = np.random.default_rng([20261129, seed])
     dimension = 2 + seed % 2
     low = draw.integers(2, 6, dimension) / 16
@@ -210,7 +227,7 @@ def test_points_enter_cells_as_a_fine_look_along_their_way_tells(seed: int) -> N
     np.testing.assert_array_equal(filled, cells(since))
     looks = np.array([cells(time) for time in np.linspace(since, now, 4001)]) > 0
     came = (looks[1:] & ~looks[:-1]).sum(axis=0)
-    assert (entries != came).mean() < 2e-3  # those that graze a corner between two looks
+    assert (entries != came).mean() < 2e-3  # except those that graze a corner between two samples
     assert entries.sum() > 0
     last = cells(now)
     stays = (entries == 1) & (last > 0) & (came == 1)
@@ -237,8 +254,8 @@ def test_a_drain_acts_when_it_has_been_open_in_a_part_of_a_step(
 
 
 def test_a_source_in_a_pool_pushes_its_volume_in_and_draws_nothing_from_behind() -> None:
-    # were the source's upstream faces open to the pool, its liquid would circulate and the pool
-    # would not rise
+    # If the source's upstream faces were open to the pool, its liquid would circulate and the pool
+    # would not rise.
     source = box([0.4375, 0.1875], [0.5625, 0.25], velocity=[0.0, 0.25])
     simulation = tap([source], liquid=[box([0.0, 0.0], [1.0, 0.5])], density_correction={})
     rows = advance(simulation, 1.0)

@@ -1,4 +1,4 @@
-"""Particles that are alone fly off the grid, and come back."""
+"""Single particles that fly off the grid, and come back."""
 
 from typing import Any
 
@@ -14,12 +14,12 @@ GRAVITY = np.array([0.0, -9.81, 0.0])
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lay grids even in small domains."""
+    """Use grid windows even in small domains."""
     monkeypatch.setattr(coverage, "LEAST_CELLS", 0)
 
 
 def with_drops(points: list[list[float]], velocity: list[float], **tables: Any) -> LiquidSimulation:
-    """A block of liquid on the floor, and single particles."""
+    """Return a block of liquid on the floor, and single particles."""
     simulation = create(
         scene(size=[6.0, 3.0], resolution=120, liquid=[box([0.0, 0.0], [1.0, 0.5])], **tables)
     )

@@ -12,7 +12,10 @@ CEILING = GRID.counts[1] + 1  # row of the ceiling's faces
 
 
 class Air:
-    """A 2-D box of AIR and FLUID cells in which every open face that touches FLUID has been projected to one velocity."""
+    """Box in 2-D of AIR and FLUID cells.
+
+    Every open face that touches FLUID has been projected to one velocity.
+    """
 
     def __init__(self, fluid: np.ndarray, velocity: tuple[float, float]) -> None:
         kind = np.full(GRID.shape, SOLID, np.int8)
@@ -66,7 +69,7 @@ TOP = [(x, y) for x in range(5) for y in (4, 5)]
     ("separating", "state", "speed", "expected"),
     [
         (1, HELD, -0.5, 0.0),
-        (1, RELEASED, -0.5, -0.5),  # leaves
+        (1, RELEASED, -0.5, -0.5),  # separates
         (1, RELEASED, 0.5, 0.0),  # but not into the wall
         (0, HELD, -0.5, 0.0),
         (0, RELEASED, -0.5, 0.0),  # a free-slip face of a cell that another wall released
@@ -112,9 +115,9 @@ def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
 @pytest.mark.parametrize(
     ("separating", "state", "weight", "own", "expected"),
     [
-        (1, RELEASED, 4.6, 0.06, 0.06),  # not the speed of what leaves
+        (1, RELEASED, 4.6, 0.06, 0.06),  # not the speed of the leaving liquid
         (1, RELEASED, 4.6, -0.06, 0.0),  # but not into the wall
-        (1, RELEASED, 0.0, 0.0, 3.0),  # nothing of its own
+        (1, RELEASED, 0.0, 0.0, 3.0),  # no velocity of its own
         (1, HELD, 4.6, 0.06, 0.0),
         (0, RELEASED, 4.6, 0.06, 0.0),
     ],
@@ -135,7 +138,10 @@ def test_what_rests_at_a_wall_is_not_thrown_after_what_leaves_it(
 
 
 def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
-    """A drop above a pool at rest: extrapolating the pool over it would make it hang."""
+    """Velocity of spray beyond one layer: its own.
+
+    A drop above a pool at rest: extrapolating the pool over it would make it hang.
+    """
     air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
     for row in (3, 5):
         air.velocity[1][1, row, 3:4].fill_(-2.0)
@@ -144,11 +150,14 @@ def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
     assert v[2, 3] == 0.0
     assert v[3, 3] == 0.0  # the first layer above the pool's own faces
     assert v[5, 3] == -2.0
-    assert v[6, 3] == -2.0  # what follows is extrapolated from both
+    assert v[6, 3] == -2.0  # the rest is extrapolated from both
 
 
 def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
-    """As `test_spray_beyond_one_layer_keeps_its_own_velocity`, with z upwards, in a window of some planes."""
+    """The same in 3-D, with z upwards, in a window of some planes.
+
+    See `test_spray_beyond_one_layer_keeps_its_own_velocity`.
+    """
     grid = StaggeredGrid((5, 5, 12), 0.1, 3, "cpu")
     kind = np.full(grid.shape, SOLID, np.int8)
     kind[1:-1, 1:-1, 1:-1] = AIR

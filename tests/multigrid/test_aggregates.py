@@ -1,4 +1,7 @@
-"""Projected cycles on aggregates: solutions are their fixed points, bounds hold, and Newton's method starts near its end."""
+"""Projected cycles on aggregates.
+
+Solutions are their fixed points, bounds hold, and Newton's method starts near its end.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from warp_lcp.multigrid.aggregates import MonotoneAggregation
 
 
 def convection_diffusion(n, wind):
-    """Upwind differences on n x n cells of the unit square, times h^2."""
+    """Return upwind differences on n x n cells of the unit square, times h^2."""
     h, one = 1 / (n + 1), scipy.sparse.eye_array(n)
     second = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
     first = h * scipy.sparse.diags_array([-1.0, 1.0], offsets=[-1, 0], shape=(n, n))
@@ -33,7 +36,11 @@ def fields(device, *values):
 @pytest.mark.parametrize("wind", [0.0, 30.0])
 @pytest.mark.parametrize("dtype", [wp.float64, wp.float32])
 def test_cycles_alone_solve_and_stay_there(wind, dtype, device):
-    """More cycles than a CPU graph is recorded after; a coarse bound of the wrong sign or child would overstep or never let go."""
+    """Convergence of cycles alone, and solutions as fixed points.
+
+    More cycles than a CPU graph is recorded after. A coarse bound of the wrong sign or child would
+    overstep, or never release an unknown.
+    """
     n = 15
     A, b = convection_diffusion(n, wind), load(n)
     cycles = MonotoneAggregation(wl.SparseOperator(A, device=device, dtype=dtype))
@@ -72,8 +79,12 @@ def test_boxes_and_the_energy(device):
 
 
 def test_an_unknown_in_no_aggregate_is_not_moved_with_one(device):
-    """Stiff, and all but on its own: what another's correction did to it would come out of its neighbor's energy."""
-    # almost 1e-3 of sqrt(a_ii a_jj), from which on unknowns aggregate
+    """Unknown in no aggregate: not moved with one.
+
+    It is stiff and almost decoupled; the correction of another would come out of its neighbor's
+    energy.
+    """
+    # Almost 1e-3 of sqrt(a_ii a_jj), from which on unknowns aggregate.
     n, stiff, coupling = 20, 1e12, 1999.0
     A = scipy.sparse.block_array(
         [[scipy.sparse.eye_array(1) * stiff, None], [None, convection_diffusion(n, 0.0)]]
@@ -113,7 +124,11 @@ def test_a_matrix_may_change_and_so_may_the_fields():
 @pytest.mark.parametrize("method", [wl.MinimumMapNewton, wl.PrimalDualActiveSet])
 @pytest.mark.parametrize("wind", [0.0, 40.0, 1000.0])
 def test_newton_does_not_creep(wind, method, device):
-    """Cold, the boundary of the active set moved by a row a step: 14 to 32 steps at 65^2, 22 to 57 at 129^2 and twice as many at 257^2."""
+    """Number of Newton steps from a cold start.
+
+    Without cycles the boundary of the active set moved by a row per step: 14 to 32 steps at 65^2,
+    22 to 57 at 129^2 and twice as many at 257^2.
+    """
     counts = []
     for n in (65, 129):
         problem = wl.LCP(wl.SparseOperator(convection_diffusion(n, wind), device=device), load(n))
@@ -141,7 +156,7 @@ def test_warm_starts_and_other_matrices_take_none(device):
     first = wl.solve(problem, wl.MinimumMapNewton())
     again = wl.solve(problem, wl.MinimumMapNewton(), x0=first.x.numpy())
     assert "monotone cycle" not in {r.step for r in again.history}
-    # positive off the diagonal: aggregates would average what alternates
+    # Positive off the diagonal: aggregates would average alternating values.
     plus = scipy.sparse.csr_array(abs(A))
     assert not MonotoneAggregation(wl.SparseOperator(plus, device=device)).refresh()
     result = wl.solve(

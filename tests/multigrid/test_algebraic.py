@@ -1,4 +1,7 @@
-"""Algebraic multigrid: Galerkin products against SciPy's, symmetry of the cycle, iterations that do not grow with the grid."""
+"""Algebraic multigrid.
+
+Galerkin products against SciPy's, symmetry of the cycle, iterations that do not grow with the grid.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,10 @@ from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 
 
 def poisson(*counts):
-    """Stencil of 2 d on the diagonal and -1 to each neighbor, held at 0 outside."""
+    """Return the stencil of 2 d on the diagonal and -1 to each neighbor.
+
+    The solution is 0 outside.
+    """
     A = scipy.sparse.csr_array((1, 1))
     for n in counts:
         T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
@@ -23,13 +29,13 @@ def poisson(*counts):
 
 
 def principal(matrix, free, shift):
-    """P A P + P D P by SciPy."""
+    """Return P A P + P D P by SciPy."""
     P = scipy.sparse.diags_array(free.astype(float))
     return (P @ matrix @ P + P @ scipy.sparse.diags_array(shift)).tocsr()
 
 
 def stored(M):
-    """A device matrix as SciPy's."""
+    """Return a device matrix as SciPy's."""
     parts = M.values.numpy().astype(np.float64), M.indices.numpy(), M.indptr.numpy()
     return scipy.sparse.csr_array(parts, shape=M.shape)
 
@@ -48,7 +54,10 @@ def restrict(H, free, shift):
 
 
 def iterations(matrix, free, shift, device, real=wp.float64):
-    """Conjugate-gradient iterations to 1e-6, checked by the true residual."""
+    """Return the conjugate-gradient iterations to 1e-6.
+
+    The true residual is checked.
+    """
     H = hierarchy(matrix, free, shift, device, real)
     krylov = ConjugateGradient(H.product, H)
     b = np.random.default_rng(3).standard_normal(len(free)) * free
@@ -104,7 +113,10 @@ def test_products_are_galerkins(convection, device):
 
 
 def test_entries_that_cancel_once_may_not_later(device):
-    """A pattern taken from the numbers of one product would lack them."""
+    """Entries that cancel once but not later.
+
+    A pattern taken from the numbers of one product would lack them.
+    """
     matrix = poisson(12, 12).tolil()
     matrix[0, 1] = matrix[1, 0] = 0.0  # an explicit zero that an update fills
     pattern = poisson(12, 12)
@@ -167,7 +179,11 @@ def test_iterations_do_not_grow_with_the_grid(dimension, sizes, device):
 
 
 def test_singular_components_do_not_break_a_cycle(device):
-    """A closed domain: constants are in the null space, and a compatible right-hand side is solved up to them."""
+    """Cycle with singular components.
+
+    In a closed domain constants are in the null space, and a compatible right-hand side is solved
+    up to them.
+    """
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tolil()
     T[0, 0] = T[-1, -1] = 1.0
     matrix = (
@@ -189,7 +205,7 @@ def test_singular_components_do_not_break_a_cycle(device):
     [
         scipy.sparse.diags_array(np.arange(1.0, 301.0)).tocsr(),  # nothing aggregates
         scipy.sparse.csr_array(np.eye(100) + 1 / 100),  # rows as wide as the matrix
-        # empty rows
+        # Empty rows.
         scipy.sparse.block_diag([poisson(9, 9), scipy.sparse.csr_array((40, 40))]).tocsr(),
         poisson(1),
     ],
@@ -208,8 +224,11 @@ def test_matrices_that_hardly_coarsen(matrix, device):
 
 @pytest.mark.parametrize("pairs", [1, 2, 3])
 def test_a_coarsest_level_too_large_to_invert_is_swept_forth_and_back(pairs, device):
-    """Each pair of sweeps goes on from the one before; the first alone starts from zero."""
-    # so strong that nothing aggregates
+    """Coarsest level too large to invert: forward and backward sweeps.
+
+    Each pair of sweeps continues from the one before; only the first starts from zero.
+    """
+    # So strong that nothing aggregates.
     settings = AlgebraicSettings(strength=0.9, coarsest_cpu=0, coarsest_cuda=0, last_sweeps=pairs)
     H = hierarchy(poisson(5, 6), np.ones(30, dtype=bool), None, device, settings=settings)
     (level,) = H.levels

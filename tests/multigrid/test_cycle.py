@@ -1,4 +1,7 @@
-"""The cycle step by step: a plain loop in NumPy on dense Galerkin products, and the order in which levels are asked for stages."""
+"""Multigrid cycle against a plain loop in NumPy, and the order of its stages.
+
+The loop uses dense Galerkin products.
+"""
 
 from dataclasses import dataclass
 
@@ -17,14 +20,17 @@ from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
 from warp_lcp.multigrid.cycle import Cycle, GatheredLevel
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 
-ALPHA, PAIRS = 1.5, 3  # over-correction, and pairs of sweeps that stand for a projected solve
-# 1 / the Chebyshev points of [0.5, 2]
+ALPHA, PAIRS = 1.5, 3  # over-correction, and pairs of sweeps in place of a projected solve
+# 1 / the Chebyshev points of [0.5, 2].
 OMEGAS = 1 / (1.25 + 0.75 * np.cos(np.pi / 4)), 1 / (1.25 - 0.75 * np.cos(np.pi / 4))
 
 
 @dataclass
 class Plain:
-    """Minimize x'Ax/2 - b'x over lower <= x <= upper, on dense levels; rows without a diagonal are no unknowns."""
+    """Plain cycle for the minimum of x'Ax/2 - b'x over lower <= x <= upper.
+
+    On dense levels; rows without a diagonal are no unknowns.
+    """
 
     matrices: list
     prolongations: list
@@ -33,7 +39,7 @@ class Plain:
     omegas: tuple = OMEGAS
 
     def scale(self, A):
-        """What a residual is divided by in a Jacobi sweep."""
+        """Return the divisor of a residual in a Jacobi sweep."""
         return A.diagonal()
 
     def sweep(self, A, x, b, lower, upper, omega):
@@ -120,7 +126,7 @@ def test_a_grids_cycle_is_the_plain_loop(shape, gamma, bounded, together, device
 
 
 class PlainRows(Plain):
-    """Sweeps are over the rows' l1 norms."""
+    """Plain cycle with sweeps over the rows' l1 norms."""
 
     def scale(self, A):
         return np.abs(A).sum(axis=1)
@@ -128,7 +134,10 @@ class PlainRows(Plain):
 
 @pytest.mark.parametrize("gamma", [1, 2])
 def test_an_algebraic_cycle_is_the_plain_loop(gamma, device):
-    """Smoothed aggregates are PyAMG's; coarse matrices are products of them here."""
+    """Algebraic cycle against the plain loop.
+
+    Smoothed aggregates are PyAMG's; coarse matrices are products of them here.
+    """
     n = 12
     A = wl.SparseOperator(convection_diffusion(n, 0.0), device=device)
     settings = AlgebraicSettings(gamma=gamma, coarsest_cpu=4, coarsest_cuda=4)
@@ -151,13 +160,17 @@ def test_an_algebraic_cycle_is_the_plain_loop(gamma, device):
 
 
 def dense(matrix):
-    """A device's matrix in rows as a dense one."""
+    """Return a device's matrix in rows as a dense one."""
     parts = (part.numpy() for part in (matrix.values, matrix.indices, matrix.indptr))
     return scipy.sparse.csr_array(tuple(parts), shape=matrix.shape).toarray()
 
 
 class PlainAggregates(Plain):
-    """One Gauss-Seidel sweep on the way down, forward, and one up, backward; the coarsest level is swept until it converges."""
+    """Plain cycle on aggregates.
+
+    One forward Gauss-Seidel sweep on the way down, and one backward on the way up; the coarsest
+    level is swept until it converges.
+    """
 
     def sweep(self, A, x, b, lower, upper, omega):
         x = x.copy()
@@ -192,7 +205,10 @@ class PlainAggregates(Plain):
 
 @pytest.mark.cpu_form("sweeps row by row, where a GPU takes colors")
 def test_a_cycle_on_aggregates_is_the_plain_loop():
-    """A bounded problem, three visits of each level, from an iterate that is not 0."""
+    """Cycle on aggregates against the plain loop.
+
+    A bounded problem, three visits of each level, from an iterate that is not 0.
+    """
     n, rng = 20, np.random.default_rng(5)
     host = convection_diffusion(n, 10.0)
     cycles = MonotoneAggregation(wl.SparseOperator(host, device="cpu"))
@@ -215,7 +231,7 @@ def test_a_cycle_on_aggregates_is_the_plain_loop():
 
 @dataclass
 class Named:
-    """A level whose stages are words."""
+    """Level whose stages are words."""
 
     name: str
     visits: int
@@ -240,18 +256,24 @@ W = [
     *(2 * ["b 0 to c", "bounds of c", "solve c x 2", "c to b"]),
     "b to a",
 ]
-W[6] = "b x to c"  # the second visit goes on from what the first one left
+W[6] = "b x to c"  # the second visit continues from the result of the first
 
 
 def test_stages_come_in_the_order_of_the_algorithm():
-    """A level is visited from 0 first, then from what the last visit left."""
+    """Order of the stages.
+
+    A level is visited from 0 first, then from the result of the last visit.
+    """
     levels = {gamma: [Named(name, gamma) for name in "abc"] for gamma in (1, 2)}
     assert list(Cycle(levels[1], levels[1][-1].solve).stages()) == V
     assert list(Cycle(levels[2], levels[2][-1].solve, projected=True).stages()) == W
 
 
 def test_a_gathered_levels_cycle_is_that_of_the_whole():
-    """Its visits are the whole's, between one gathering and one taking back."""
+    """Cycle of a gathered level: that of the whole.
+
+    Its visits are the whole's, between one gather and one scatter.
+    """
     levels = [Named(name, 2) for name in "abc"]
     whole = Cycle(levels[1:], levels[-1].solve, projected=True)
     gathered = GatheredLevel(

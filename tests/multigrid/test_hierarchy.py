@@ -1,4 +1,7 @@
-"""Galerkin coarsening against dense triple products; cycles: symmetry, definiteness, bounds; conjugate gradients."""
+"""Galerkin coarsening against dense triple products, and cycles.
+
+The tests cover symmetry, definiteness, bounds and conjugate gradients.
+"""
 
 import numpy as np
 import pytest
@@ -30,7 +33,7 @@ def masked_hierarchy(
 
 
 def level_matrix(stencil, real=wp.float64):
-    """Dense matrix of a level, column by column through its own product."""
+    """Return the dense matrix of a level, column by column through its own product."""
     counts, shape = stencil.padding.counts, stencil.padding.shape
     columns = []
     for i in range(int(np.prod(counts))):
@@ -45,7 +48,7 @@ def level_matrix(stencil, real=wp.float64):
 
 
 def aggregation(counts):
-    """Piecewise-constant prolongation onto cells (nz, ny, nx)."""
+    """Return piecewise-constant prolongation onto cells (nz, ny, nx)."""
     coarse = [-(-n // 2) for n in counts]
     P = np.zeros((int(np.prod(counts)), int(np.prod(coarse))))
     for row, index in enumerate(np.ndindex(*counts)):
@@ -80,7 +83,10 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
 
 @pytest.mark.parametrize("interval", [(0.5, 2.0), (0.1, 1.0), (0.9, 1.1)])
 def test_two_sweeps_contract_an_interval_of_eigenvalues_as_no_other_two_do(interval):
-    """By 1/T2((b + a)/(b - a)), the least that a polynomial of degree 2 with value 1 at 0 can."""
+    """Contraction of two sweeps on an interval of eigenvalues: optimal.
+
+    The factor is 1/T2((b + a)/(b - a)), the minimum of polynomials of degree 2 with value 1 at 0.
+    """
     (first, second), t = CycleSettings(interval=interval).weights, np.linspace(*interval, 1001)
     best = 1 / (2 * (sum(interval) / (interval[1] - interval[0])) ** 2 - 1)
     assert np.abs((1 - first * t) * (1 - second * t)).max() == pytest.approx(best, rel=1e-5)
@@ -103,7 +109,11 @@ def test_only_strong_axes_are_coarsened_until_the_others_have_caught_up(strength
     "strength", [(1.0, 1.0, 100.0), (1.0, 100.0, 1.0), (100.0, 1.0, 100.0), (1e-3, 1.0, 1.0)]
 )
 def test_the_row_sums_of_coarse_levels_are_never_negative(strength, device):
-    """Diagonals are sums of positive numbers: taking inner faces off them in float32 would leave an indefinite level."""
+    """Row sums of coarse levels: never negative.
+
+    Diagonals are sums of positive numbers. Subtracting inner faces from them in float32 would leave
+    an indefinite level.
+    """
     cells = np.random.default_rng(73).choice(3, (24, 24, 24), p=[0.02, 0.9, 0.08])
     A = wl.GridPoisson(
         cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device
@@ -140,7 +150,7 @@ def test_cycle_is_symmetric_positive_definite(gamma, device):
     assert not Mr[~inside].any()
 
 
-# the coarsest level's sweeps are followed by others, or are the last
+# The coarsest level's sweeps are followed by others, or are the last.
 @pytest.mark.parametrize("shape", [(8, 12, 10), (4, 3, 5)])
 @pytest.mark.parametrize("periodic", [(False,) * 3, (True, False, False)])
 def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, shape, device):

@@ -1,4 +1,7 @@
-"""Rebuilding the rows that changed gives what a complete rebuild gives, to the last bit, and leaves the others alone."""
+"""Rebuild of changed rows: equal to a complete rebuild to the last bit.
+
+Other rows stay untouched.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ GRIDS = [
     ((40, 37), (False,) * 3, {}),
     ((12, 10, 14), (True, True, True), {}),
     ((14, 9, 12), (False, False, True), {}),
-    ((24, 20, 16), (False,) * 3, {"face_y": 100.0}),  # only y is coarsened at first
+    ((24, 20, 16), (False,) * 3, {"face_y": 100.0}),  # at first only y is coarsened
     ((24, 20, 16), (False,) * 3, {"face_x": 100.0, "face_z": 100.0}),
 ]
 SETTINGS = CycleSettings(coarsest_cpu=8, coarsest_cuda=8, one_launch_cuda=0)
@@ -38,7 +41,7 @@ def snapshot(hierarchy):
 
 
 def sets(cells, rng):
-    """Free sets that differ in one cell, in some, in a block, in none, in all."""
+    """Yield free sets that differ in one cell, some, a block, none and all."""
     free = np.ones(cells.shape, dtype=bool)
     yield free.copy()
     for _ in range(4):
@@ -56,7 +59,10 @@ def sets(cells, rng):
 @pytest.mark.parametrize("arrays", [False, True])
 @pytest.mark.parametrize(("shape", "periodic", "numbers"), GRIDS)
 def test_changed_rows_give_what_a_complete_rebuild_gives(shape, periodic, numbers, arrays, device):
-    """A row that depends on a changed one and is left out keeps a face, or an excess, of the last free set."""
+    """Rebuild of changed rows against a complete rebuild.
+
+    A dependent row that is left out keeps a face, or an excess, of the last free set.
+    """
     rng = np.random.default_rng(811)
     cells, A = operator(shape, periodic, numbers, arrays, device, rng)
     partly, whole = (
@@ -93,7 +99,7 @@ def test_rows_that_nothing_changed_are_not_touched(device):
     hierarchy.rebuild_changed()
     level = hierarchy.levels[1].stencil
     made = (level.d.numpy().reshape(level.padding.shape)[1:-1, 1:-1, 1:-1] != 7).any(axis=2)
-    assert 1 <= made.sum() <= 4  # its own aggregates, and what lies beside the row
+    assert 1 <= made.sum() <= 4  # its own aggregates, and those beside the row
     assert (hierarchy._dense.inverse.numpy() != 7).any()
 
 
@@ -117,7 +123,11 @@ def test_the_first_rebuild_after_new_cells_is_complete(device):
 @pytest.mark.parametrize("arrays", [False, True])
 @pytest.mark.parametrize("bounds", ["walls", "everywhere"])
 def test_a_solve_leaves_the_hierarchy_of_its_last_free_set(bounds, arrays, device):
-    """The pass that evaluates the residual marks the rows; one that it forgets would be stale in the hierarchy."""
+    """Hierarchy after a solve: that of its last free set.
+
+    The pass that evaluates the residual marks the rows; one that it misses would be stale in the
+    hierarchy.
+    """
     rng = np.random.default_rng(827)
     cells, A = operator((18, 20, 22), (False,) * 3, {}, arrays, device, rng)
     b = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
@@ -144,7 +154,10 @@ def test_a_solve_leaves_the_hierarchy_of_its_last_free_set(bounds, arrays, devic
 
 
 def scene(rng):
-    """Cells of a box of FLUID that moves and of some more, in rows longer than several spans."""
+    """Return cells of a moving box of FLUID and of some more.
+
+    In rows longer than several spans.
+    """
     cells = np.zeros((10, 11, 70), dtype=np.int8)
     low = rng.integers(0, 30)
     cells[rng.integers(0, 3) :, rng.integers(0, 4) :, low : low + rng.integers(1, 40)] = wl.FLUID
@@ -153,11 +166,15 @@ def scene(rng):
     return cells
 
 
-# float64 corrections have weights of their own
+# float64 corrections have their own weights.
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 @pytest.mark.parametrize("arrays", [False, True])
 def test_new_cells_and_weights_rebuild_the_rows_that_they_change(arrays, real, device):
-    """Spans shrink, grow and empty; weights change in place; fields that are not 0 off the new spans would enter the next cycle."""
+    """Rebuild after new cells and weights.
+
+    Spans shrink, grow and become empty; weights change in place. Fields that are not 0 outside the
+    new spans would enter the next cycle.
+    """
     rng = np.random.default_rng(829)
     padded = (12, 13, 72)
     faces = (
@@ -198,7 +215,10 @@ def test_new_cells_and_weights_rebuild_the_rows_that_they_change(arrays, real, d
 
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_weights_that_keep_every_diagonal_change_their_rows(real, device):
-    """Up on two faces and down on two around an edge of the grid: the sums of the four cells stay."""
+    """Weights that keep every diagonal but change their rows.
+
+    Up on two faces and down on two around an edge of the grid: the sums of the four cells stay.
+    """
     cells = np.full((2, 8, 70), wl.FLUID)
     faces = {f"face_{a}": wp.full((4, 10, 72), 0.5, dtype=wp.float32, device=device) for a in "xyz"}
     A = wl.GridPoisson(cells, device=device, **faces)

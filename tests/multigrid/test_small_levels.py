@@ -1,4 +1,7 @@
-"""All small levels in one launch against one launch a stage, and the inverse of the coarsest one against dense algebra."""
+"""All small levels in one launch against one launch per stage.
+
+The inverse of the coarsest one is compared with dense algebra.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ FACES = ["equal", "numbers", "arrays"]
 
 
 def problem(shape, faces, seed=83):
-    """Cells, the free ones and keywords of their faces."""
+    """Return cells, the free ones and keywords of their faces."""
     rng = np.random.default_rng(seed)
     cells = rng.choice(3, shape, p=[0.1, 0.85, 0.05])
     arrays = rng.uniform(0.1, 1, (*shape[:-1], shape[-1] + 1))
@@ -57,7 +60,10 @@ def run_cycle(hierarchy, cells, projected):
 )
 @pytest.mark.parametrize(("shape", "periodic"), GRIDS)
 def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, real, device):
-    """A stage left out, out of order or on a wrong array changes the cycle by far more than rounding."""
+    """Cycles and levels of a single launch against single launches.
+
+    A missing stage, a wrong order or a wrong array changes the cycle by far more than rounding.
+    """
     cells, free, keywords = problem(shape, faces)
     apart = masked_hierarchy(
         cells, free, periodic, device, CycleSettings(**APART), real, True, **keywords
@@ -77,8 +83,8 @@ def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, 
             atol=20 * eps * np.abs(expected).max(),
         )
         assert np.abs(expected).max() > 0.1
-        # on CUDA, the last launches of the descent, the visits and the first of the ascent have
-        # become one
+        # On CUDA, the last launches of the descent, the visits and the first of the ascent have
+        # become one.
         program = "monotone_cycle" if projected else "cycle"
         assert device == "cpu" or len(getattr(together, program)) < len(getattr(apart, program))
 
@@ -86,10 +92,11 @@ def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, 
 @pytest.mark.parametrize("projected", [False, True])
 @pytest.mark.parametrize(("shape", "periodic"), GRIDS)
 def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, projected):
-    """As on a GPU, a cell at a time by strided threads, but with a launch a stage in place of the barriers.
+    """Stage shared by any number of threads of a block.
 
-    A cell that two threads or none take, and a stage whose threads read what others of it write,
-    give another result.
+    As on a GPU, a cell at a time by strided threads, but with a launch per stage in place of the
+    barriers. A cell that two threads or none take, and a stage whose threads read what others of it
+    write, give another result.
     """
     cells, free, keywords = problem(shape, "arrays")
     hierarchy = masked_hierarchy(
@@ -165,7 +172,11 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
     [((3, 4, 5), (False,) * 3), ((2, 3, 2), (True, True, True)), ((7, 9), (True, False))],
 )
 def test_the_coarsest_level_is_inverted(shape, periodic, faces, device):
-    """Its matrix comes from its own product, column by column; two faces join the cells of a periodic axis of two."""
+    """Inverse of the coarsest level.
+
+    Its matrix comes from its own product, column by column. Two faces join the cells of a periodic
+    axis of two.
+    """
     cells, free, keywords = problem(shape, faces)
     _, hierarchy = masked_hierarchy(
         cells, free, periodic, device, CycleSettings(**TOGETHER), **keywords
@@ -183,7 +194,10 @@ def test_the_coarsest_level_is_inverted(shape, periodic, faces, device):
 
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_a_singular_coarsest_level_is_pinned(real, device):
-    """A closed domain: one unknown of each component is 0, and what remains is a generalized inverse."""
+    """Singular coarsest level, pinned.
+
+    In a closed domain one unknown of each component is 0, and the rest is a generalized inverse.
+    """
     cells = np.full((4, 4, 4), wl.FLUID)
     cells[:, :, 2] = wl.SOLID  # two components
     _, hierarchy = masked_hierarchy(
@@ -212,7 +226,11 @@ def test_solves_take_the_same_iterations(method, device):
 
 
 def test_levels_follow_when_the_cells_change(device):
-    """The tables on the device hold addresses: rows, spans and weights that change in place are seen."""
+    """Levels after a change of the cells.
+
+    The tables on the device hold addresses: rows, spans and weights that change in place take
+    effect.
+    """
     cells = np.full((10, 12, 48), wl.AIR)
     cells[:, :6, :10] = wl.FLUID
     moved = np.full(cells.shape, wl.AIR)
@@ -238,7 +256,10 @@ def test_levels_follow_when_the_cells_change(device):
 @pytest.mark.cpu_form("compiles for GPUs, emulated or not")
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_path):
-    """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""
+    """Barriers of the GPU after every stage, and loads that bypass the cache.
+
+    Barriers are in the GPU's source only. Loads must see a block's own writes.
+    """
     cells, free, keywords = problem((8, 12, 10), "arrays")
     hierarchy = masked_hierarchy(
         cells, free, (True, False, True), "cpu", CycleSettings(**TOGETHER), real, True, **keywords
@@ -248,7 +269,7 @@ def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_p
         for projected in (False, True)
     }
     modules[hierarchy._small.coarsening.kernel.module.name] = 1
-    # assembled, eliminated to and fro
+    # Assembled, eliminated forward and backward.
     modules[coarsest_kernels(True, real, real).invert.module.name] = 3
     for module, barriers in modules.items():
         (path,) = wp.compile_aot_module(
@@ -257,7 +278,7 @@ def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_p
         (text,) = path.read_text().split(".visible .entry")[1:]
         assert text.count("bar.sync") == barriers, module
         assert "ld.global.nc" not in text
-        # else there may be too few registers for such a block
+        # Otherwise too few registers may be left for such a block.
         assert f".maxntid {CUDA_THREADS}" in text
 
 

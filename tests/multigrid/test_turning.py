@@ -1,4 +1,7 @@
-"""Coefficients whose strong direction turns: what is called turning, iteration budgets, cycles, rebuilding of the shared finest level."""
+"""Coefficients whose strong direction varies.
+
+The tests cover detection, iteration budgets, cycles, and the rebuild of the shared finest level.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +17,10 @@ AXES = ("face_x", "face_y", "face_z")
 
 
 def faces_of(shape, strengths):
-    """Return face coefficients: `strengths` makes those along x, y, z of places between 0 and 1."""
+    """Return face coefficients.
+
+    `strengths` maps places between 0 and 1 to those along x, y, z.
+    """
     out = {}
     for axis in range(len(shape)):
         d = len(shape) - 1 - axis
@@ -27,39 +33,39 @@ def faces_of(shape, strengths):
 
 
 def along(angle, weak):
-    """Return strengths in 2-D that are 1 along an angle to x and `weak` across it."""
+    """Return strengths in 2-D: 1 along an angle to x, `weak` across it."""
     return np.cos(angle) ** 2 + weak * np.sin(angle) ** 2, np.sin(angle) ** 2 + weak * np.cos(
         angle
     ) ** 2
 
 
 def turn(weak):
-    """Turn from x to y over the domain."""
+    """Return strengths that turn from x to y over the domain."""
     return lambda x, y: along(0.5 * np.pi * x, weak)
 
 
 def circles(weak):
-    """Run around the center."""
+    """Return strengths that are large around the center."""
     return lambda x, y: along(np.arctan2(x - 0.5, 0.5 - y), weak)
 
 
 def waves(weak):
-    """Turn here and there, smoothly."""
+    """Return strengths whose direction varies smoothly."""
     return lambda x, y: along(3 * np.sin(5 * x + 2 * np.cos(4 * y)) + 2 * y, weak)
 
 
 def halves(weak):
-    """Be along x in one half and along y in the other."""
+    """Return strengths along x in one half and along y in the other."""
     return lambda x, y: along(0.5 * np.pi * (x > 0.5), weak)
 
 
 def patch(weak):
-    """Be along x but for a disk, where it is along y."""
+    """Return strengths along x, except in a disk, where they are along y."""
     return lambda x, y: along(0.5 * np.pi * (np.hypot(x - 0.4, y - 0.6) < 0.15), weak)
 
 
 def needles(weak):
-    """Turn in space: from x to y, and to z."""
+    """Return strengths that turn in space: from x to y, and to z."""
 
     def strengths(x, y, z):
         a, b = 0.5 * np.pi * x, 0.5 * np.pi * z
@@ -70,7 +76,7 @@ def needles(weak):
 
 
 def sheets(weak):
-    """Be strong along two axes that turn."""
+    """Return strengths that are large along two axes that turn."""
     return lambda x, y, z: tuple(1 + weak - s for s in needles(weak)(x, y, z))
 
 
@@ -80,13 +86,16 @@ def framed(shape):
 
 
 def load(shape):
-    """Return a right-hand side with both signs, smooth."""
+    """Return a smooth right-hand side with both signs."""
     places = np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
     return np.sin(7 * places[0] + 3 * places[1]) * np.cos(5 * places[-1]) - 0.3
 
 
 def matrix(cells, faces):
-    """Return the matrix by SciPy, from the definition; rows and columns of cells that are no unknowns are 0."""
+    """Return the matrix by SciPy, from the definition.
+
+    Rows and columns of cells that are no unknowns are 0.
+    """
     index, d = np.arange(cells.size).reshape(cells.shape), np.zeros(cells.size)
     off = scipy.sparse.csr_array((cells.size, cells.size))
     for axis in range(cells.ndim):
@@ -106,7 +115,10 @@ def matrix(cells, faces):
 
 
 def solved(shape, strengths, lower=-np.inf, upper=np.inf, solver=None):
-    """Solve; return the result and its residual, relative to that of clip(0, l, u), by SciPy."""
+    """Solve; return the result and its relative residual by SciPy.
+
+    Relative to that of clip(0, l, u).
+    """
     cells, faces, b = framed(shape), faces_of(shape, strengths), load(shape)
     A = wl.GridPoisson(cells, **faces, device="cpu", dtype=wp.float64)
     result = wl.solve(wl.LCP(A, b, lower, upper), solver)
@@ -128,7 +140,11 @@ def solved(shape, strengths, lower=-np.inf, upper=np.inf, solver=None):
 @pytest.mark.parametrize("strengths", [turn, circles, waves, halves, patch])
 @pytest.mark.parametrize("n", [64, 256])
 def test_the_default_solves_turning_anisotropy(strengths, n):
-    """1:1000: without companions 40 to 190 iterations at 256^2 and more with bounds, growing with the grid."""
+    """Default method on varying anisotropy of 1:1000.
+
+    Without the additional hierarchies it needs 40 to 190 iterations at 256^2. With bounds it needs
+    more, and they grow with the grid.
+    """
     free, residual = solved((n, n), strengths(1e-3))
     assert free, free.status
     assert residual <= 1.01e-6
@@ -199,7 +215,10 @@ def slivers(shape):
 
 
 def surface(shape):
-    """Return ghost-fluid coefficients 1 / theta along a slanted line of faces, and cut fractions along another."""
+    """Return ghost-fluid coefficients 1 / theta along a slanted line of faces.
+
+    And cut fractions along another line.
+    """
     faces = {name: face.copy() for name, face in faces_of(shape, turn(1.0)).items()}
     for j in range(shape[0] - 1):
         faces["face_y"][j + 1, j % shape[1]], faces["face_x"][j, (2 * j) % shape[1]] = 1e4, 1e-4
@@ -241,13 +260,13 @@ def made(A, settings=None):
 
 
 def hold(A, hierarchy, free):
-    """Take a free set, as methods do."""
+    """Set a free set, as methods do."""
     hierarchy.hold(A.stencil.d, wp.array(free.astype(np.uint8), device=A.device))
     hierarchy.rebuild_changed()
 
 
 def operator(device, periodic=False, shape=(32, 32)):
-    """Return two halves that are strong along other axes."""
+    """Return two halves that are strong along different axes."""
     cells, faces = np.ones(shape, dtype=int), faces_of(shape, halves(1e-3))
     cells[0] = wl.AIR
     return wl.GridPoisson(
@@ -256,7 +275,7 @@ def operator(device, periodic=False, shape=(32, 32)):
 
 
 def applied(hierarchy, r):
-    """Return what a cycle makes of r."""
+    """Return the result of a cycle applied to r."""
     hierarchy.finest.b.assign(r)
     hierarchy.cycle.run()
     return hierarchy.finest.x.numpy().copy()
@@ -274,7 +293,10 @@ def test_cycle_is_symmetric_and_positive(device, periodic):
 
 
 def test_levels_in_one_launch_leave_the_finest_one_out(device):
-    """Such a launch starts from x = 0, and would forget what the other hierarchies did."""
+    """Fused levels without the finest one.
+
+    Such a launch starts from x = 0, and would discard the results of the other hierarchies.
+    """
     A = operator(device)
     r = np.random.default_rng(89).standard_normal(A.layout.size) * (
         A.cells.numpy().ravel() == wl.FLUID
@@ -300,10 +322,13 @@ def test_changed_rows_are_coarsened_in_every_hierarchy(device):
 
 
 def test_new_cells_in_place(device):
-    """A workspace that is used again after `update` gives what a new one gives."""
+    """New cells in place.
+
+    A workspace that is used again after `update` gives the results of a new one.
+    """
     b, more = load((32, 64)), np.ones((32, 64), dtype=np.int8)
     more[0] = wl.AIR
-    # the rows' spans are shorter
+    # The rows' spans are shorter.
     some = np.where(np.indices(more.shape)[1] < 44, more, wl.AIR).astype(np.int8)
     A = operator(device, shape=more.shape)
     problem, method = wl.LCP(A, b), wl.ProjectedMultigrid()

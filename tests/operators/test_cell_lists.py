@@ -1,4 +1,4 @@
-"""Operators from lists of cells against those from arrays, and lists that are refused."""
+"""Operators from lists of cells against those from arrays; refused lists."""
 
 import tracemalloc
 

@@ -13,7 +13,10 @@ from warp_lcp.operators.components import ComponentFinder
 
 
 def expected_labels(cells, faces, shift, periodic):
-    """Sets of cells of components that touch no AIR through an open face and have no shift."""
+    """Return sets of cells of floating components.
+
+    They touch no AIR through an open face and have no shift.
+    """
     A = assemble(cells, faces, shift, periodic)
     fluid = np.flatnonzero(cells.ravel() == wl.FLUID)
     block = A[np.ix_(fluid, fluid)]

@@ -99,7 +99,11 @@ def test_update_equals_a_new_operator(device):
 
 @pytest.mark.parametrize("n", [1, 7, 8, 16, 31, 70])
 def test_rows_span_their_fluid_cells(n, device, monkeypatch):
-    """Spans of rows, of whole vectors of 16 cells, and the chunks of flat fields that have been in use, as a plain loop finds them."""
+    """Spans of rows around their FLUID cells.
+
+    In whole vectors of 16 cells; also the chunks of flat fields that have been in use, as a plain
+    loop finds them.
+    """
     monkeypatch.setattr("warp_lcp.operators.grid_operator.LARGE", 0)
     rng = np.random.default_rng(n)
     shape = (9, 40, n)

@@ -1,4 +1,7 @@
-"""Operators by their products alone: functions, SciPy's LinearOperator, and what inherits from wl.Operator with only an `apply`."""
+"""Operators by their products alone.
+
+Functions, SciPy's LinearOperator, and subclasses of wl.Operator with only an `apply`.
+"""
 
 import pickle
 from dataclasses import replace
@@ -19,7 +22,7 @@ N = 8
 
 
 def matrix(symmetric, seed=31):
-    """Positive definite, with rows and columns of sizes from 0.03 to 30."""
+    """Return a positive definite matrix with rows and columns of 0.03 to 30."""
     rng = np.random.default_rng(seed)
     B, D = rng.standard_normal((N, N)), 10.0 ** rng.uniform(-0.75, 0.75, N)
     skew = 0.0 if symmetric else B - B.T
@@ -27,7 +30,7 @@ def matrix(symmetric, seed=31):
 
 
 def given(A, kind):
-    """The same matrix in the ways that it may come, which know less and less of it."""
+    """Return the same matrix in several forms, with decreasing information."""
     linear = Linear(A.shape, matvec=lambda v: A @ v, dtype=np.float64)
     return {
         "bare": lambda: linear,
@@ -76,7 +79,7 @@ def test_methods_that_need_products_only_take_it(name, kind, symmetric):
     try:
         result = wl.solve(problem, wl.METHODS[name](), stopping=replace(STOPPING, **slow))
     except ValueError as refusal:
-        # symmetry is needed and not known, or products with the transpose, which are not to be had
+        # Symmetry is needed and not known, or products with the transpose are not available.
         assert "symmetric" in str(refusal) or "transpose" in str(refusal)
         assert not problem.A.symmetric
         return
@@ -117,7 +120,10 @@ def test_symmetry_is_known_of_operators_that_are_their_own_adjoint():
 
 
 def test_sizes_stand_for_a_diagonal_that_is_not_given():
-    """Positive, as large as what leads its rows, and of its units."""
+    """Estimated diagonal: positive, as large as the largest entries of the rows.
+
+    It is in the units of A's entries.
+    """
     n = 200
     D = scipy.sparse.diags_array(np.geomspace(1e-3, 1e3, n))
     A = D @ scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)) @ D
@@ -133,7 +139,7 @@ def test_products_neither_see_nor_keep_the_iterate():
     def product(x):
         kept.append(x)
         image = 2 * x
-        x[:] = np.nan  # it is the function's own
+        x[:] = np.nan  # the array belongs to the function
         return image
 
     A = wl.LinearOperator(product, (3,), symmetric=True)

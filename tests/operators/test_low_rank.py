@@ -7,12 +7,12 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.operators.low_rank import BlockColumns
 
-# two rows belong to both blocks
+# Two rows belong to both blocks.
 ROWS, BLOCKS = np.array([2, 2, 5, 9, 9, 11]), np.array([0, 1, 1, 0, 1, 0])
 
 
 def columns_on(device, seed):
-    """Columns of two blocks of three, and the same as a dense matrix."""
+    """Return columns of two blocks of three, and the same as a dense matrix."""
     values = np.random.default_rng(seed).standard_normal((len(ROWS), 3))
     columns, dense = BlockColumns(12, 2, 3, wp.float64, wp.get_device(device)), np.zeros((12, 6))
     columns.assign(ROWS, BLOCKS, values)
@@ -82,7 +82,11 @@ def test_only_rows_that_are_not_zero_are_stored(device):
 
 @pytest.mark.parametrize(("column", "floats"), [([1.0, -1.0], True), ([1.0, 1.0], False)])
 def test_a_column_that_feels_the_constants_grounds_a_closed_component(column, floats, device):
-    """A body that is moved by the mean pressure of a chamber closes it off as a piston does; one in its midst is not."""
+    """Column that is not orthogonal to constants: it grounds a closed component.
+
+    A body that is moved by the mean pressure of a chamber closes it as a piston does; one in its
+    interior does not.
+    """
     cells = np.ones((4, 4), dtype=int)
     U = np.zeros((4, 4, 1))
     U[1, 1], U[1, 2] = column[0], column[1]

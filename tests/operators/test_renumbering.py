@@ -1,4 +1,7 @@
-"""Matrices whose unknowns are numbered at random are solved in an order of their own, and results come back in the caller's."""
+"""Matrices with random numbering: solved in another order.
+
+Results come back in the caller's order.
+"""
 
 import numpy as np
 import pytest
@@ -7,11 +10,14 @@ import scipy.sparse
 import warp_lcp as wl
 from warp_lcp.operators.renumbering import renumbering
 
-N = 260  # n^2 unknowns are enough for an order to pay
+N = 260  # n^2 unknowns are enough for another order to pay
 
 
 def shuffled(n=N, *, block=1, wind=0.0, seed=30211):
-    """An obstacle problem (per component, of `block` ones) with nodes numbered at random: A, b, l, and the numbers."""
+    """Return an obstacle problem with randomly numbered nodes: A, b, l, numbers.
+
+    Each node has `block` components.
+    """
     second = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
     convection = scipy.sparse.diags_array([-wind, wind], offsets=[-1, 0], shape=(n, n))
     one = scipy.sparse.eye_array(n)

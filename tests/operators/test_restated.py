@@ -1,4 +1,7 @@
-"""Problems in another form: their solutions, starts and bounds are those of the given one, by a residual from NumPy."""
+"""Restated problems: solutions, starts and bounds of the original one.
+
+The residual is computed by NumPy.
+"""
 
 import numpy as np
 import pytest

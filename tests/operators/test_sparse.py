@@ -1,4 +1,7 @@
-"""Sparse operators against SciPy: products, symmetry, coloring, sweeps in row order and by color, updates, bad input."""
+"""Sparse operators against SciPy.
+
+Products, symmetry, coloring, sweeps in row order and by color, updates, bad input.
+"""
 
 import itertools
 import pickle
@@ -15,7 +18,7 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 
 
 def random_matrix(n, seed, density=0.1):
-    """Unsymmetric, with empty rows, entries out of order and twice in one place."""
+    """Return an unsymmetric matrix with empty rows and unordered, repeated entries."""
     rng = np.random.default_rng(seed)
     count = int(density * n * n)
     rows, columns = rng.integers(0, n, count), rng.integers(0, n, count)
@@ -25,7 +28,10 @@ def random_matrix(n, seed, density=0.1):
 
 
 def poisson(*counts):
-    """Stencil of 2 d on the diagonal and -1 to each neighbor, held at 0 outside."""
+    """Return the stencil of 2 d on the diagonal and -1 to each neighbor.
+
+    The solution is 0 outside.
+    """
     A = scipy.sparse.csr_array((1, 1))
     for n in counts:
         T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
@@ -64,7 +70,7 @@ def test_symmetry_is_judged_by_size():
     scaled = scipy.sparse.block_diag(
         [1e12 * base, scipy.sparse.csr_array([[1.0, 0.5], [0.4, 1.0]])]
     )
-    # a small block counts, whatever the large one's size
+    # A small block counts, whatever the size of the large one.
     assert not wl.SparseOperator(scaled, device="cpu").symmetric
 
 
@@ -129,9 +135,9 @@ def test_values_are_updated_in_place(device):
     matrix.sum_duplicates()
     A = wl.SparseOperator(matrix, device=device)
     x = wp.array(np.random.default_rng(29).standard_normal(30), dtype=wp.float64, device=device)
-    A.apply_transpose(x)  # so that a stored transpose must follow
+    A.apply_transpose(x)  # so that a stored transpose must be updated
     diagonal = A.diagonal()
-    assert A.version == 1  # the entries have been taken once
+    assert A.version == 1  # the entries have been updated once
     other = matrix.copy()
     other.data = np.random.default_rng(31).standard_normal(matrix.nnz)
     for values in (other.data, wp.array(other.data, dtype=wp.float64, device=device), other):
@@ -260,7 +266,7 @@ def test_blocks_are_found_and_a_pickle_keeps_the_near_null_space():
 @pytest.mark.parametrize("form", ["csr", "csc", "coo", "bsr"])
 @pytest.mark.parametrize("index", [2_000_000, -1, 50])
 def test_indices_out_of_range_are_refused(form, index):
-    """They once ended the process."""
+    """Refusal of indices out of range, which once crashed the process."""
     A = (
         scipy.sparse.random_array((50, 50), density=0.2, rng=np.random.default_rng(1))
         + 20 * scipy.sparse.eye_array(50)

@@ -16,21 +16,21 @@ NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 
 
 
 def changed(A, cells):
-    """Let the operator take other cells."""
+    """Set other cells."""
     A.update(
         wp.array(np.pad(cells.reshape(A.layout.padding.counts), 1).astype(np.int8), device=A.device)
     )
 
 
 def same(found, expected, kind):
-    """Compare with what functions of float32, or arrays of float64, allow."""
+    """Compare to the accuracy of float32 functions or float64 arrays."""
     np.testing.assert_allclose(
         found, expected, rtol=1e-9, atol=2e-5 if kind == "functions" else 1e-11
     )
 
 
 def check_definition(seed, kind, device):
-    """Compare all that a stencil computes with the definition, on other cells, too."""
+    """Compare all results of a stencil with the definition, on other cells, too."""
     stencil, rng = drawn([seed, 9], kind), np.random.default_rng(seed)
     A, expected, inside = stencil.operator(device), stencil.matrix(), stencil.inside
     x = rng.standard_normal(stencil.cells.shape)
@@ -93,7 +93,11 @@ def test_solutions_are_those_of_the_matrix(seed, kind, device):
 
 
 def test_sides_towards_solid_and_air_have_the_coefficients_given(device):
-    """Between the two cells the coefficients are one, so that A is symmetric; at the sides they are not."""
+    """Coefficients of sides towards SOLID and AIR.
+
+    Between the two cells the coefficients are equal, so that A is symmetric; at the sides they are
+    not.
+    """
     given = {
         (0, 0): np.full((1, 2), 20.0),
         (0, 1): np.array([[-1.0, -5.0]]),
@@ -123,7 +127,10 @@ def test_a_periodic_axis_of_one_cell_is_beside_itself(device):
 
 
 def test_other_cells_may_make_a_stencil_unsymmetric(device):
-    """A pair of cells with two coefficients, one of them SOLID at first."""
+    """Other cells that make a stencil unsymmetric.
+
+    A pair of cells has two coefficients; one of them is SOLID at first.
+    """
     right, left = np.full((1, 3), -1.0), np.full((1, 3), -1.0)
     right[0, 1] = -2.0
     cells = np.array([[wl.FLUID, wl.FLUID, wl.SOLID]])
@@ -144,7 +151,10 @@ def test_other_cells_may_make_a_stencil_unsymmetric(device):
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("periodic", [False, True])
 def test_sides_across_a_periodic_end_count_for_symmetry(axis, periodic, device):
-    """The coefficient of the first cell toward the last is not the last one's toward the first."""
+    """Sides across a periodic end, in the test of symmetry.
+
+    The coefficient of the first cell toward the last is not that of the last toward the first.
+    """
     shape, step = ((3, 2), (2, 3))[axis], ((1, 0), (0, 1))[axis]
     lower = np.full(shape, -1.0)
     lower[(0, slice(None)) if axis == 0 else (slice(None), 0)] = -2.0
@@ -186,7 +196,10 @@ def test_an_array_of_numbers_has_the_center_in_the_middle(device):
 
 
 def test_boundary_values_are_a_term_of_b(device):
-    """With x = g in AIR the rows are those of a larger grid whose border is given."""
+    """Boundary values as a term of b.
+
+    With x = g in AIR the rows are those of a larger grid with a given border.
+    """
     rng = np.random.default_rng(5)
     g, full = rng.standard_normal((7, 8)), np.ones((7, 8), dtype=int)
     large = wl.Stencil(full, NINE, outside=wl.AIR, device=device, dtype=wp.float64)

@@ -1,4 +1,4 @@
-"""Sums and operators of low rank against dense assembly, alone and inside solvers."""
+"""Sums and low-rank operators against dense assembly, alone and in solvers."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=2000)
 
 
 def dense_of(A):
-    """Dense matrix of an operator, by its products with unit vectors."""
+    """Return the dense matrix of an operator, by products with unit vectors."""
     n = int(np.prod(A.shape))
     columns = [
         A.apply(wp.array(e.reshape(A.shape), dtype=wp.float64, device=A.device)).numpy().ravel()
@@ -97,7 +97,11 @@ def test_a_body_coupled_to_a_grid(cells, device):
 
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
-    """A turned body's: R I^-1 R' of equal moments is diagonal, and what rounding leaves beside the diagonal has no symmetry."""
+    """Weights that are symmetric up to rounding.
+
+    Those of a turned body: R I^-1 R' of equal moments is diagonal, and its off-diagonal rounding
+    errors have no symmetry.
+    """
     rng, grid = np.random.default_rng(19), wl.GridPoisson(cells, device=device, dtype=dtype)
     U = rng.standard_normal((*cells.shape, 3)) * (cells == wl.FLUID)[..., None]
     fluid, b = cells.ravel() == wl.FLUID, rng.standard_normal(cells.shape)
@@ -138,7 +142,10 @@ def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
 
 @pytest.mark.parametrize("felt", [(), (0,), (1,), (0, 2), (0, 1, 2)])
 def test_chambers_that_a_body_feels_do_not_float(felt, device):
-    """Three closed chambers: the null space is the constants of those that no column touches."""
+    """Chambers coupled to a body do not float.
+
+    Of three closed chambers, the null space is the constants of those that no column touches.
+    """
     cells, U = np.full((4, 11), wl.SOLID), np.zeros((4, 11, 1))
     chambers = [
         np.arange(44).reshape(4, 11)[chamber].ravel()
@@ -162,7 +169,7 @@ def test_chambers_that_a_body_feels_do_not_float(felt, device):
     }
     fluid = cells.ravel() == wl.FLUID
     block = dense_of(A)[np.ix_(fluid, fluid)]
-    # one column holds one constant
+    # One column removes one constant.
     assert len(block) - np.linalg.matrix_rank(block) == count + max(0, len(felt) - 1)
 
 

@@ -1,4 +1,8 @@
-"""Friction: bounds affine in x, against exhaustive enumeration of the states of planar contacts, and against Coulomb's law by hand."""
+"""Friction: bounds affine in x.
+
+They are compared with an enumeration of the states of planar contacts, and with Coulomb's law by
+hand.
+"""
 
 import itertools
 
@@ -18,7 +22,7 @@ from warp_lcp.solvers.staggering import Staggering
 TIGHT = wl.StoppingCriteria(rtol=1e-11, max_iterations=20_000, patience=2000)
 CONTACTS = 3
 NORMALS = np.array([0, 2, 4])
-# unknowns 0, 2, 4 are normal, 1, 3, 5 their tangential ones
+# Unknowns 0, 2, 4 are normal; 1, 3, 5 are their tangential ones.
 INDEX = np.array([-1, 0, -1, 2, -1, 4])
 
 SWEEPING = {
@@ -37,9 +41,12 @@ SWEEPING = {
 
 
 def contacts(rng, mu):
-    """A = J M^-1 J' of three planar contacts between random bodies, and the velocities they start from; strong but solvable friction."""
+    """Return A = J M^-1 J' of three planar contacts, and their initial velocities.
+
+    Between random bodies; friction is strong but solvable.
+    """
     J = rng.standard_normal((2 * CONTACTS, 9))
-    # symmetric to rounding only
+    # Symmetric to rounding only.
     A = J @ np.diag(rng.uniform(0.5, 2.0, 9)) @ J.T / 9 + 0.3 * np.eye(2 * CONTACTS)
     b = rng.standard_normal(2 * CONTACTS)
     b[NORMALS] -= 1.0
@@ -47,7 +54,11 @@ def contacts(rng, mu):
 
 
 def enumerate_contacts(A, b, mu):
-    """All solutions: each normal force is 0 or its contact touches; each friction force sticks, or is at -mu n or at mu n."""
+    """Return all solutions by enumeration.
+
+    Each normal force is 0 or its contact touches; each friction force sticks, or is at -mu n or at
+    mu n.
+    """
     n, found = len(b), []
     for touching in itertools.product((False, True), repeat=CONTACTS):
         for sliding in itertools.product((-1, 0, 1), repeat=CONTACTS):
@@ -104,11 +115,14 @@ def test_planar_contacts_have_the_enumerated_solution(name, sparse, device):
             ("open", "slides", "sticks")[int(n > 1e-9) * (1 + int(abs(t) < mu * n - 1e-9))]
             for n, t in x.reshape(3, 2)
         }
-    assert kinds == {"open", "slides", "sticks"}  # each state of Coulomb's law has been met
+    assert kinds == {"open", "slides", "sticks"}  # each state of Coulomb's law has occurred
 
 
 def block_on_a_slope(angle, mu):
-    """Normal and friction impulse that hold a block of unit mass on a slope for a unit of time: n = cos, t = min(sin, mu cos)."""
+    """Return normal and friction impulse of a block of unit mass on a slope.
+
+    They hold it for a unit of time: n = cos, t = min(sin, mu cos).
+    """
     return (
         np.eye(2),
         np.array([-np.cos(angle), -np.sin(angle)]),
@@ -118,7 +132,7 @@ def block_on_a_slope(angle, mu):
 
 @pytest.mark.parametrize("angle", [0.2, 0.5])
 def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(angle, device):
-    mu = 0.3  # holds up to atan(0.3) = 0.29
+    mu = 0.3  # sticks up to atan(0.3) = 0.29
     A, b, expected = block_on_a_slope(angle, mu)
     result = wl.solve(
         wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction([-1, 0], mu)),
@@ -129,7 +143,10 @@ def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(angle, de
 
 
 def test_a_block_is_pressed_no_harder_than_it_may(device):
-    """The most normal force bounds the friction too: both bounds of the friction are at hand at the largest n, whatever their signs."""
+    """Block with a bound on the normal force, which also bounds its friction.
+
+    Both bounds of the friction are reached at the largest n, whatever their signs.
+    """
     low, high = wl.AffineBounds.friction([-1, 0], 0.3, upper=0.5)
     problem = wl.LCP(wl.DenseOperator(np.eye(2), device=device), [-1.0, -1.0], low, high)
     result = wl.solve(problem, wl.ProjectedSOR(omega=1.0), stopping=TIGHT)
@@ -138,12 +155,15 @@ def test_a_block_is_pressed_no_harder_than_it_may(device):
 
 
 def test_grid_fields_take_affine_bounds(device):
-    """On grids bounds are evaluated once a sweep; a cell whose upper bound is half of another cell's value."""
+    """Affine bounds on grid fields.
+
+    They are evaluated once a sweep; a cell's upper bound is half of another cell's value.
+    """
     cells = np.array([[wl.AIR, wl.FLUID, wl.FLUID, wl.AIR]])
     index = np.array([[-1, -1, 1, -1]])
     upper = wl.AffineBounds(np.where(index < 0, np.inf, 0.0), index, 0.5)
     # A = [[2, -1], [-1, 2]], b = -(1, 3): free, x = (5/3, 7/3); with x_2 <= x_1 / 2 it is 2 x_1 -
-    # x_2 = 1, x_2 = x_1 / 2
+    # x_2 = 1, x_2 = x_1 / 2.
     expected = np.array([[0.0, 2 / 3, 1 / 3, 0.0]])
     for method in (wl.ProjectedSOR(omega=1.0), ProjectedJacobi(), Staggering(blocks=[[1], [2]])):
         A = wl.GridPoisson(cells, device=device, dtype=wp.float64)

@@ -1,4 +1,7 @@
-"""Bounds that are coded in a byte a cell: the same problem as their fields, also when the caller changes them in place."""
+"""Bounds coded in one byte per cell: the same problem as their fields.
+
+Also when the caller changes them in place.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ SHAPE = (5, 6, 7)
 
 
 def pool():
-    """A box of liquid under AIR, with random b."""
+    """Return a box of liquid under AIR, with random b."""
     cells = np.ones(SHAPE, dtype=int)
     cells[-1] = wl.AIR
     return cells, np.where(cells == wl.FLUID, np.random.default_rng(31).standard_normal(SHAPE), 0.0)
@@ -73,7 +76,10 @@ def test_wrong_fields_are_still_named():
 
 
 def reference(cells, b, lower, upper):
-    """Active sets guessed from x and y until the guess stays, each solved densely: the solution, to rounding, or an assertion."""
+    """Return the solution by primal-dual active sets with dense solves.
+
+    To rounding, or an assertion fails.
+    """
     fluid = cells == wl.FLUID
     A, c = assemble(cells)[np.ix_(fluid.ravel(), fluid.ravel())], b[fluid]
     low, high = (np.broadcast_to(v, SHAPE)[fluid] for v in (lower, upper))

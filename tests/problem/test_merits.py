@@ -1,4 +1,7 @@
-"""The book's merit functions in a history: their formulas, on matrices and grids, and nothing of them unless asked for."""
+"""Merit functions of the book in a history: formulas on matrices and grids.
+
+They are absent by default.
+"""
 
 import numpy as np
 import pytest
@@ -41,7 +44,7 @@ def test_each_record_has_the_merits_of_its_iterate(method, device):
     for record, x in zip(result.history, iterates, strict=True):
         y = A @ x + b
         assert record.merits.largest == pytest.approx(np.abs(x).max())  # [Book] eq. 2.55
-        # [Book] eq. 2.56
+        # [Book] eq. 2.56.
         assert record.merits.complementarity == pytest.approx(abs(x @ y), abs=1e-13)
         assert record.merits.absolute == pytest.approx(x @ np.abs(y), abs=1e-13)  # [Book] eq. 2.200
     assert result.history[0].merits.absolute == 0  # at x = 0, which is no solution
@@ -49,7 +52,10 @@ def test_each_record_has_the_merits_of_its_iterate(method, device):
 
 
 def test_sweeps_converge_linearly_in_the_modified_merit():
-    """[Book] fig. C.2 draws eq. 2.200 for PGS: a straight line on a logarithmic scale."""
+    """Linear convergence of sweeps in the modified merit.
+
+    [Book] fig. C.2 draws eq. 2.200 for PGS: a straight line on a logarithmic scale.
+    """
     A, b = spd(40, 5107), np.random.default_rng(5109).standard_normal(40)
     result = wl.solve(
         wl.LCP(wl.DenseOperator(A, device="cpu"), b), wl.ProjectedSOR(omega=1.0), stopping=ASKED
@@ -61,7 +67,11 @@ def test_sweeps_converge_linearly_in_the_modified_merit():
 
 
 def test_in_a_box_distances_are_those_to_the_bound_that_y_asks_for():
-    """y = x + b; x half above l where y > 0, half below u where y < 0, under u alone, and without a bound."""
+    """Distances in a box: those to the bound that the sign of y implies.
+
+    y = x + b. x is half above l where y > 0, half below u where y < 0, under u alone, and without a
+    bound.
+    """
     problem = wl.LCP(
         wl.DenseOperator(np.eye(4), device="cpu"),
         np.array([2.0, -5.0, 1.0, 5.0]),

@@ -1,4 +1,7 @@
-"""Matrices with their sign flipped: told at once, with a message that asks for the sign."""
+"""Matrices with their sign flipped: detected at once, with a message.
+
+The message asks for the sign.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +25,10 @@ def laplacian(n):
 
 
 def drawn(seed):
-    """Return a matrix that methods solve with: sparse or dense, symmetric positive definite or a dominant unsymmetric one."""
+    """Return a solvable matrix, sparse or dense.
+
+    It is symmetric positive definite, or dominant and unsymmetric.
+    """
     rng = np.random.default_rng(seed)
     kind, n = int(rng.integers(0, 4)), int(rng.integers(2, 40))
     if kind == 0:
@@ -37,7 +43,7 @@ def drawn(seed):
 
 
 def products(A):
-    """Return A as an operator that shows products only."""
+    """Return A as an operator with products only."""
     symmetric = bool(abs(A - A.T).max() < 1e-12)
     return wl.LinearOperator(
         lambda x: A @ x,
@@ -66,7 +72,10 @@ def test_flipped_matrices_take_no_steps(method):
 
 
 def test_flipped_matrices_are_solved_or_refuted_by_default():
-    """Pivots solve -A or prove it infeasible; what neither does has negative curvature."""
+    """Flipped matrices: solved or proved infeasible by default.
+
+    Pivots solve -A or prove it infeasible; otherwise negative curvature is reported.
+    """
     for seed in range(6201, 6216):
         A = drawn(seed)
         b = np.random.default_rng([seed, 1]).standard_normal(A.shape[0]) - 1.0
@@ -79,7 +88,10 @@ def test_flipped_matrices_are_solved_or_refuted_by_default():
 
 @pytest.mark.parametrize(("n", "status"), [(20, 2), (32, 10)])
 def test_the_message_asks_for_the_sign(n, status):
-    """Up to 1,000 unknowns pivots prove that there is no solution."""
+    """Message that asks for the sign.
+
+    Up to 1,000 unknowns pivots prove that there is no solution.
+    """
     found = wl.linear_complementarity(-laplacian(n), np.full(n * n, -1.0))
     assert not found.success
     assert "A, not -A" in found.message
@@ -96,7 +108,10 @@ def test_products_alone_tell_too():
 
 
 def test_finite_bounds_allow_any_sign():
-    """A box always holds a solution (Brouwer's fixed point of the projection)."""
+    """Any sign with finite bounds.
+
+    A box always has a solution (Brouwer's fixed point of the projection).
+    """
     A = drawn(6261)
     assert not has_negative_curvature(wl.LCP(-A, np.ones(A.shape[0]), 0.0, 1.0))
     upper = np.full(A.shape[0], np.inf)
@@ -104,7 +119,11 @@ def test_finite_bounds_allow_any_sign():
 
 
 def test_some_negative_entries_are_no_wrong_sign():
-    """Convection makes some, as in a step of Newton's method for ice: such problems have solutions, which the default finds."""
+    """Some negative entries: no wrong sign.
+
+    Convection causes some, as in a Newton step for ice. Such problems have solutions, which the
+    default finds.
+    """
     rng = np.random.default_rng(6281)
     for form in (np.asarray, scipy.sparse.csr_array):
         A = drawn(6262)

@@ -1,4 +1,7 @@
-"""Pickles and copies of problems, operators and results: the same answers, bit for bit, and memory of their own."""
+"""Pickles and copies of problems, operators and results.
+
+The same answers, bit for bit, and separate memory.
+"""
 
 import copy
 import pickle
@@ -137,7 +140,7 @@ def test_results(again, device):
 
 
 def test_statuses_go_by_their_names():
-    """What they say may change between versions."""
+    """Statuses by their names, since their messages may change between versions."""
     for status in wl.SolveStatus:
         assert again_by_pickle(status) is status
         assert status.value.encode() not in pickle.dumps(status)

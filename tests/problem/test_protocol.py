@@ -1,4 +1,7 @@
-"""Operators of a user's own: the methods that take one with only what all have, and those that each capability lets in."""
+"""User-defined operators.
+
+Methods that take an operator with only the common members, and those that each capability enables.
+"""
 
 import numpy as np
 import pytest
@@ -28,9 +31,9 @@ ASKED = {
 
 
 class Least:
-    """What every operator has of another one, and what some capabilities ask for; it counts what it is asked for.
+    """Operator with the common members of another one, and some capabilities.
 
-    Where it has no layout it is a user's own, with plain fields.
+    It counts its calls. Without a layout it is user-defined, with plain fields.
     """
 
     def __init__(self, A, *capabilities):
@@ -48,7 +51,7 @@ class Least:
 
 
 def shown(capability, n):
-    """An operator of ours that has a capability, SPD with n unknowns."""
+    """Return an operator of the library with one capability, SPD with n unknowns."""
     grid = wl.GridPoisson(np.ones((n, 1), dtype=int), shift=0.5, device="cpu", dtype=wp.float64)
     if capability is HasColumns:
         return wl.SumOperator(
@@ -122,7 +125,11 @@ def test_tables_say_what_operators_have():
 
 
 def test_methods_that_messages_name_ask_for_nothing():
-    """MinimumMapNewton, and for bounds affine in x ProjectedJacobi: also what is taken and recommended without a word."""
+    """Methods named by messages: they need no further capability.
+
+    MinimumMapNewton, and ProjectedJacobi for bounds affine in x: also what is used and recommended
+    by default.
+    """
     own = Least(shown(None, 3))
     assert takes(wl.MinimumMapNewton, own)
     constant, friction = (
@@ -138,7 +145,10 @@ def test_methods_that_messages_name_ask_for_nothing():
 
 
 def test_rows_are_the_operator_s_own():
-    """A row sweep sees entries that change in place, of an operator that has no sweep of its own."""
+    """Rows of an operator without a sweep of its own.
+
+    A row sweep uses entries that change in place.
+    """
     A = shown(HasRows, 12)
     own, b = Least(A, HasRows, HasScale), np.linspace(-1.0, 1.0, 12)
     problem, method = wl.LCP(own, b), wl.ProjectedSOR()

@@ -1,4 +1,4 @@
-"""Both forms of a problem are solved, by methods that have nothing in common, and give the same answer."""
+"""Both forms of a problem, solved by unrelated methods: the same answer."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ TIGHT = wl.StoppingCriteria(rtol=1e-11)
 
 
 def boxes(seed, n=7, *, mixed=0.0):
-    """A symmetric positive definite matrix, boxes of all kinds, and the answer by exhaustive search."""
+    """Return an SPD matrix, boxes of all kinds, and the answer by enumeration."""
     rng = np.random.default_rng(seed)
     A, b = definite(n, condition=20, seed=seed).A, rng.standard_normal(n)
     kind = rng.integers(0, 3, n)
@@ -170,7 +170,7 @@ def test_gap_is_infinite_where_the_cone_has_no_end():
         np.eye(2), np.array([-1.0, 1.0]), np.zeros(2), np.full(2, np.inf)
     )
     assert inequality.gap(np.zeros(2)) == np.inf  # y_0 < 0 and x_0 has no upper bound
-    assert inequality.gap(np.array([1.0, 0.0])) == 0.0  # the solution
+    assert inequality.gap(np.array([1.0, 0.0])) == 0.0  # at the solution
     assert inequality.gap(np.array([1.0, 2.0])) == 6.0  # y = (0, 3), x - l = (1, 2)
 
 
@@ -222,12 +222,15 @@ def test_a_chain_of_forms_ends_where_it_began():
 
 @pytest.mark.parametrize("equations", [[0], [1, 0], np.array([1, 0]), np.array([True]), "ab"])
 def test_equations_are_marked_not_numbered(equations):
-    """~ of the integers 1, 0 is -2, -1: both rows would be bounded."""
+    """Equations are marked by booleans, not by numbers.
+
+    ~ of the integers 1, 0 is -2, -1: both rows would be bounded.
+    """
     A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
     for make in (form.mixed_to_lcp, form.mixed_to_boxed):
         with pytest.raises(ValueError, match=r"equations has shape .* expected \(2,\) and bool"):
             make(A, b, equations, device="cpu")
-    # -2.5 + 0.5 / 2
+    # -2.5 + 0.5 / 2.
     assert form.mixed_to_lcp(A, b, [True, False], device="cpu").b == pytest.approx([-2.25])
 
 

@@ -1,4 +1,4 @@
-"""The natural residual's scale d: what it is, and that no wrong answer passes where the diagonal is tiny."""
+"""Scale d of the natural residual; no wrong answer passes if the diagonal is tiny."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.scale import scale_by_products, scale_of_matrix
 
-# x = (1, 1); (1, 1e-8) and (71, .95) once passed
+# The solution is x = (1, 1); (1, 1e-8) and (71, 0.95) once passed.
 TINY = (np.array([[1e-8, -1.0], [1.0, 1e-8]]), np.array([1.0, -1.0]))
 SOLVE_IT = ["interior-point", "lemke", "minimum-map-newton", "primal-dual-active-set"]
 
 
 class Shown:
-    """An operator of a user's own: products and the diagonal, no entries."""
+    """User-defined operator: products and the diagonal, no entries."""
 
     def __init__(self, A):
         self._A, self.shape, self.dtype, self.device = (
@@ -54,7 +54,10 @@ def operator(A, kind):
 
 
 def program(seed, m=20, n=20):
-    """A linear program min c'x, G x >= h, x >= 0 of 40 unknowns with its dual, as an LCP with eps I, and c, G, h."""
+    """Return a linear program with its dual, as an LCP with eps I, and c, G, h.
+
+    The program is min c'x, G x >= h, x >= 0, of 40 unknowns.
+    """
     rng = np.random.default_rng([7919, seed])
     G, x, u = (
         rng.uniform(-1, 1, (m, n)),
@@ -78,7 +81,7 @@ def semidefinite(rng, n, rank):
 
 
 def unscaled(M, b, x):
-    """||min(x, y)|| over that at x = 0, of matrices with entries near 1."""
+    """Return ||min(x, y)|| over that at x = 0, of matrices with entries near 1."""
     return np.linalg.norm(np.minimum(x, M @ x + b)) / np.linalg.norm(np.minimum(0.0, b))
 
 
@@ -118,7 +121,11 @@ def test_linear_programs_have_their_optimum_or_are_not_solved(method, kind):
 
 @pytest.mark.parametrize("method", ["interior-point", "lemke", "minimum-map-newton"])
 def test_units_of_rows_and_columns_are_the_users(method):
-    """diag(R) M diag(C) with sixteen orders of magnitude among columns and eight among rows; judged in units of M."""
+    """Solutions in the user's units of rows and columns.
+
+    The matrix is diag(R) M diag(C) with sixteen orders of magnitude among columns and eight among
+    rows. It is judged in units of M.
+    """
     for seed in range(4):
         M, b, *_ = program(seed)
         rng = np.random.default_rng(seed)
@@ -133,7 +140,10 @@ def test_units_of_rows_and_columns_are_the_users(method):
 
 
 def test_the_scale_by_assignment():
-    """Against the oracle's, which knows no potentials; and the largest entry of each row and column becomes 1."""
+    """Scale by assignment, against the oracle's, which has no potentials.
+
+    The largest entry of each row and column becomes 1.
+    """
     rng, leads = np.random.default_rng(613), 0
     for k in range(200):
         n = int(rng.integers(1, 9))
@@ -155,7 +165,10 @@ def test_the_scale_by_assignment():
 
 @pytest.mark.parametrize("rank", [3, 40])
 def test_semidefinite_matrices_keep_their_diagonal(rank):
-    """Bit for bit, also stored in float32; and where rows and columns are in other units."""
+    """Diagonal of semi-definite matrices: unchanged bit for bit.
+
+    Also stored in float32, and where rows and columns are in other units.
+    """
     rng = np.random.default_rng(617)
     for n in (4, 40):
         A = semidefinite(rng, n, rank)
@@ -184,7 +197,11 @@ def test_grids_keep_their_stencil():
 
 
 def test_an_operator_that_shows_its_diagonal_only():
-    """Its scale is |A_ii| where that is at least a tenth of the sizes of row and column, else about those sizes."""
+    """Scale of an operator with its diagonal only.
+
+    |A_ii| where that is at least a tenth of the sizes of row and column, otherwise about those
+    sizes.
+    """
     M, b = TINY
     residual = NaturalResidual(wl.LCP(Shown(M), b))
     wrong = wp.array([1.0, 1e-8], dtype=wp.float64, device="cpu")

@@ -1,4 +1,7 @@
-"""Rows of very different size: a large one says nothing of the others, neither at the start nor at the floor."""
+"""Rows of very different size, judged independently.
+
+At the start and at the floor.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +19,10 @@ CRITERIA = wl.StoppingCriteria(rtol=1e-6, max_iterations=3000, patience=300)
 
 
 def planted(seed, *, largest, form="dense"):
-    """Return A, b and the solution of a problem with some rows that are held and whose y is up to `largest`."""
+    """Return A, b and the solution of a problem with some large active rows.
+
+    Their y is up to `largest`.
+    """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 12))
     A = -rng.uniform(0, 1, (n, n)) * (rng.random((n, n)) < 0.5)
@@ -43,7 +49,10 @@ def test_large_rows_that_are_held_hide_no_others(largest):
 
 @pytest.mark.parametrize("name", DENSE)
 def test_no_method_calls_the_start_a_solution(name):
-    """[[2, 1], [1, 2]] and b = (-1, 1e16): (0, 0) was called CONVERGED, and (.5, 0) is right."""
+    """Start that is no solution, for every method.
+
+    [[2, 1], [1, 2]] and b = (-1, 1e16): (0, 0) was called CONVERGED; the solution is (0.5, 0).
+    """
     problem = wl.LCP(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-1.0, 1e16]))
     result = wl.solve(problem, METHODS[name](), stopping=CRITERIA)
     if name == "penalty":  # its penalty of 1e6 d is small beside b = 1e16: the residual grows
@@ -83,7 +92,10 @@ def test_nor_on_grids(name, kind):
 
 
 def test_rounding_is_judged_row_by_row():
-    """Against NumPy: |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|)."""
+    """Rounding judged row by row, against NumPy.
+
+    The tolerance of a row is |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|).
+    """
     rng = np.random.default_rng(6131)
     A = rng.standard_normal((5, 5)) + 6 * np.eye(5)
     x = rng.standard_normal(5)
@@ -101,7 +113,10 @@ def test_rounding_is_judged_row_by_row():
 
 
 def test_a_start_that_solves_up_to_rounding_takes_no_steps():
-    """l = x: y is the rounding of sums whose terms cancel, with either sign."""
+    """Start that solves up to rounding: no steps.
+
+    l = x: y is the rounding error of sums whose terms cancel, with either sign.
+    """
     rng = np.random.default_rng(6137)
     A = rng.standard_normal((8, 8))
     A = A @ A.T + np.eye(8)
@@ -112,7 +127,11 @@ def test_a_start_that_solves_up_to_rounding_takes_no_steps():
 
 
 def test_the_floor_is_that_of_the_rows_whose_y_counts():
-    """Row 0 is held far from its bound's end: the rounding of its b is no error of the residual."""
+    """Floor of the rows whose y counts.
+
+    Row 0 is active far from the end of its bound: the rounding of its b is no error of the
+    residual.
+    """
     A, b = np.diag([2.0, 3.0]), np.array([1e16, -3.0])
     problem = wl.LCP(A, b)
     residual = NaturalResidual(problem)

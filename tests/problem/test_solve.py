@@ -12,7 +12,7 @@ from warp_lcp.solvers.registry import grid_methods
 
 
 def poisson(n=16, seed=7, device="cpu", **options):
-    """A pool with AIR above, right-hand side random."""
+    """Return a pool with AIR above and a random right-hand side."""
     cells = np.ones((n, n), dtype=int)
     cells[-1] = wl.AIR
     return wl.GridPoisson(cells, device=device, **options), np.random.default_rng(
@@ -28,7 +28,7 @@ def method(request):
 
 
 class Ring:
-    """A user's own operator: periodic second differences plus a shift, in NumPy."""
+    """User-defined operator: periodic second differences plus a shift, in NumPy."""
 
     symmetric = True
 
@@ -115,7 +115,11 @@ def test_reused_workspace_gives_the_same_answer_bit_for_bit(method):
 
 @pytest.mark.parametrize("name", grid_methods())
 def test_in_place_problem_follows_changed_cells_and_b(name):
-    """Cells go, and others come to the right of the last ones in their rows: a workspace takes the steps of a new one."""
+    """In-place problem after changes of cells and b.
+
+    Cells disappear, and others appear to the right of the last ones in their rows: a workspace
+    takes the steps of a new one.
+    """
     solver, b, cells = (
         wl.METHODS[name](),
         np.random.default_rng(7).standard_normal((12, 40)),
@@ -145,7 +149,10 @@ def test_in_place_problem_follows_changed_cells_and_b(name):
 
 @pytest.mark.parametrize("precision", ["single", "mixed"])
 def test_an_in_place_problem_has_its_solution_in_one_array(precision):
-    """x lies where the last one did, of the method's precision; another workspace has another array."""
+    """Solution of an in-place problem in one array.
+
+    x has the place of the last one and the method's precision; another workspace has another array.
+    """
     A, _ = poisson()
     b = wp.array(
         np.random.default_rng(7).standard_normal(A.layout.stored_shape),
@@ -205,7 +212,7 @@ def test_without_a_method_the_fastest_is_taken():
         -np.ones(2),
         *wl.AffineBounds.friction([-1, 0], 0.5),
     )
-    # x_n = 1, and x_t = 1 beyond mu x_n
+    # x_n = 1, and x_t = 1 beyond mu x_n.
     np.testing.assert_allclose(wl.solve(friction).x.numpy(), [1.0, 0.5], atol=1e-5)
     assert wl.solve(wl.LCP(A, b)).history[1].step == "monotone cycle"
     assert wl.solve(dense)
@@ -287,7 +294,7 @@ def test_newton_settings_are_checked(bad):
 
 
 class TestStatuses:
-    """Each status is reached once on purpose."""
+    """Each status, reached once on purpose."""
 
     def test_floor(self, method):
         A, b = poisson()
@@ -320,7 +327,7 @@ class TestStatuses:
             problem, wl.ProjectedSOR(omega=1.0), stopping=wl.StoppingCriteria(max_iterations=1000)
         )
         assert result.status is wl.SolveStatus.DIVERGED
-        # the best iterate comes back, not the last
+        # The best iterate is returned, not the last.
         assert result.residual == min(record.residual for record in result.history)
         infinite = np.full(2, np.inf)
         assert natural_residual(
@@ -340,7 +347,7 @@ class TestStatuses:
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2))
         assert wl.solve(problem, wl.MinimumMapNewton()).status is wl.SolveStatus.NEGATIVE_CURVATURE
         assert wl.solve(problem, wl.Lemke()).status is wl.SolveStatus.INFEASIBLE
-        # indefinite, with a positive diagonal
+        # Indefinite, with a positive diagonal.
         A = np.array([[3.0, 3.0, 9.0], [3.0, 2.0, -4.0], [9.0, -4.0, 9.0]])
         indefinite = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-4.0, 1.0, -2.0]))
         assert wl.solve(indefinite, wl.DirectEnumeration())
@@ -416,7 +423,11 @@ class TestStatuses:
 
 @pytest.mark.parametrize("arrays", [False, True])
 def test_a_blob_that_moves_through_a_reused_workspace(method, arrays, device):
-    """Rows are worked on between their first and last liquid cells only: what the last blob left outside must not be seen."""
+    """Moving blob with a reused workspace.
+
+    Rows are processed between their first and last liquid cells only. Values that the last blob
+    left outside must have no effect.
+    """
     rng = np.random.default_rng(79)
     shape = (6, 40, 90)
     _, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")

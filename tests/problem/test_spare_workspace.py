@@ -1,4 +1,7 @@
-"""The workspace that is kept between cold solves: the bits of a new one, bounded memory, nothing of the problems before."""
+"""Spare workspace between cold solves.
+
+It has the bits of a new one, bounded memory, and no data of earlier problems.
+"""
 
 import gc
 import threading
@@ -21,7 +24,7 @@ METHODS += [wl.ProjectedMultigrid(monotone_cycles=0), wl.ProjectedMultigrid(pati
 
 @pytest.fixture(autouse=True)
 def nothing_kept(monkeypatch):
-    """Begin without a workspace, and leave none."""
+    """Begin and end without a spare workspace."""
     wl.release_workspace()
     monkeypatch.setattr(KEPT, "last", None)
     before = wl.get_threads()
@@ -39,7 +42,7 @@ def faces_of(rng, shape):
 
 
 def sides_of(rng, shape, kind):
-    """Return bounds of a kind: numbers, fields that are coded, or other fields."""
+    """Return bounds of a kind: numbers, coded fields, or other fields."""
     some, inf = rng.random(shape) < 0.3, np.inf
     return {
         "obstacle": (0.0, inf),
@@ -53,13 +56,16 @@ def sides_of(rng, shape, kind):
 
 
 def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
-    """Return problems that differ in cells, right-hand side, fields of bounds and, where drawn, the shift."""
+    """Return problems that differ in cells, right-hand side and bounds.
+
+    They differ in the shift too, where it is drawn.
+    """
     made = []
     for _ in range(count):
         cells = rng.choice([wl.FLUID] * 6 + [wl.AIR, wl.SOLID], shape).astype(np.int8)
         cells[:, -int(rng.integers(1, 4)) :] = wl.AIR
         if rng.random() < 0.3:
-            cells[: shape[0] // 2] = wl.SOLID  # rows that are no longer in use
+            cells[: shape[0] // 2] = wl.SOLID  # rows that are no longer used
         cells[0, 0, :2] = wl.FLUID
         shift = {"shift": rng.random(shape)} if coefficients == "shift" else {}
         A = wl.GridPoisson(cells, device="cpu", **shift, **options)
@@ -74,20 +80,20 @@ def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
 
 
 def bits_of(result):
-    """Return what a solve returns, to the last bit."""
+    """Return the results of a solve, for comparison to the last bit."""
     history = tuple((r.iteration, r.residual, r.active, r.step) for r in result.history)
     return result.status, result.x.numpy().tobytes(), result.residual, history
 
 
 def both(problem, method, **options):
-    """Return the bits of a solve, which may use the kept workspace, and of one on a new workspace."""
+    """Return the bits of a solve with the spare workspace, and with a new one."""
     return bits_of(wl.solve(problem, method, **options)), bits_of(
         wl.solve(problem, method, workspace=method.init(problem), **options)
     )
 
 
 def ready(problem, method):
-    """Solve twice, so that a workspace is kept."""
+    """Solve twice, so that a workspace is spare."""
     for _ in range(2):
         wl.solve(problem, method)
     assert KEPT.workspace is not None
@@ -95,7 +101,11 @@ def ready(problem, method):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
-    """Problems of a form in both orders; bounds, coefficients, types, settings, threads and guesses are drawn."""
+    """Bits of a solve with a spare workspace: those of a new one.
+
+    Problems of a form in both orders; bounds, coefficients, types, settings, threads and initial
+    guesses are random.
+    """
     rng = np.random.default_rng(seed)
     shape = [(6, 7, 9), (12, 10, 8), (1, 20, 13)][seed % 3]
     bounds = ["obstacle", "none", "box", "walls", "ceiling", "fields", "negative zero"][
@@ -117,11 +127,15 @@ def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
     for problem in [*problems, *problems[::-1], *problems]:
         kept, new = both(problem, method, x0=x0, stopping=stopping)
         assert kept == new
-    assert len(taken) >= 5  # all but the first two, and those after a solve that does not converge
+    # All except the first two, and those after a solve that does not converge.
+    assert len(taken) >= 5
 
 
 def test_problems_of_other_forms_have_workspaces_of_their_own():
-    """Numbers, shapes, types, settings and threads are told apart, zeros of both signs too."""
+    """Separate workspaces for problems of other forms.
+
+    Numbers, shapes, types, settings and threads are distinguished, zeros of both signs too.
+    """
     rng, method = np.random.default_rng(0), METHODS[0]
     cells, b = np.full((6, 7, 9), wl.FLUID, np.int8), rng.standard_normal((6, 7, 9))
     cells[:, -1:] = wl.AIR
@@ -158,7 +172,10 @@ def test_problems_of_other_forms_have_workspaces_of_their_own():
 
 
 def test_problems_without_copies(monkeypatch):
-    """Fields in place, operators of subclasses, masked ones, many cells: each solve has a workspace of its own."""
+    """Problems without copies: a new workspace for each solve.
+
+    They have fields in place, operators of subclasses, masked ones, or many cells.
+    """
     cells, b = (
         np.full((6, 7, 9), wl.FLUID, np.int8),
         np.random.default_rng(0).standard_normal((6, 7, 9)),
@@ -192,7 +209,11 @@ def test_problems_without_copies(monkeypatch):
 
 
 def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
-    """Operators, fields and guesses of the caller end with him; one workspace stays, and goes by `wl.release_workspace`."""
+    """Lifetime of a problem's data, and release of the spare workspace.
+
+    Operators, fields and guesses end with the caller's references. One workspace stays until
+    `wl.release_workspace`.
+    """
     method, rng = METHODS[0], np.random.default_rng(3)
     problems = drawn_problems(rng, (6, 7, 9), "fields", "uniform")
     guess = wp.array(np.zeros((8, 9, 11)), dtype=wp.float64, device="cpu")
@@ -226,7 +247,11 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
 
 
 def test_solves_that_end_badly_and_rows_alone_keep_nothing():
-    """A workspace in which something may be infinite is not used again, nor one of which the result is a part."""
+    """No spare workspace after a failed solve.
+
+    A workspace that may hold infinite values is not used again, nor one of which the result is a
+    part.
+    """
     method, problem = (
         METHODS[0],
         drawn_problems(np.random.default_rng(5), (6, 7, 9), "obstacle", "uniform")[0],
@@ -255,7 +280,7 @@ def test_solves_that_end_badly_and_rows_alone_keep_nothing():
 
 
 def test_solves_within_solves_and_in_threads():
-    """A workspace serves one solve at a time."""
+    """Solves within solves and in threads: a workspace serves one at a time."""
     method, problems = (
         METHODS[0],
         drawn_problems(np.random.default_rng(6), (12, 10, 8), "walls", "uniform", count=4),
@@ -285,6 +310,6 @@ def test_solves_within_solves_and_in_threads():
 
 
 def test_most_cells_are_those_of_the_docs():
-    """The bounds on memory that `wl.release_workspace` tells."""
+    """Memory limits of `wl.release_workspace`, as documented."""
     assert MOST_CELLS == 393_216
     assert (MOST_CELLS * 45 >> 20, MOST_CELLS * 140 >> 20) == (16, 52)

@@ -1,4 +1,7 @@
-"""Boxes of which liquid takes a part: the bits of a problem that looks through all of its box, in memory of the size of the liquid."""
+"""Boxes partly filled with liquid.
+
+They have the bits of a problem that visits the whole box, in memory of the size of the liquid.
+"""
 
 import subprocess
 import sys
@@ -13,12 +16,15 @@ from warp_lcp.benchmarks.tank import Tank, record
 from warp_lcp.operators import grid_operator
 from warp_lcp.rows import Rows
 
-SHAPES = (24, 150, 90), (8, 300, 150)  # planes of liquid; rows of it in each plane
+SHAPES = (24, 150, 90), (8, 300, 150)  # planes of liquid; rows of liquid in each plane
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
 
 
 def liquid(up, level):
-    """Return cells that are FLUID up to a level along an axis, with a wavy surface and a SOLID block in it."""
+    """Return cells that are FLUID up to a level along an axis.
+
+    They have a wavy surface and a SOLID block.
+    """
     shape = SHAPES[up]
     k, j, i = np.indices(shape, sparse=True)
     height = (k / shape[0], j / shape[1])[up] + 0.05 * np.sin(0.2 * i)
@@ -37,7 +43,10 @@ def stored(values):
 
 
 def solves(up, method, *, in_place):
-    """Return what solves find in liquid that rises, falls and rises again, cold and from the last one's x."""
+    """Return results of solves in liquid that rises, falls and rises again.
+
+    The solves start cold, and from the last x.
+    """
     levels = [liquid(up, level) for level in (0.2, 0.5, 0.1, 0.3)]
     A = wl.GridPoisson(levels[0], device="cpu")
     b, lower = data(levels[0], 61)
@@ -53,7 +62,7 @@ def solves(up, method, *, in_place):
             result = wl.solve(problem, method, stopping=STOPPING, x0=guess, workspace=work)
             assert result
             found.append((result.x.numpy().copy(), [r.residual for r in result.history]))
-        # of cells without liquid, too
+        # Of cells without liquid, too.
         x0 = np.random.default_rng(71).standard_normal(found[-1][0].shape) * 0.01
     return A, found
 
@@ -137,7 +146,10 @@ for grid_operator.LARGE in (1 << 20, 1 << 40):
     resident_bytes() == 0, reason="the system does not tell how much memory is resident"
 )
 def test_fields_take_the_memory_of_the_liquid():
-    """In a process of its own: here memory freed by other tests would be taken again."""
+    """Memory of fields: that of the liquid.
+
+    In a separate process, since here memory freed by other tests would be reused.
+    """
     done = subprocess.run(
         [sys.executable, "-c", TAKEN], check=True, capture_output=True, text=True, timeout=300
     )

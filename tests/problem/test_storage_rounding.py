@@ -1,4 +1,7 @@
-"""Tolerances below what storage in float32 changes: CONVERGED is said of the caller's coefficients, FLOOR of rounded ones."""
+"""Tolerances below the rounding of float32 storage.
+
+CONVERGED refers to the caller's coefficients; rounded ones give FLOOR.
+"""
 
 import numpy as np
 import pytest
@@ -9,20 +12,20 @@ import warp_lcp as wl
 from oracle import assemble
 
 TIGHT, USUAL = (wl.StoppingCriteria(rtol=rtol, max_iterations=200) for rtol in (1e-10, 1e-7))
-EXACT = ("dyadic", "ones")  # float32 holds them, and sums of a row of them
+EXACT = ("dyadic", "ones")  # float32 represents them, and sums of a row of them
 KINDS = ("any", "of float32", *EXACT)
 
 
 def drawn(rng, kind, shape):
-    """Coefficients in [1/4, 1]."""
+    """Return coefficients in [1/4, 1]."""
     values = rng.uniform(0.25, 1.0, shape)
-    if kind == "of float32":  # whose sums it does not hold
+    if kind == "of float32":  # float32 does not represent their sums
         return values.astype(np.float32).astype(np.float64)
     return {"any": values, "dyadic": np.ceil(values * 64) / 64, "ones": np.ones(shape)}[kind]
 
 
 def grid(rng, kind, dtype):
-    """A GridPoisson of random cells, and its matrix."""
+    """Return a GridPoisson of random cells, and its matrix."""
     shape = tuple(int(n) for n in rng.integers(3, 8, rng.integers(2, 4)))
     cells = rng.choice(3, shape, p=[0.2, 0.7, 0.1])
     cells[(0,) * len(shape)] = wl.FLUID
@@ -37,7 +40,7 @@ def grid(rng, kind, dtype):
 
 
 def stencil(rng, kind, dtype):
-    """A dominant, unsymmetric stencil, and its matrix."""
+    """Return a dominant, unsymmetric stencil, and its matrix."""
     n, m = (int(k) for k in rng.integers(4, 9, 2))
     around = {o: -drawn(rng, kind, (n, m)) for o in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1))}
     center = (5.25 if kind in EXACT else 5.3) - sum(around.values()) * 0.5
@@ -99,7 +102,7 @@ def check(family, kind, seed, dtype=wp.float32):
         return None
     assert tight.relative_residual <= 1e-10, (seed, tight.status)
     assert (tight.status is wl.SolveStatus.FLOOR) == (A.storage_rounding() > 1e-10), seed
-    # there sums on the diagonal are rounded
+    # There sums on the diagonal are rounded.
     if tight and not (kind == "of float32" and dtype is wp.float32):
         assert residual(M, b, x) <= 2e-10 * size, seed
     return tight.status
@@ -110,7 +113,7 @@ def check(family, kind, seed, dtype=wp.float32):
 def test_what_is_converged_is_so_for_the_coefficients_that_were_given(family, kind):
     for seed in range(6):
         found = check(family, kind, seed)
-        # whose center is a sum
+        # Its center is a sum.
         rounded = kind == "any" or (kind == "of float32" and family == "stencil")
         assert found in (None, wl.SolveStatus.FLOOR if rounded else wl.SolveStatus.CONVERGED), (
             seed,
@@ -146,7 +149,11 @@ def test_the_rounding_is_the_largest_relative_one():
 
 
 def test_arrays_of_float32_are_what_was_given():
-    """A simulator's arrays on the device: tolerances below float32 are met by the stored A, and say CONVERGED."""
+    """Arrays of float32 are not rounded.
+
+    A simulator's arrays on the device: the stored A meets tolerances below float32, and the status
+    is CONVERGED.
+    """
     cells = np.ones((6, 7), dtype=int)
     cells[0] = wl.AIR
     face = wp.array(np.full((3, 8, 9), 0.1), dtype=wp.float32, device="cpu")

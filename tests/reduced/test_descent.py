@@ -1,4 +1,7 @@
-"""The energy as the judge of steps, and grids on which the residual misleads: strips, vents, torsion, a dam, an obstacle that moves."""
+"""Energy as the criterion of steps, and grids with a misleading residual.
+
+They are strips, vents, torsion, a dam, and a moving obstacle.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +29,8 @@ def test_pressure_far_from_air_is_that_of_the_linear_system(name):
     cells[(..., -1) if "strip" in name else (0,) * cells.ndim] = 0
     A, b = wl.GridPoisson(cells, device="cpu"), np.where(cells == 1, -1.0, 0.0)
     result, linear = wl.solve(wl.LCP(A, b)), wl.solve(wl.LCP(A, b, -np.inf))
-    assert result, result.status  # no unknown is held, and the residual rises thirtyfold on the way
+    # No unknown is active, and the residual rises thirtyfold on the way.
+    assert result, result.status
     assert linear
     assert result.iterations <= 2 * linear.iterations + 6
     x = result.x.numpy()
@@ -77,7 +81,7 @@ def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
 def test_obstacles_against_lemke(problem):
     dense = problem.dense()
     result = wl.solve(problem.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10))
-    # with the stored A; FLOOR where float32 has rounded that
+    # With the stored A; FLOOR where float32 has rounded it.
     assert result.relative_residual <= 1e-10, result.status
     x, fluid = result.x.numpy(), problem.sparse()
     rows = np.flatnonzero(problem.A.cells.numpy()[1, 1:-1, 1:-1].ravel() == wl.FLUID)
@@ -95,7 +99,10 @@ def test_obstacles_against_lemke(problem):
 
 @pytest.mark.parametrize("ny", [25, 49])
 def test_dam_is_that_of_its_definition(ny):
-    """Where the dam is wet the second differences are 1, whatever the grid; above it is dry."""
+    """Dam against its definition.
+
+    Where the dam is wet the second differences are 1 on any grid; above it is dry.
+    """
     p = dam(17, ny, device="cpu")  # hx = 1
     x = wl.solve(p.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy()
     w, y = x.copy(), np.linspace(0, 24, ny)
@@ -135,7 +142,11 @@ def test_energy_is_that_of_the_definition(method, faces):
 @pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.MinimumMapNewton()])
 @pytest.mark.parametrize("size", [1e-3, 40.0])
 def test_a_projected_cycle_solves_a_few_cells(size, method):
-    """All of them are on the coarsest level, whose sweeps come to the solution: of the problem itself, whatever its size."""
+    """Projected cycle on a few cells.
+
+    All are on the coarsest level, whose sweeps converge to the solution of the problem itself,
+    whatever its size.
+    """
     cells, rng = (
         np.pad(np.ones((2, 3), dtype=np.int8), 1, constant_values=wl.AIR),
         np.random.default_rng(23),
@@ -157,7 +168,10 @@ def test_a_projected_cycle_solves_a_few_cells(size, method):
 
 
 def test_projected_sweeps_lower_the_energy_from_anywhere():
-    """What a solve falls back on if nothing else leads down converges: every sweep lowers the energy, for any iterate."""
+    """Projected sweeps as the last fallback: they converge.
+
+    Every sweep lowers the energy, for any iterate.
+    """
     rng = np.random.default_rng(5150)
     cells = rng.choice([0, 1, 1, 1, 1, 2], size=(11, 8)).astype(np.int8)
     problem = wl.LCP(
@@ -192,7 +206,7 @@ def test_runs_of_projected_steps_double():
         due.append(descent.due(3))
     assert due == [0, 0, 1, 0, 0, 2, 0, 0, 4, 0, 0, 8]
     assert not descent.sinks
-    descent.record(-1.1, 50.0)  # the residual rises, the energy has never been less
+    descent.record(-1.1, 50.0)  # the residual rises, but the energy is the least so far
     assert descent.sinks
     assert descent.due(3) == 0
 
@@ -249,7 +263,11 @@ def test_warm_starts_take_no_more_steps_than_cold_ones():
     [((17, 17, 17), (True, True, False)), ((60, 44), (True, True)), ((52, 75), (True, False))],
 )
 def test_boxes_that_one_bound_holds(shape, periodic, method):
-    """Off its bound the box is singular: what b pushes it with is left to the bound, and the rest solved as without it."""
+    """Boxes held by one bound.
+
+    Away from its bound the box is singular: the bound takes the sum of b, and the rest is solved as
+    without it.
+    """
     rng = np.random.default_rng([*shape, 7])
     cells, upper = np.ones(shape, dtype=np.int8), np.full(shape, np.inf)
     upper[tuple(n // 3 for n in shape)] = 4000.0
@@ -262,5 +280,5 @@ def test_boxes_that_one_bound_holds(shape, periodic, method):
     x, at = result.x.numpy().ravel(), int(np.argmin(upper.ravel()))
     y = grid_matrix(A) @ x + b.ravel()
     assert x[at] == 4000.0
-    assert y[at] == pytest.approx(b.sum(), rel=1e-5)  # all that b has
+    assert y[at] == pytest.approx(b.sum(), rel=1e-5)  # all of b
     assert np.abs(np.delete(y, at)).max() < 1e-3 * abs(b.sum())

@@ -1,4 +1,7 @@
-"""Rows in units of their own, D A D with D from 1e-8 to 1e8, and problems without a solution: what second-order methods make of them."""
+"""Rows in different units, and problems without a solution.
+
+D A D with D from 1e-8 to 1e8, for second-order methods.
+"""
 
 import numpy as np
 import pytest
@@ -45,14 +48,19 @@ def problem(A, b, kind, lower=0.0, upper=np.inf):
 @pytest.mark.parametrize("method", METHODS, ids=name)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_extreme_rows(kind, method):
-    """Sixteen orders of magnitude between units, thirty-two between pivots: interior points once diverged, dense blocks seemed singular."""
+    """Extreme rows.
+
+    There are sixteen orders of magnitude between units, and thirty-two between pivots. Interior
+    points once diverged, and dense blocks seemed singular.
+    """
     for seed in range(6):
         rng = np.random.default_rng(seed)
         A, b, D = matrix(kind, rng), rng.standard_normal(N), 10 ** rng.uniform(-8, 8, N)
         scaled = problem(D[:, None] * A * D, D * b, kind)
         result = wl.solve(scaled, wl.default_chain(method, scaled))
         assert result, (seed, result.status)
-        largest = D.max() / 100 < D  # the criterion is in units of y: it tells these rows from 0
+        # The criterion is in units of y: it distinguishes these rows from 0.
+        largest = D.max() / 100 < D
         np.testing.assert_array_equal(
             (result.x.numpy() * D)[largest] < 1e-3, lemke(A, b)[largest] < 1e-3
         )
@@ -60,7 +68,7 @@ def test_extreme_rows(kind, method):
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_same_steps_in_any_units(kind):
-    """D powers of 4, so that S takes them out exactly."""
+    """Equal steps in any units: D powers of 4, so that S removes them exactly."""
     rng = np.random.default_rng(107)
     A, b, D = matrix(kind, rng), rng.standard_normal(N), 4.0 ** rng.integers(-13, 14, N)
     x, high = lemke(A, b), np.full(N, 2.0)
@@ -90,7 +98,10 @@ def test_the_same_steps_in_any_units(kind):
 @pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
 @pytest.mark.parametrize("precision", ["mixed", "double", "single"])
 def test_no_solution_is_proved(b, kind, precision):
-    """y_2 = -x_1 - 1 < 0 whatever x >= 0 is: iterates leave for infinity, and were once said to be not finite."""
+    """Proof that no solution exists.
+
+    y_2 = -x_1 - 1 < 0 for every x >= 0: iterates diverge, and were once reported as not finite.
+    """
     result = wl.solve(problem(TURN, np.array(b), kind), InteriorPoint(precision=precision))
     assert result.status is wl.SolveStatus.INFEASIBLE
     assert np.isfinite(result.x.numpy()).all()
@@ -99,7 +110,10 @@ def test_no_solution_is_proved(b, kind, precision):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_what_is_no_solution_is_not_called_infeasible_where_there_is_one(seed):
-    """Indefinite matrices, for which the method promises nothing; exhaustive search knows better."""
+    """False INFEASIBLE is excluded for solvable problems.
+
+    Indefinite matrices, for which the method gives no guarantee; enumeration decides.
+    """
     rng = np.random.default_rng(seed)
     A, b = rng.standard_normal((4, 4)), rng.standard_normal(4)
     result = wl.solve(problem(A + A.T, b, "dense"), InteriorPoint())

@@ -1,4 +1,7 @@
-"""Nested iteration on narrow matrices: cyclic reduction against dense Schur complements, and steps that do not grow with n."""
+"""Nested iteration on narrow matrices.
+
+Cyclic reduction against dense Schur complements, and steps that do not grow with n.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +23,10 @@ def banded(p):
 
 
 def natural_residual(A, b, lower, upper, x):
-    """The diagonal is the scale: the matrices here are dominant or positive definite."""
+    """Return the natural residual; its scale is the diagonal.
+
+    The matrices here are dominant or positive definite.
+    """
     d = A.diagonal()
     return np.linalg.norm(d * (x - np.clip(x - (A @ x + b) / d, lower, upper)))
 
@@ -34,7 +40,10 @@ def relative_residual(p, x):
 
 
 def newton(A, b, lower, upper, x):
-    """Whole Newton steps on the minimum map until the active set comes again, by dense NumPy."""
+    """Return whole Newton steps on the minimum map, by dense NumPy.
+
+    They end when the active set repeats.
+    """
     seen = []
     while True:
         target = x - (A @ x + b) / A.diagonal()
@@ -48,7 +57,10 @@ def newton(A, b, lower, upper, x):
 
 
 def plain_nested_iteration(A, b, lower, upper, k, *, finest=True):
-    """The definition, with dense Schur complements; n is a multiple of k."""
+    """Return nested iteration by definition, with dense Schur complements.
+
+    n is a multiple of k.
+    """
     n = len(b)
     if n <= COARSEST * k:
         return newton(A, b, lower, upper, np.clip(np.zeros(n), lower, upper))
@@ -93,13 +105,16 @@ def test_steps_on_m_matrices_do_not_grow_with_n(kind):
             p = narrow_problem(kind, seed, n)
             result = wl.solve(wl.LCP(p.A, p.b, p.lower, p.upper))
             assert result, f"{p.name}: {result.status.name}"
-            # four plain steps, nested iteration, and what is left
+            # Four plain steps, nested iteration, and the rest.
             assert result.iterations <= 11, p.name
             assert relative_residual(p, result.x.numpy()) <= 1e-6 * (1 + 1e-6)
 
 
 def test_an_upper_bound_in_a_window_at_any_size():
-    """Ended in an AttributeError at 3,700 unknowns, after 9, 22 and 76 steps at 100, 400 and 1,600."""
+    """Upper bound in a window at any size.
+
+    It ended in an AttributeError at 3,700 unknowns, after 9, 22 and 76 steps at 100, 400 and 1,600.
+    """
     for n in (100, 400, 1600, 3700, 50000):
         x = np.arange(1, n + 1) / (n + 1)
         A = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
@@ -115,7 +130,10 @@ def test_an_upper_bound_in_a_window_at_any_size():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_default_solves_narrow_problems(kind):
-    """Beams of 150 unknowns: the condition of larger ones leaves no digits."""
+    """Default method on narrow problems.
+
+    Beams of 150 unknowns: the condition number of larger ones leaves no digits.
+    """
     for seed in range(7331, 7339):
         p = narrow_problem(kind, seed, 150)
         result = wl.solve(wl.LCP(p.A, p.b, p.lower, p.upper))
@@ -126,7 +144,11 @@ def test_default_solves_narrow_problems(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1500, 15000])
 def test_default_solves_large_narrow_problems(n):
-    """The condition of beams is about n^4: 5e12 at 1,500 unknowns, where FLOOR is honest; at 15,000, 5e16, A is singular in float64."""
+    """Default method on large narrow problems.
+
+    The condition number of beams is about n^4: 5e12 at 1,500 unknowns, where FLOOR is correct; at
+    15,000, 5e16, A is singular in float64.
+    """
     for kind in KINDS:
         beam = kind in ("beam", "supported beam", "frame")
         for seed in range(7341, 7361):
@@ -136,7 +158,7 @@ def test_default_solves_large_narrow_problems(n):
             assert result or honest, f"{p.name}: {result.status.name}"
             if result:
                 x = result.x.numpy()
-                # of A x: another order of sums leaves another residual
+                # Of A x: another order of sums gives another residual.
                 rounding = EPS * np.linalg.norm(abs(p.A) @ abs(x))
                 start = np.clip(np.zeros(len(p.b)), p.lower, p.upper)
                 allowed = 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, start) + 4 * rounding

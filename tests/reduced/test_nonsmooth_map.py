@@ -1,4 +1,7 @@
-"""The maps that Newton-type methods descend on: each row against its definition, at kinks too, in all places where they are computed."""
+"""Nonsmooth maps of Newton-type methods, row by row against their definition.
+
+At kinks too, in all places where they are computed.
+"""
 
 from decimal import Decimal, localcontext
 
@@ -26,7 +29,10 @@ BOUNDS = [(0.0, np.inf), (-2.0, 3.0), (-np.inf, 1.0), (-np.inf, np.inf), (1.0, 1
 
 
 def at_kinks(seed, n=60):
-    """A diagonally dominant matrix of integers, every kind of row, x at a bound with y = 0 in a third of them: kinks without rounding."""
+    """Return a dominant matrix of integers with kinks without rounding.
+
+    Every kind of row; x is at a bound with y = 0 in a third of the rows.
+    """
     rng = np.random.default_rng(seed)
     A = rng.integers(-2, 3, (n, n)).astype(float)
     np.fill_diagonal(A, 2.0 ** rng.integers(7, 9, n))
@@ -39,7 +45,7 @@ def at_kinks(seed, n=60):
 
 
 def device_map(A, b, lower, upper, x, form, share, kink, device):
-    """The map on the device where the residual was evaluated at x, and x there."""
+    """Return the map on the device, evaluated with the residual at x, and x there."""
     problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper)
     residual, field = NaturalResidual(problem), wp.array(x, dtype=wp.float64, device=device)
     made = NonsmoothMap(problem, residual, MapForm(form), share, kink)
@@ -50,7 +56,11 @@ def device_map(A, b, lower, upper, x, form, share, kink, device):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("kink", [Kink.PERTURBATION, Kink.ZERO, Kink.APPROXIMATION])
 def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
-    """(A + D) e = -f / q with D = d p / q, and which unknowns move: those at a kink do not by `zero` and by `approximation`."""
+    """Systems on the device against the definition.
+
+    (A + D) e = -f / q with D = d p / q, and which unknowns move: those at a kink do not by `zero`
+    and by `approximation`.
+    """
     A, b, lower, upper, x = at_kinks(4001)
     made, field, problem = device_map(A, b, lower, upper, x, form, 0.7, kink, device)
     f, p, q, kinks = PlainMap(form, A, b, lower, upper, share=0.7).rows(x)
@@ -75,7 +85,11 @@ def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_gradients_are_those_of_the_definition(form, device):
-    """J'f over d^2, with the element (0, 1) at kinks, where f = 0 but not in other rows of the column."""
+    """Gradients against the definition.
+
+    They are J'f over d^2, with the element (0, 1) at kinks, where f = 0 but not in other rows of
+    the column.
+    """
     A, b, lower, upper, x = at_kinks(4003)
     made, field, _ = device_map(A, b, lower, upper, x, form, 0.7, Kink.PERTURBATION, device)
     plain = PlainMap(form, A, b, lower, upper, share=0.7)
@@ -103,9 +117,11 @@ def test_the_map_on_the_host_is_that_of_the_definition(form, kink):
 
 
 def towards_kinks(seed, n=400):
-    """Rows with (a, y) or (c, -y) at angles all around and distances of 1e-18 to 1 from a kink, the kink itself among them.
+    """Return rows at angles all around a kink, at distances of 0 to 1.
 
-    Returns the diagonal of A, b, bounds and x; 2^k units, so that a = d (x - l) is exact for l = 0.
+    The arguments (a, y) or (c, -y) have distances of 1e-18 to 1 from a kink; the kink itself is
+    included. Returns the diagonal of A, b, bounds and x, in units 2^k, so that a = d (x - l) is
+    exact for l = 0.
     """
     rng = np.random.default_rng(seed)
     d, angle = (
@@ -124,7 +140,11 @@ def towards_kinks(seed, n=400):
 @pytest.mark.parametrize("share", [1.0, 0.7])
 @pytest.mark.parametrize("seed", [4021, 4027])
 def test_host_and_device_agree_step_by_step_at_the_kink(share, seed, device):
-    """f, p f and q f of rows at and near their kinks, from one y: to rounding of p and q, which on the host is that of 1 - a / rho."""
+    """Host and device, step by step at the kink.
+
+    f, p f and q f of rows at and near their kinks, from one y: to the rounding of p and q, which on
+    the host is that of 1 - a / rho.
+    """
     d, b, lower, upper, x = towards_kinks(seed)
     form = "fischer" if share == 1 else "penalized"
     made, field, problem = device_map(
@@ -148,7 +168,11 @@ def test_host_and_device_agree_step_by_step_at_the_kink(share, seed, device):
 
 @pytest.mark.parametrize("smoothing", [0.0, 1e-12, 0.3])
 def test_the_smoothed_map_is_that_of_the_definition(smoothing):
-    """psi = x + y - sqrt(x^2 + y^2 + 2 mu) without cancellation, and its rounded derivatives, beside 60 digits."""
+    """Smoothed map against the definition, with 60 digits.
+
+    The map is psi = x + y - sqrt(x^2 + y^2 + 2 mu) without cancellation, with its rounded
+    derivatives.
+    """
     rng = np.random.default_rng(4049)
     x, y = (rng.choice([-1.0, 1.0], 300) * 10.0 ** rng.uniform(-4, 4, 300) for _ in range(2))
     data = DenseProblem(
@@ -161,7 +185,7 @@ def test_the_smoothed_map_is_that_of_the_definition(smoothing):
             *found[:3], *([Decimal(v) for v in side] for side in (x, y)), strict=True
         ):
             rho = (a * a + h * h + 2 * Decimal(smoothing)).sqrt()
-            # near a h = mu the map itself is 0: to rounding of its terms
+            # Near a h = mu the map itself is 0: to the rounding of its terms.
             assert f == pytest.approx(
                 float(a + h - rho), rel=1e-14, abs=1e-15 * float(min(abs(a), abs(h)))
             )
@@ -174,7 +198,10 @@ def test_the_smoothed_map_is_that_of_the_definition(smoothing):
 
 
 def test_random_elements_on_the_host_are_from_the_disc():
-    """(1 - p)^2 + (1 - q)^2 <= 1, up to the edge, and not the same for all."""
+    """Random elements on the host: from the disc, up to its edge.
+
+    (1 - p)^2 + (1 - q)^2 <= 1; they are not all equal.
+    """
     n = 2000
     data = DenseProblem(np.arange(n), np.eye(n), np.zeros(n), np.zeros(n), np.full(n, np.inf), 0.0)
     _, p, q, kinks = HostMap(data, 1.0, Kink.RANDOM, np.random.default_rng(1)).linearized(
@@ -187,7 +214,11 @@ def test_random_elements_on_the_host_are_from_the_disc():
 
 
 def test_random_elements_on_the_device_are_from_the_disc(device):
-    """D = d p / q: with p and q in [1 - sqrt(1/2), 1] its extremes are 0.293 and 3.414; others in the next step."""
+    """Random elements on the device: from the disc.
+
+    D = d p / q: with p and q in [1 - sqrt(1/2), 1] its extremes are 0.293 and 3.414; they differ in
+    the next step.
+    """
     n, share = 4000, 1 - np.sqrt(0.5)
     problem = wl.LCP(
         wl.LinearOperator(lambda x: x, (n,), symmetric=True, diagonal=1.0, device=device),
@@ -204,13 +235,17 @@ def test_random_elements_on_the_device_are_from_the_disc(device):
         assert free.numpy().all()
         assert share <= drawn[-1].min() < 1.1 * share
         assert 1 / (1.1 * share) < drawn[-1].max() <= 1 / share
-        assert np.mean(drawn[-1] < 1) == pytest.approx(0.5, abs=0.05)  # p and q are drawn alike
+        # p and q have equal distributions
+        assert np.mean(drawn[-1] < 1) == pytest.approx(0.5, abs=0.05)
         assert np.abs(r.numpy()).max() == 0  # f = 0 at a kink
     assert np.abs(np.corrcoef(*drawn)[0, 1]) < 0.1
 
 
 def grid_at_kinks(seed, bounds):
-    """Cells, b and x on a grid with AIR and SOLID: integers, so that y = 0 is exact, in half of the cells that are at a bound."""
+    """Return cells, b and x on a grid with AIR and SOLID.
+
+    Integers, so that y = 0 is exact in half of the cells that are at a bound.
+    """
     rng = np.random.default_rng(seed)
     cells = rng.choice(3, (5, 7, 6), p=[0.1, 0.8, 0.1])
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
@@ -227,7 +262,11 @@ def grid_at_kinks(seed, bounds):
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_systems_over_the_rows_of_a_grid_are_those_of_the_definition(bounds, kink, share):
-    """The one pass that moves x, evaluates y there and condenses: D on top of A's diagonal, in units of `scale`."""
+    """Systems over the rows of a grid against the definition.
+
+    The one pass that moves x, evaluates y there and condenses: D is added to A's diagonal, in units
+    of `scale`.
+    """
     cells, fluid, A, b, lower, upper, x = grid_at_kinks(4013, bounds)
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), _on(fluid, b, cells.shape), *bounds)
     work = FischerNewton(kink=kink, fischer_weight=share, precision="double").init(problem)
@@ -236,7 +275,7 @@ def test_systems_over_the_rows_of_a_grid_are_those_of_the_definition(bounds, kin
         layout.load(_on(fluid, v, cells.shape), wp.float64) for v in (x - 0.5, np.full(len(x), 2.0))
     )
     finest, scale = work.system.hierarchy.finest, 0.125
-    work.residual.start(work.x, keep=False)  # takes the size of b
+    work.residual.start(work.x, keep=False)  # reads the size of b
     work.map.begin()
     merit = work.map.step(field, move, 0.25, finest, scale, 1)
     plain = PlainMap("fischer" if share == 1 else "penalized", A, b, lower, upper, share=share)
@@ -255,7 +294,7 @@ def test_systems_over_the_rows_of_a_grid_are_those_of_the_definition(bounds, kin
 
 
 def _on(fluid, values, shape):
-    """A field with values on FLUID cells."""
+    """Return a field with values on FLUID cells."""
     field = np.zeros(fluid.size)
     field[fluid] = values
     return field.reshape(shape)

@@ -1,4 +1,7 @@
-"""(P A P + P D P) e = r on every family of operators, with masks and shifts, against dense matrices."""
+"""Principal systems (P A P + P D P) e = r on every family of operators.
+
+They have masks and shifts, and are compared with dense matrices.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +21,7 @@ def grid(cells, dtype=wp.float64, device="cpu", **faces):
 
 
 def families(device):
-    """Name, operator, dense matrix, unknowns."""
+    """Yield name, operator, dense matrix and unknowns."""
     rng = np.random.default_rng(3)
     cells = rng.choice(3, (9, 10), p=[0.1, 0.8, 0.1])
     cells[0, 0] = wl.AIR
@@ -83,7 +86,7 @@ def test_solves_the_masked_and_shifted_system(name, shifted, real, device):
     rng = np.random.default_rng(5)
     system = principal_system(problem, real, bounded=True, shifted=shifted)
     least = 1e-4 if real is wp.float32 else 1e-8
-    # the second and the third follow a coarsening that must be forgotten
+    # The second and the third follow a coarsening that must be discarded.
     for share in (1.0, 0.6, 0.3):
         free = unknown & (rng.random(n) < share)
         D = 10 ** rng.uniform(-4, 8, n) if shifted else np.zeros(n)
@@ -121,7 +124,10 @@ def test_a_grid_without_room_for_a_shift_says_so():
 
 
 def test_a_grids_iterations_stay_few_for_any_shift(device):
-    """On the central path D spans many magnitudes; the cycle must see it on every level."""
+    """Iterations on a grid: few for any shift.
+
+    On the central path D spans many magnitudes; the cycle must include it on every level.
+    """
     rng = np.random.default_rng(7)
     counts = []
     for n in (17, 33, 65):
@@ -152,7 +158,11 @@ def test_the_methods_suit_the_matrices():
 
 
 def test_incomplete_factors_leave_little_to_iterate():
-    """More unknowns than are factored completely; with the diagonal alone GMRES takes 29 iterations."""
+    """Incomplete factors: few iterations.
+
+    There are more unknowns than are factored completely; with the diagonal alone GMRES takes 29
+    iterations.
+    """
     rng, n, offsets = np.random.default_rng(3), 2100, [-30, -3, -1, 1, 3, 40]
     matrix = scipy.sparse.diags_array(
         [*rng.uniform(-1, 1, (6, n)), np.full(n, 2.4)], offsets=[*offsets, 0], shape=(n, n)
@@ -171,7 +181,10 @@ def test_incomplete_factors_leave_little_to_iterate():
 
 
 def test_singular_blocks_still_get_factors():
-    """Two equal rows: no factorization exists, and GMRES must still return the best there is."""
+    """Factors of singular blocks.
+
+    With two equal rows no factorization exists, and GMRES must still return the best iterate.
+    """
     matrix = scipy.sparse.csr_array(np.array([[1.0, 2.0, 0.0], [1.0, 2.0, 0.0], [0.5, 0.0, -1.0]]))
     problem = wl.LCP(wl.SparseOperator(matrix, device="cpu"), np.zeros(3))
     system = principal_system(problem, wp.float64, bounded=False)
@@ -199,7 +212,10 @@ def test_an_update_is_taken_and_lost_symmetry_is_told(device):
 
 
 def convection_diffusion(m, wind, upwind):
-    """A 5-point stencil with a wind along both axes: centered differences, or upwind ones of any strength."""
+    """Return a 5-point stencil with a wind along both axes.
+
+    The differences are centered, or upwind with a wind of any strength.
+    """
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
     C = scipy.sparse.diags_array(
         [-2.0, 2.0, 0.0] if upwind else [-1.0, 0.0, 1.0], offsets=[-1, 0, 1], shape=(m, m)
@@ -213,7 +229,11 @@ def convection_diffusion(m, wind, upwind):
     [(0.1, False, 8), (0.5, False, 22), (0.9, False, 34), (5.0, True, 45)],
 )
 def test_convection_does_not_break_the_multigrid(wind, upwind, most, device):
-    """Galerkin products of smoothed aggregates are unstable from a wind of 0.5 on: GMRES then stalls at 1e-1."""
+    """Convection with the multigrid.
+
+    Galerkin products of smoothed aggregates are unstable from a wind of 0.5 on: GMRES then stalls
+    at 1e-1.
+    """
     for m in (33, 129):
         matrix = convection_diffusion(m, wind, upwind)
         assert suits_multigrid(matrix)

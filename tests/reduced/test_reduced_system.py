@@ -1,4 +1,7 @@
-"""Reduced systems of Newton's method: which operator gets which, a step by the protocol against NumPy, the change of system."""
+"""Reduced systems of Newton's method.
+
+Choice by operator, a step by the protocol against NumPy, the change of system.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +24,7 @@ FORMS = {
 
 
 def matrix(rng, n=12, width=None):
-    """A symmetric positive definite matrix, of few diagonals if a width is given."""
+    """Return an SPD matrix, banded if a width is given."""
     B = rng.standard_normal((n, n))
     A = B @ B.T / n + np.eye(n)
     return (
@@ -33,7 +36,7 @@ def matrix(rng, n=12, width=None):
 
 
 def begun(problem, method, x0):
-    """A workspace at x0, whose solve has begun."""
+    """Return a workspace at x0 whose solve has begun."""
     work = method.init(problem)
     work.residual.start(work.x, keep=False)
     work.x.assign(x0)
@@ -56,7 +59,10 @@ def begun(problem, method, x0):
     ],
 )
 def test_a_step_by_the_protocol(form, direct, width, lengths):
-    """Held unknowns onto their bounds, y = 0 on the others, and parts of the step from there."""
+    """Step by the protocol.
+
+    Active unknowns move onto their bounds, y = 0 on the others, and parts of the step from there.
+    """
     rng = np.random.default_rng(7101)
     for _ in range(5):
         n = 12 if width is None else 40
@@ -84,7 +90,7 @@ def test_a_step_by_the_protocol(form, direct, width, lengths):
         assert system.classify() is None
         assert system.restrict()
         assert system.solve() >= 1
-        # whole steps are not shortened, nor projected
+        # Whole steps are not shortened or projected.
         for length in lengths[:1] if system.whole else lengths:
             norm = system.move(length)
             end = start + length * e
@@ -124,7 +130,11 @@ def test_which_operator_gets_which():
 
 
 def test_the_change_of_system_keeps_the_iterate():
-    """Whole steps go round in a circle of three: searched steps go on, and the next solve begins with whole ones again."""
+    """Change of system with the same iterate.
+
+    Whole steps cycle with period three: searched steps continue, and the next solve begins with
+    whole ones again.
+    """
     problem, method = (
         wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)),
         wl.MinimumMapNewton(direct=True),
@@ -148,7 +158,11 @@ def test_the_change_of_system_keeps_the_iterate():
 
 
 def test_a_grid_moves_its_iterate_as_it_solves():
-    """The linear solve ends at the accuracy asked for; a part of its last iteration's step can be taken back."""
+    """Iterate of a grid, moved during its linear solve.
+
+    The linear solve ends at the requested accuracy; a part of its last iteration's step can be
+    reverted.
+    """
     rng = np.random.default_rng(7103)
     cells = np.ones((9, 11), dtype=int)
     A, b = wl.GridPoisson(cells, shift=0.5, device="cpu"), rng.standard_normal(cells.shape)

@@ -1,4 +1,4 @@
-"""The table [camera] of a scene and the camera that it makes."""
+"""Table [camera] of a scene and its camera."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,10 @@ def test_wrong_cameras(scene, text, size, message):
 
 
 def project(view, points, size):
-    """Where points [m] appear to a pinhole: x to the right, y down from the upper left corner [pixels], and the depth [m]."""
+    """Return the images of points [m] in a pinhole camera, and their depths [m].
+
+    x points to the right and y down from the upper left corner [pixels].
+    """
     width, height = size
     x, y, depth = ((points - view.position) @ view.axes.T).T
     focal = 0.5 * height / np.tan(np.radians(view.angle / 2))
@@ -111,7 +114,7 @@ def test_the_camera_of_a_scene(scene):
     )
     np.testing.assert_allclose(view.position, [1.0, 3.0, 6.0])
     np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)
-    # to the right of who looks along -z
+    # To the right for a view along -z.
     np.testing.assert_allclose(view.axes[0], [1.0, 0.0, 0.0], atol=1e-12)
     assert view.axes[1, 1] > 0.5
     np.testing.assert_allclose(

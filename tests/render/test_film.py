@@ -1,4 +1,4 @@
-"""Films, read back by other programs than those that wrote them where there are some."""
+"""Films, read back by other programs where available."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from warp_lcp.render.recording import RenderError
 Image = pytest.importorskip(
     "PIL.Image", reason="films need Pillow, which comes with the extra `render`"
 )
-WIDTH, HEIGHT = 320, 241  # an odd height, which H.264 does not have
+WIDTH, HEIGHT = 320, 241  # an odd height, which H.264 cannot have
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def encoder():
 
 
 def picture(number: int) -> "Image.Image":
-    """Return a white image with a square of a color and a place of its own."""
+    """Return a white image with a square of its own color and place."""
     pixels = np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8)
     pixels[100:140, 20 * number : 20 * number + 40] = (200, 40 + 10 * number, 30)
     return Image.fromarray(pixels)
@@ -55,7 +55,7 @@ def test_a_gif_holds_the_images_their_times_and_repeats(encoder, tmp_path):
             np.testing.assert_allclose(
                 np.asarray(film.convert("RGB"), dtype=int), np.asarray(picture(number)), atol=8
             )
-    # milliseconds: 12 images at 30 a second, though a GIF knows whole hundredths of a second
+    # Milliseconds: 12 images at 30 per second, though a GIF resolves only hundredths of a second.
     assert sum(durations) == 400
     assert set(durations) == {30, 40}
 
@@ -110,7 +110,10 @@ def test_an_mp4_holds_the_images(encoder, tmp_path):
 @pytest.mark.usefixtures("only_new_objects")
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_images_are_drawn_one_at_a_time(encoder, tmp_path, suffix):
-    """No image is asked for before the one before was taken, and none stays in memory."""
+    """Images of a film, drawn one at a time.
+
+    An image is requested after the one before was used, and none stays in memory.
+    """
     import gc
     import weakref
 
@@ -184,7 +187,7 @@ def test_the_command_films_a_run(encoder, dots, tmp_path, suffix):
     assert result.exit_code == 0, result.stderr
     assert f"{film}: 5 frames" in result.stdout
     if suffix == "mp4":
-        # the scene's frames a second
+        # The scene's frames per second.
         assert encoder.count_frames_and_secs(str(film)) == (5, pytest.approx(5 / 20, abs=0.02))
         return
     with Image.open(film) as read:

@@ -1,4 +1,4 @@
-"""The page of a run, asked as a browser asks for it."""
+"""Live page of a run, with requests like those of a browser."""
 
 import errno
 import json
@@ -217,7 +217,7 @@ def test_other_names_of_this_machine_are_refused(dots, tmp_path, host):
         with socket.create_connection((LOOPBACK, server.server_port), timeout=30) as connection:
             connection.sendall(f"GET / HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
             assert b" 403 " in connection.recv(4096)
-        assert ask(server, "/", "localhost:9000")[0] == 200  # a port that is forwarded here
+        assert ask(server, "/", "localhost:9000")[0] == 200  # a forwarded port
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,10 @@ def test_a_log_that_leads_elsewhere_is_not_shown(dots, tmp_path):
 
 
 def test_idle_connections_take_few_threads_and_descriptors(dots, tmp_path):
-    """And the page is there all the same, for whoever asks."""
+    """Few threads and descriptors for idle connections.
+
+    The page is still served.
+    """
     with serving(write_run(tmp_path / "run", [])) as server, ExitStack() as stack:
         before = threading.active_count()
         idle = []

@@ -1,4 +1,7 @@
-"""Path-traced pictures of a run: their description, camera, settings and files. What needs Mitsuba is skipped where it is missing."""
+"""Path-traced pictures of a run: description, camera, settings and files.
+
+Tests that need Mitsuba are skipped where it is missing.
+"""
 
 import sys
 from types import SimpleNamespace
@@ -62,7 +65,7 @@ def grains(count: int = 300) -> Points:
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """Replace the renderer by one that gives even grey; list the frames that it renders."""
+    """Replace the renderer by one that gives uniform gray; list its frames."""
     pytest.importorskip("PIL.Image", reason="pictures need Pillow")
     numbers = []
 
@@ -119,7 +122,7 @@ def test_pictures_hold_what_was_rendered(dots, tmp_path, rendered):
     (file,) = photograph_run(folder, settings=SETTINGS, estimated=seconds.append)
     pixels = np.asarray(image.open(file))
     assert pixels.shape == (36, 64, 3) and np.ptp(pixels) <= 1
-    # middle grey, with the look's contrast
+    # Middle gray, with the contrast of the look.
     assert pixels[0, 0, 0] == pytest.approx(255 * 0.5**photo.CONTRAST, abs=1)
     assert seconds == [expected_seconds(SETTINGS, "scalar_rgb", liquid=True)]
 
@@ -226,7 +229,7 @@ def test_water_bodies_and_solids_are_described(dots, tmp_path):
         found["liquid"].finish is Finish.LIQUID
         and found["liquid"].color[0] > found["liquid"].color[2] > 0.0
     )
-    # cut at the domain
+    # Cut at the domain.
     assert (
         found["solid_0"].points[:, 0].max() < 1.01 and found["solid_0"].points[:, 2].min() > -0.01
     )
@@ -255,7 +258,7 @@ def test_particles_become_grains(dots, tmp_path):
 
 
 def test_particles_alone_get_a_surface():
-    # 12 x 12 x 12, a cube in a corner
+    # 12 x 12 x 12, a cube in a corner.
     places = np.stack(np.meshgrid(*[np.arange(0.025, 0.6, 0.05)] * 3), axis=-1).reshape(-1, 3)
     velocity = np.tile([1.0, 2.0, 3.0], (len(places), 1))
     scene = SimpleNamespace(
@@ -320,11 +323,11 @@ def test_water_and_a_body_are_rendered(dots, tmp_path):
     assert image.shape == (36, 64, 3) and np.isfinite(image).all() and image.min() >= 0.0
     red, blue = image[..., 0], image[..., 2]
     wet, body = blue > 1.15 * red, red > 2.0 * blue
-    # the middle of the picture is water, the ball orange
+    # The middle of the picture is water, the ball orange.
     assert 0.15 < wet.mean() < 0.7 and 0.01 < body.mean() < 0.2
     assert wet[20:28, 24:40].mean() > 0.8
     corner = image[:6, :6].mean(axis=(0, 1))
-    assert np.ptp(corner) < 0.15 * corner.mean()  # the ground is grey
+    assert np.ptp(corner) < 0.15 * corner.mean()  # the ground is gray
     np.testing.assert_array_equal(image, shot(folder))
     assert np.abs(image - shot(folder, seed=2)).max() > 0.0
 

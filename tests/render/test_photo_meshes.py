@@ -1,4 +1,7 @@
-"""Meshes of path-traced pictures: normals, liquid against walls and solids, grains, convex solids; and the view transform."""
+"""Meshes of path-traced pictures, and the view transform.
+
+The tests cover normals, liquid against walls and solids, grains, and convex solids.
+"""
 
 import numpy as np
 import pytest
@@ -30,7 +33,10 @@ def volume(points, corners):
 
 
 def lattice(count):
-    """A closed cube of triangles, `count` squares along an edge, corners counterclockwise seen from outside."""
+    """Return a closed cube of triangles, `count` squares along an edge.
+
+    Corners are counterclockwise seen from outside.
+    """
     points, corners, start = [], [], 0
     u, v = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, count + 1), indexing="ij")
     node = np.arange((count + 1) ** 2).reshape(count + 1, count + 1)
@@ -52,7 +58,10 @@ def lattice(count):
 
 
 def test_agx_follows_its_published_polynomial():
-    """Wrensch's fit of Sobotka's curve, whose error is below one percent."""
+    """AgX transform against its published polynomial.
+
+    Wrensch's fit of Sobotka's curve, whose error is below one percent.
+    """
     x = np.linspace(0.0, 1.0, 501)
     published = np.polyval([15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232], x)
     assert np.abs(sigmoid(x) - published).max() < 0.01
@@ -60,13 +69,13 @@ def test_agx_follows_its_published_polynomial():
 
 
 def test_agx_of_greys():
-    # rows of the inset matrix sum to 1 within 1e-3
+    # Rows of the inset matrix sum to 1 within 1e-3.
     np.testing.assert_allclose(agx(np.full(3, MIDDLE_GREY)), 0.5, atol=1e-3)
     greys = agx(np.logspace(-5, 3, 400)[:, None] * np.ones(3))
     assert (np.diff(greys, axis=0) >= 0.0).all()
     assert np.ptp(greys, axis=1).max() < 5e-3
     assert greys[0].max() < 0.01 and greys[-1].min() > 0.99
-    # and no NaN
+    # Without NaN.
     assert (
         agx(np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), contrast=1.6, saturation=1.3).max()
         < 1e-6
@@ -102,7 +111,7 @@ def test_creases_stay_sharp_and_round_sides_smooth():
 def test_a_liquid_is_flat_at_walls_and_reaches_below_the_floor():
     points, corners = lattice(4)
     surface = Surface("surface", points, corners, {"velocity": np.ones_like(points)})
-    # the side z = 1 is free
+    # The side z = 1 is free.
     at, own, normals, velocity = closed_liquid(surface, (1.0, 1.0, 2.0), 0.25, None)
     floor = -OVERLAP * 0.25
     assert volume(at, own) == pytest.approx(1.0 - floor)
@@ -115,7 +124,7 @@ def test_a_liquid_is_flat_at_walls_and_reaches_below_the_floor():
         np.testing.assert_array_equal(velocity[wall, axis], 0.0)
     facets = face_normals(at, own)
     facets /= np.linalg.norm(facets, axis=1, keepdims=True)
-    # no normal is bent at an edge
+    # No normal is bent at an edge.
     np.testing.assert_allclose(np.einsum("ijk,ik->ij", normals[own], facets), 1.0, atol=1e-9)
     assert velocity[free & (at[:, 0] > 0.1) & (at[:, 0] < 0.9)][:, 0].all()
 
@@ -135,7 +144,7 @@ def test_a_liquid_is_pressed_against_what_it_touches(seed):
     points, corners = lattice(12)
     before = np.array(points)
     gap = center[2] - radius - 1.0  # between the side z = 1 and the nearest point of the ball
-    # the side comes so near, or into the ball
+    # The side comes within half a spacing of the ball, or into it.
     points[:, 2] *= 1.0 + gap - rng.uniform(0.0, 0.5) * spacing
     surface = Surface("surface", points, corners)
     at, _, _, _ = closed_liquid(surface, (2.0, 2.0, 2.0), spacing, distance)
@@ -149,11 +158,11 @@ def test_a_liquid_is_pressed_against_what_it_touches(seed):
         ((points - center) / np.linalg.norm(points - center, axis=1, keepdims=True))[:, 2] < -0.4
     )
     assert facing.any()
-    for p in points[facing]:  # each of them has moved along the ball's normal to the overlap
+    for p in points[facing]:  # each has moved along the ball's normal to the overlap
         goal = center + (p - center) / np.linalg.norm(p - center) * (radius - OVERLAP * spacing)
         assert np.linalg.norm(at - goal, axis=1).min() < 0.02 * spacing
     far = d_before > TOUCHING * spacing
-    # the floor's moves
+    # The points of the floor move.
     assert all(np.linalg.norm(at - p, axis=1).min() < OVERLAP * spacing + 1e-9 for p in points[far])
     assert d.min() > -(OVERLAP + 0.6) * spacing
 

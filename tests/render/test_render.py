@@ -1,4 +1,4 @@
-"""Images of a run. What needs pyvista is skipped where it is missing."""
+"""Images of a run; tests that need pyvista are skipped where it is missing."""
 
 import re
 import sys
@@ -35,7 +35,10 @@ def pyvista():
 
 @pytest.fixture
 def make_run(dots, tmp_path):
-    """Write the folder of a run by hand: a list of frames, each the points [m] and velocities [m/s] of its particles."""
+    """Write the folder of a run by hand.
+
+    It has a list of frames, each with the points [m] and velocities [m/s] of its particles.
+    """
 
     def make(
         frames, text: str = "", size=(1.0, 1.0), grid: bool = True, solids: str = "voxel"
@@ -70,7 +73,10 @@ def make_run(dots, tmp_path):
 
 
 def drops(count: int, dimension: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Scatter particles away from the walls, one at most in a cell; their speeds are 1 m/s."""
+    """Return random particles away from the walls, at most one per cell.
+
+    Their speeds are 1 m/s.
+    """
     cells = np.stack(np.meshgrid(*[np.arange(1, 9)] * dimension), axis=-1).reshape(-1, dimension)
     points = np.pad((RNG.permutation(cells)[:count] + 0.5) / 10, ((0, 0), (0, 3 - dimension)))
     return points, np.tile([0.6, 0.8, 0.0], (count, 1))
@@ -197,7 +203,10 @@ def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
 def test_sand_is_drawn_as_grains_and_liquid_as_its_surface_unless_told(
     simulator, key, expected, tmp_path
 ):
-    """A heap's surface is lace where it is a grain thin, and a pillar of clay where it is thick."""
+    """Default looks: sand as grains, liquid as its surface.
+
+    A heap's surface has holes where it is a grain thin, and bulges where it is thick.
+    """
     material = {key: [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.5]}]}
     tables = {
         "scene": {"simulator": simulator},
@@ -269,9 +278,9 @@ def test_discs_have_the_size_of_the_particles(pyvista, make_run):
     page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
     page.painter.close()
-    pixel = MARGIN / page.tile[1]  # [m]; the height is what limits a square domain here
+    pixel = MARGIN / page.tile[1]  # [m] per pixel; the height limits the size of a square domain
     assert page.painter.radius == pytest.approx(0.6 * 0.1)
-    # neighbors overlap
+    # Neighbors overlap.
     assert is_blue(image).sum() * pixel**2 == pytest.approx(
         30 * np.pi * page.painter.radius**2, rel=0.25
     )
@@ -290,7 +299,11 @@ def test_discs_lie_where_the_particles_are(pyvista, make_run):
 
 
 def test_flat_walls_hide_what_of_discs_reaches_across_them(pyvista, make_run):
-    """Beside the domain's sides and a round wall each disc ends where the wall is; a saw-tooth of discs would be a radius wide."""
+    """Discs cut by flat walls.
+
+    Beside the domain's sides and a round wall each disc ends at the wall; otherwise a saw-tooth of
+    discs would be a radius wide.
+    """
     along = np.linspace(0.0, 1.0, 16)
     angle = 2.0 * np.pi * along
     sides = [np.stack([np.full(16, end), along], axis=-1) for end in (0.001, 0.999)]
@@ -313,7 +326,10 @@ def test_flat_walls_hide_what_of_discs_reaches_across_them(pyvista, make_run):
 
 @pytest.mark.parametrize("size", ["400x300", "300x400"])
 def test_balls_do_not_reach_beyond_the_outline_of_a_room(pyvista, make_run, size):
-    """The picture with balls beside all walls has the outline of the empty room's."""
+    """Balls within the outline of a room.
+
+    With balls beside all walls the outline is that of the empty room.
+    """
     ends = np.array([0.001, 0.999])
     grid = np.stack(np.meshgrid(*[np.linspace(0.05, 0.95, 10)] * 2), axis=-1).reshape(-1, 2)
     walls = [np.insert(grid, axis, end, axis=1) for axis in range(3) for end in ends]
@@ -342,7 +358,7 @@ def test_flat_solids_are_filled_gray(pyvista, make_run):
     page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
     page.painter.close()
-    # lighter than the outlines
+    # Lighter than the outlines.
     gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)
     assert gray.sum() * (MARGIN / page.tile[1]) ** 2 == pytest.approx(
         1.0 - np.pi * 0.4**2, rel=0.03
@@ -372,7 +388,7 @@ def test_pressure_and_plain_colors(pyvista, make_run):
     assert recording.scale.label == "pressure [Pa]"
     assert Recording(folder, Color.PLAIN).scale.label == ""
     pressure, plain = draw(folder, color=Color.PRESSURE)[0], draw(folder, color=Color.PLAIN)[0]
-    assert (pressure[:20] < 200).sum() > (plain[:20] < 200).sum()  # its legend
+    assert (pressure[:20] < 200).sum() > (plain[:20] < 200).sum()  # legend of the pressure
     assert is_blue(plain[25:]).sum() > is_blue(pressure[25:]).sum()
 
 
@@ -401,7 +417,7 @@ def test_the_camera_shows_the_whole_room(pyvista, make_run, size):
     )[0][20:]  # without the line with the time
     drawn = np.argwhere((image < 200).any(axis=-1))
     margin = np.array([drawn.min(axis=0), image.shape[:2] - drawn.max(axis=0)]) / image.shape[:2]
-    assert margin.min() > 0.02  # nothing is cut off,
+    assert margin.min() > 0.02  # nothing is cut,
     assert margin.sum(axis=0).min() < 1.02 - 1.0 / MARGIN  # one direction is filled,
     assert np.abs(margin[0] - margin[1]).max() < 0.02  # and the other is centered
 
@@ -444,13 +460,13 @@ def test_surfaces_lie_where_the_solver_has_them(pyvista, make_run, name, invert,
     )
     assert np.abs(distance.numpy()[inside]).max(initial=0.0) < 2e-3
     if not invert:
-        # what closes the surface at the walls is inside the solid
+        # The closing of the surface at the walls is inside the solid.
         assert distance.numpy().max() < 2e-3
         assert (points > -1e-6).all()
         assert (points < 1 + 1e-6).all()
     assert mesh.n_open_edges == 0
     corners = points[mesh.triangulate().regular_faces]
-    # positive: every triangle faces outward
+    # Positive: every triangle faces outward.
     assert np.linalg.det(corners).sum() / 6 == pytest.approx(mesh.volume, rel=1e-3)
 
 
@@ -465,14 +481,18 @@ def test_solids_in_a_room_are_gray(pyvista, make_run):
 
 
 def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_run):
-    """A disc of radius 0.1 m moves by 4 m/s until 0.1 s: frames at 0, 0.05 and 0.2 s find it at x = 0.2, 0.4 and 0.6 m."""
+    """Position of a flat solid at the time of a frame.
+
+    A disc of radius 0.1 m moves at 4 m/s until 0.1 s: in frames at 0, 0.05 and 0.2 s it is at x =
+    0.2, 0.4 and 0.6 m.
+    """
     motion = '{ kind = "translation", velocity = [4.0, -1.0], stop = 0.1 }'
     wall = '[[solid]]\nshape = "box"\nmin = [0.9, 0.0]\nmax = [1.0, 1.0]\n'
     disc = f'[[solid]]\nshape = "sphere"\ncenter = [0.2, 0.6]\nradius = 0.1\nmotion = {motion}\n'
     folder = make_run([([0.05, 0.05, 0.0], [1.0, 0.0, 0.0])] * 5, disc + wall, solids="cut-cell")
     page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     pixel = MARGIN / page.tile[1]  # [m]
-    # [m] from the image's left and lower edge to the domain's corner
+    # [m] From the image's left and lower edge to the domain's corner.
     low = 0.5 * (np.array(page.tile) * pixel - 1.0)
     for frame, expected in ((0, [0.2, 0.6]), (1, [0.4, 0.55]), (4, [0.6, 0.5]), (0, [0.2, 0.6])):
         image = np.asarray(page.draw([frame]), dtype=int)[page.line :]
@@ -481,9 +501,9 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
         x, y = (columns + 0.5) * pixel - low[0], (page.tile[1] - rows - 0.5) * pixel - low[1]
         ours = (x > 0.05) & (x < 0.85) & (y > 0.05) & (y < 0.95)
         np.testing.assert_allclose([x[ours].mean(), y[ours].mean()], expected, atol=pixel)
-        # and nothing is left where it was
+        # Nothing remains at its former position.
         assert ours.sum() * pixel**2 == pytest.approx(np.pi * 0.1**2, rel=0.1)
-        assert (x[~ours] > 0.9).mean() > 0.8  # the wall stands
+        assert (x[~ours] > 0.9).mean() > 0.8  # the wall is fixed
     page.painter.close()
 
 
@@ -498,7 +518,7 @@ def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
     np.testing.assert_array_equal(images[0], images[3])
     gray = [((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).sum() for image in images]
     assert gray[1] > 1.5 * gray[2]
-    # by 0.15 s the ball has left through the ceiling; the room's edges stay
+    # By 0.15 s the ball has left through the ceiling; the room's edges stay.
     assert gray[0] > 1.5 * gray[2]
 
 
@@ -515,7 +535,7 @@ def test_liquid_is_lit_from_above_and_drops_are_not():
         np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, "water"
     )
     light = colors.mean(axis=1)
-    depth = (0.5 - np.abs(block - 0.5)).min(axis=1)  # only what lies deep inside need not be drawn
+    depth = (0.5 - np.abs(block - 0.5)).min(axis=1)  # only points deep inside may be left out
     assert outer[-1]
     assert outer[:-1][depth < 0.1].all()
     assert not outer[:-1][depth > 0.3].any()
@@ -544,7 +564,7 @@ def test_scales_end_at_round_numbers():
         [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]],
         atol=1,
     )
-    # viridis
+    # Colors of viridis.
     np.testing.assert_array_equal(
         Scale("", 0.0, 1.0).colors(np.array([0.0, 1.0])), [[68, 1, 84], [253, 231, 36]]
     )

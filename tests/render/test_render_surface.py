@@ -1,4 +1,4 @@
-"""Images of surfaces and rigid bodies. What needs pyvista is skipped where it is missing."""
+"""Images of surfaces and bodies; tests without pyvista are skipped."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,10 @@ def is_orange(image):
 
 
 def middle(mask, folder, page_line=20):
-    """Return the mean place of a 2-D image's pixels [m], for a domain of 1 m whose height limits the image."""
+    """Return the mean position of a 2-D image's pixels [m].
+
+    The domain has sides of 1 m; its height limits the image.
+    """
     rows, columns = np.nonzero(mask)
     pixel = MARGIN / mask.shape[0]
     return (columns.mean() + 0.5 - SIZE[0] / 2) * pixel + 0.5, (
@@ -78,7 +81,7 @@ def test_the_surface_is_shown_where_there_is_one(dots, tmp_path):
     both = write_run(tmp_path / "both", [[PARTICLE, ball([0.5, 0.5], 0.2)]])
     alone = write_run(tmp_path / "alone", [[PARTICLE]])
     assert Recording(both).show is Show.SURFACE
-    assert Recording(both, Color.SPEED).show is Show.PARTICLES  # a color is of particles
+    assert Recording(both, Color.SPEED).show is Show.PARTICLES  # colors are those of particles
     assert Recording(alone).show is Show.PARTICLES
     assert len(Recording(both).frame(0).points) == 0
     assert Recording(both, show=Show.BOTH).frame(0).surface is not None
@@ -93,7 +96,7 @@ def test_the_surface_is_shown_where_there_is_one(dots, tmp_path):
 def test_surfaces_come_back_as_they_were_written(dots, tmp_path):
     surface = ball([0.5, 0.4, 0.3], 0.2)
     surface.points[7] = np.nan
-    # one that raises "invalid" when it is converted
+    # A NaN that raises "invalid" when it is converted.
     surface.points[7:8].view(np.uint32)[0, 0] = 0x7FA00000
     read = Recording(write_run(tmp_path / "run", [[surface]], size=ROOM)).frame(0).surface
     whole = ~(surface.corners == 7).any(axis=1)
@@ -156,7 +159,7 @@ def test_bodies_have_colors_of_their_own_in_every_frame(pyvista, dots, tmp_path)
     np.testing.assert_array_equal(first, again)
     colored = np.ptp(first, axis=-1) > 40
     left, right = first[:, :200][colored[:, :200]], first[:, 200:][colored[:, 200:]]
-    assert len(left) == pytest.approx(len(right), rel=0.2)  # a particle is on the left
+    assert len(left) == pytest.approx(len(right), rel=0.2)  # one particle is on the left
     assert np.abs(left.mean(axis=0) - right.mean(axis=0)).max() > 20
 
 
@@ -203,13 +206,17 @@ def test_solids_with_mass_do_not_stand_where_they_began(pyvista, dots, tmp_path)
         assert len(prescribed_solids(Recording(folder).scene)) == count
         (image,) = draw(folder)
         gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)
-        # the domain's edges are gray too
+        # The domain's edges are gray too.
         assert (gray[:, : SIZE[0] // 2].sum() > 2000) == (count == 2)
         assert gray[:, SIZE[0] // 2 :].sum() > 300
 
 
 def test_water_in_a_room_shows_what_is_in_it(pyvista, dots, tmp_path):
-    """The ball of water is blue, the body in it is seen through it, and particles too where both are asked for."""
+    """Transparent water in a room.
+
+    The ball of water is blue, the body in it is visible, and so are particles if both are
+    requested.
+    """
     swimmer = ball([0.5, 0.5, 0.5], 0.2, "bodies", body=1)
     text = "[camera]\nposition = [0.5, 0.5, 5.0]\n"
     water = write_run(tmp_path / "water", [[PARTICLE, ball([0.5, 0.5, 0.5], 0.3)]], text, ROOM)
@@ -220,7 +227,7 @@ def test_water_in_a_room_shows_what_is_in_it(pyvista, dots, tmp_path):
     assert is_blue(plain).sum() > 2000
     assert (plain != swum).any(axis=-1).sum() > 200
     assert is_blue(plain)[plain.shape[0] // 2, SIZE[0] // 2]
-    # orange, dimmed
+    # Orange, dimmed.
     assert (
         swum[swum.shape[0] // 2, SIZE[0] // 2, 0] > plain[plain.shape[0] // 2, SIZE[0] // 2, 0] + 30
     )
@@ -294,7 +301,11 @@ def test_a_camera_from_the_command_line(pyvista, dots, tmp_path):
 
 
 def test_each_side_of_the_domain_has_its_own_part_of_a_surface():
-    """Shared normals would smear light over the edges between walls, and between a wall and the free surface."""
+    """Separate parts of a surface on each side of the domain.
+
+    Shared normals would smear light over the edges between walls, and between a wall and the free
+    surface.
+    """
     pytest.importorskip("pyvista")
     pool = box([0.0, 0.0, 0.0], [1.0, 0.4, 1.0])
     pool = Surface("surface", *welded(pool.points, pool.corners), {})
@@ -314,6 +325,6 @@ def test_each_side_of_the_domain_has_its_own_part_of_a_surface():
 
 
 def welded(points, corners):
-    """Return a mesh whose triangles share the points that lie at one place."""
+    """Return a mesh whose triangles share points at the same place."""
     own, number = np.unique(points, axis=0, return_inverse=True)
     return own, number.ravel()[corners].astype(np.int32)

@@ -28,7 +28,10 @@ def call(*arguments: object) -> Result:
 
 
 def material(dimension: int, column: int = 2):
-    """Return cells of a layer at x = 0.2 to 0.3 m whose pressure is 100 Pa times their row, each with a particle in its middle."""
+    """Return cells of a layer at x = 0.2 to 0.3 m, each with a particle.
+
+    Their pressure is 100 Pa times their row.
+    """
     axes = [[column], range(10), range(10) if dimension == 3 else [0]]
     index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     points = ((index + 0.5) * [0.1, 0.1, 0.1 if dimension == 3 else 0.0]).astype(np.float32)
@@ -58,7 +61,7 @@ def test_a_section_of_a_sphere_is_a_circle():
         assert len(ends) > 20
         np.testing.assert_allclose(np.linalg.norm(ends, axis=-1), np.sqrt(1.0 - z**2), atol=5e-3)
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
-        # each part of the circle once
+        # Each part of the circle once.
         assert length == pytest.approx(2.0 * np.pi * np.sqrt(1.0 - z**2), rel=5e-3)
         area = 0.5 * (ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]).sum()
         assert abs(area) == pytest.approx(np.pi * (1.0 - z**2), rel=1e-2)  # all in one direction
@@ -99,8 +102,8 @@ def test_solids_are_cut(dots, tmp_path, at, radius):
         at=at,
     )
     gray = (np.ptp(image, axis=-1) < 12) & (np.abs(image.mean(axis=-1) - 199) < 8)
-    frame = np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel()  # the axes' lines
-    side = np.ptp(frame)  # pixels of a meter
+    frame = np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel()  # lines of the axes
+    side = np.ptp(frame)  # pixels per meter
     assert gray.sum() / side**2 == pytest.approx(np.pi * radius**2, abs=0.012)
 
 
@@ -132,9 +135,9 @@ def test_bodies_are_filled_but_for_their_holes(dots, tmp_path, dimension):
         at=0.53 if dimension == 3 else None,
     )
     orange = (np.abs(image - [224, 122, 63]) < 12).all(axis=-1)
-    # pixels of a meter
+    # Pixels per meter.
     side = np.ptp(np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel())
-    # but for the lines along its edges
+    # Without the lines along its edges.
     assert orange.sum() / side**2 == pytest.approx(np.pi * (0.3**2 - 0.2**2), rel=0.1)
 
 
@@ -143,7 +146,7 @@ def test_a_surface_alone_is_drawn_over_plain_cells(dots, tmp_path):
     surface = ball([0.5, 0.5, 0.5], 0.3)
     folder = write_run(tmp_path / "run", [[cells, surface]], size=(1.0, 1.0, 1.0))
     (image,), (asked,) = draw(folder), draw(folder, show=Show.SURFACE)
-    assert (image[..., 2] - image[..., 0] > 80).sum() > 150  # the surface's outline
+    assert (image[..., 2] - image[..., 0] > 80).sum() > 150  # outline of the surface
     np.testing.assert_array_equal(image, asked)
     with pytest.raises(RenderError, match="holds no frames of particles"):
         draw(folder, color=Color.SPEED)

@@ -1,4 +1,4 @@
-"""Shadows, grains of sand, and a liquid's surface where it touches solids."""
+"""Shadows, grains of sand, and a liquid's surface at solids."""
 
 from pathlib import Path
 
@@ -24,12 +24,13 @@ def test_what_lies_behind_something_is_in_its_shadow():
     x, z = RNG.uniform(0.0, 1.0, (2, 4000))
     floor = np.stack([x, np.zeros(4000), z], axis=-1)
     light = sun.reaches(floor)
-    through = floor + 0.5 / LIGHT[1] * LIGHT  # where the ray to the lamp meets the plate's plane
+    # Intersection of the ray to the lamp with the plate's plane.
+    through = floor + 0.5 / LIGHT[1] * LIGHT
     depth = (0.2 - np.abs(through[:, [0, 2]] - 0.5)).min(axis=1)
     assert (light[depth > 4 * WIDTH] == 0.0).all()
     assert (light[depth < -4 * WIDTH] == 1.0).all()
     assert ((light > 0.0) & (light < 1.0)).any()  # its edge is soft
-    # before the plate, as the plate itself
+    # Before the plate, as the plate itself.
     np.testing.assert_array_equal(sun.reaches(plate + 0.1 * LIGHT), 1.0)
     np.testing.assert_array_equal(sun.reaches(plate), 1.0)
     assert (sun.reaches(plate - 2.0 * BEHIND * WIDTH * LIGHT) < 1.0).all()
@@ -56,7 +57,7 @@ def test_points_are_scattered_over_a_mesh_evenly():
     pyvista = pytest.importorskip("pyvista")
     points = scattered(pyvista.Box((0.0, 1.0, 0.0, 0.5, 0.0, 0.5)), 0.02)
     assert len(points) == pytest.approx(2 * 2.5 / 0.02**2, rel=0.01)
-    # on its sides
+    # On its sides.
     assert np.abs(np.abs(points - [0.5, 0.25, 0.25]) - [0.5, 0.25, 0.25]).min(axis=1).max() < 1e-6
     assert (points[:, 0] == 0.0).mean() == pytest.approx(0.1, rel=0.1)
     assert scattered(pyvista.PolyData(), 0.02).shape == (0, 3)
@@ -74,7 +75,7 @@ def test_grains_lie_about_their_particles_and_do_not_leave(size):
     assert (at[:, len(size) :] == 0.0).all()
     assert colors.mean() == pytest.approx(150.0, rel=0.02)
     assert colors.std() > 5.0
-    # a run's particles change places in their list: what is seen stays
+    # Particles of a run change places in their list; the image stays.
     order = RNG.permutation(500)
     again, _, _ = grains(points[order], np.full((500, 3), 150.0), 0.02, size)
     np.testing.assert_array_equal(again.reshape(500, -1, 3), at.reshape(500, -1, 3)[order])
@@ -87,7 +88,11 @@ def test_the_number_of_grains_is_bounded():
 
 
 def test_a_surface_is_left_out_where_it_touches_a_solid():
-    """A film of liquid lies on a box: its lower side goes, its upper one stays, and so does what is far from the box."""
+    """Surface left out where it touches a solid.
+
+    A film of liquid lies on a box: its lower side is left out, its upper one stays, and so does the
+    rest.
+    """
     solid = BoxTable(shape="box", min=[0.0, 0.0, 0.0], max=[1.0, 0.5, 1.0]).to_geometry(Path(), 3)
 
     def square(y, up):

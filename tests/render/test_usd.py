@@ -1,4 +1,4 @@
-"""Runs as USD files, read back by USD's own library; frames are read by meshio."""
+"""Runs as USD files, read back by USD's library; frames are read by meshio."""
 
 import sys
 from pathlib import Path
@@ -21,7 +21,7 @@ from warp_lcp.simulation import Points, Surface
 pytest.importorskip("pxr", reason="export needs usd-core, the extra `usd`")
 from pxr import Gf, Usd, UsdGeom
 
-LAST, RATE, STEP = 4, 30, 1 / 120  # frames, frames a second, longest time step [s]
+LAST, RATE, STEP = 4, 30, 1 / 120  # frames, frames per second, longest time step [s]
 RADIUS = 0.25
 ROOM = (1.0, 1.0, 1.0)
 
@@ -126,7 +126,7 @@ def test_particles_are_those_of_the_frames(falls, tmp_path, dimension):
 @pytest.mark.parametrize("name", ["particles", "surface"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_velocities_are_those_of_a_fall(falls, tmp_path, dimension, name):
-    """All points have the same, that of the middle of the last step."""
+    """Velocities of a fall: equal for all points, those of the last step's middle."""
     stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.BOTH)
     for number in range(LAST + 1):
         velocity = get(stage, name, "velocities", number)
@@ -138,7 +138,10 @@ def test_velocities_are_those_of_a_fall(falls, tmp_path, dimension, name):
 
 
 def test_velocities_lead_to_the_next_frame(falls, tmp_path):
-    """The shutter of a renderer that asks USD where points are between frames."""
+    """Velocities that lead to the next frame.
+
+    They are for the shutter of a renderer that interpolates points between frames.
+    """
     stage = exported(falls[3], tmp_path / "fall.usdc", show=Show.PARTICLES)
     particles = UsdGeom.PointBased(prim(stage, "particles"))
     for number in range(1, LAST):
@@ -148,7 +151,7 @@ def test_velocities_lead_to_the_next_frame(falls, tmp_path):
         halfway = np.mean(
             particles.ComputePointsAtTime(Usd.TimeCode(number + 0.5), Usd.TimeCode(number)), axis=0
         )
-        # of the velocity against the mean one until the next frame [s]
+        # Time of the velocity relative to the mean one until the next frame [s].
         late = 0.5 / RATE + 0.5 * STEP
         np.testing.assert_allclose(
             halfway, 0.5 * (before + after), atol=1.01 * GRAVITY * late * 0.5 / RATE
@@ -274,8 +277,8 @@ invert = true
 def test_solids_stand_and_move(dots, tmp_path):
     folder = write_run(tmp_path / "run", [[ball(ROOM, 0.2)]] * 21, SOLIDS, size=ROOM)
     stage = exported(folder, tmp_path / "run.usdc")
-    assert names(stage) == ["surface", "solid_1", "solid_2"]  # a plane has no end
-    # 90 degrees in a second
+    assert names(stage) == ["surface", "solid_1", "solid_2"]  # a plane is unbounded
+    # 90 degrees in a second.
     for code, low, high in (
         (0.0, [0.4, 0.1, 0.4], [0.6, 0.2, 0.6]),
         (20.0, [0.8, 0.4, 0.4], [0.9, 0.6, 0.6]),
@@ -321,12 +324,15 @@ def test_kinds_of_files(dots, tmp_path, name):
         20.0,
     )
     assert get(stage, "surface", "points", 2)[:, 0].max() == pytest.approx(0.5)
-    assert call(folder, "--out", file).exit_code == 0  # in place of the older one
+    assert call(folder, "--out", file).exit_code == 0  # replaces the older one
     assert [entry.name for entry in file.parent.iterdir()] == [name]
 
 
 def test_frames_are_on_the_disk_when_they_are_added(dots, tmp_path):
-    """So that one at a time is in memory; and an export that is given up leaves nothing."""
+    """Frames are written when they are added, so that one at a time is in memory.
+
+    An aborted export leaves no file.
+    """
     folder = write_run(
         tmp_path / "run",
         [[ball([0.5, 0.5, 0.5], 0.1 + 0.01 * number)] for number in range(5)],

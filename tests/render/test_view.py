@@ -1,4 +1,4 @@
-"""The window, on a plotter without a screen."""
+"""Viewer window, on a plotter without a screen."""
 
 import sys
 
@@ -62,9 +62,9 @@ def test_steps_stay_in_the_run_and_move_the_picture(viewer):
 
 def test_playing_keeps_to_the_clock(viewer):
     viewer.tick()
-    assert viewer.place == 0  # it waits
+    assert viewer.place == 0  # the viewer waits
     viewer.play()
-    # 20 frames a second
+    # 20 frames per second.
     for seconds, place in ((0.01, 0), (0.06, 1), (0.21, 4), (0.22, 4), (0.4, 8)):
         viewer.clock.now = seconds
         viewer.tick()

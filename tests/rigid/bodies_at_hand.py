@@ -14,7 +14,7 @@ SIDES = 0b111111
 def bodies_of(
     geometries, dimension, *, solids=(), open_sides=0, density=500.0, settings=None, **common
 ):
-    """Return bodies of shapes; `settings` has more for each."""
+    """Return bodies of shapes; `settings` holds further settings of each."""
     bodies = [
         RigidBody(
             mass_properties(shape, dimension, density=density),

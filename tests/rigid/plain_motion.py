@@ -1,8 +1,11 @@
-"""Motion of rigid bodies by NumPy: what the loop in `warp_lcp/rigid/headers/motion.h` does, array by array."""
+"""Motion of rigid bodies in NumPy, array by array.
+
+It is the same as the loop in `warp_lcp/rigid/headers/motion.h`.
+"""
 
 import numpy as np
 
-# v @ CROSS: the matrix of v x
+# v @ CROSS is the matrix of v x.
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)
 
 
@@ -11,7 +14,7 @@ def cross_matrix(vector):
 
 
 def spins(rotation, inverse_inertia, momentum):
-    """Angular velocities R I^-1 R' L."""
+    """Return angular velocities R I^-1 R' L."""
     return (rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None])))[
         ..., 0
     ]
@@ -24,19 +27,22 @@ def sinc(x):
 
 
 def rotation_by(vector):
-    """Rotations by |v| about v."""
+    """Return rotations by |v| about v."""
     angle = np.sqrt(np.square(vector).sum(axis=-1))[..., None, None] / np.pi
     K = cross_matrix(vector)
     return np.eye(3) + sinc(angle) * K + (0.5 * sinc(0.5 * angle) ** 2 * K) @ K
 
 
 def orthonormal(rotation):
-    """The rotations nearest to almost orthonormal matrices R: R (3 - R'R) / 2 is Newton's step to the polar factor."""
+    """Return the rotations nearest to almost orthonormal matrices R.
+
+    R (3 - R'R) / 2 is Newton's step to the polar factor.
+    """
     return 0.5 * rotation @ (3.0 * np.eye(3) - rotation.swapaxes(-1, -2) @ rotation)
 
 
 def advanced(values, mass, inverse_inertia, dt):
-    """Values of bodies, shape (n, 26), after times dt, shape (n,)."""
+    """Return values of bodies, shape (n, 26), after times dt, shape (n,)."""
     values, time = values.copy(), dt[:, None]
     R, L = values[:, 3:12].reshape(-1, 3, 3), values[:, 15:18]
     half, left = 0.5 * time * spins(R, inverse_inertia, L), np.arange(len(R))
@@ -57,7 +63,7 @@ def advanced(values, mass, inverse_inertia, dt):
 
 
 def velocity_fields(values, mass, inverse_inertia):
-    """Turns and shifts: a point x of a body moves at turn x + shift."""
+    """Return turns and shifts: a point x of a body moves at turn x + shift."""
     turn = cross_matrix(spins(values[:, 3:12].reshape(-1, 3, 3), inverse_inertia, values[:, 15:18]))
     return turn, values[:, 12:15] / mass[:, None] - (turn @ values[:, :3, None])[..., 0]
 
@@ -68,7 +74,10 @@ def corners(low, high):
 
 
 def top_speed(R, t, boxes, size, span):
-    """Largest speed of corners of boxes, clipped to the domain, between m poses R, shape (m, n, 3, 3), and t, shape (m, n, 3)."""
+    """Return the largest speed of corners of boxes between m poses.
+
+    The boxes are clipped to the domain. R has shape (m, n, 3, 3), t has shape (m, n, 3).
+    """
 
     def applied(R, t, points):
         return points @ R.swapaxes(-1, -2) + t[..., None, :]

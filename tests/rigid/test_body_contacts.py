@@ -1,4 +1,7 @@
-"""Bodies against walls, solids and each other: rest, slope, stack and impact, by what mechanics says of them."""
+"""Contacts of bodies with walls, solids and each other, against mechanics.
+
+The tests cover rest, slope, stack and impact.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ G = 9.81
 
 
 def box(low, high, dimension, rotate=0.0):
-    """Return a box, in space from 0.4 to 0.6 along z, turned by an angle about z."""
+    """Return a box turned by an angle about z; in 3-D from 0.4 to 0.6 along z."""
     if dimension == 3:
         low, high = [*low, 0.4], [*high, 0.6]
     angles = [rotate] if dimension == 2 else [0.0, 0.0, rotate]
@@ -32,7 +35,7 @@ def solid(geometry, motion=None):
 
 
 def drift(bodies, duration, **settings):
-    """Run, and return how far any body moved, and turned, meanwhile."""
+    """Run, and return the largest displacement and rotation of any body."""
     before = [(body.position.copy(), body.rotation.copy()) for body in bodies.bodies]
     run(bodies, duration, **settings)
     moves = [
@@ -58,7 +61,10 @@ def test_a_dropped_box_rests_on_the_floor_without_drift(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_stack_of_two_stands(dimension):
-    """The upper one overhangs; they start a little apart."""
+    """Stack of two at rest.
+
+    The upper one overhangs; they start slightly apart.
+    """
     bodies = bodies_of(
         [box([0.4, 0.01], [0.6, 0.15], dimension), box([0.47, 0.17], [0.62, 0.3], dimension)],
         dimension,
@@ -72,7 +78,10 @@ def test_a_stack_of_two_stands(dimension):
 
 
 def test_a_box_on_one_of_the_same_size_stands():
-    """Corners meet corners, where a distance has no direction."""
+    """Rest of a box on one of the same size, where corners meet corners.
+
+    There a distance has no direction.
+    """
     bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], 2), box([0.4, 0.1], [0.6, 0.2], 2)], 2)
     moved, _ = drift(bodies, 2.0)
     assert moved < 1e-5
@@ -81,7 +90,10 @@ def test_a_box_on_one_of_the_same_size_stands():
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(("slope", "slides"), [(0.38, False), (0.42, True)])
 def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, slides):
-    """In space along a diagonal, where boxes of friction would hold more than the cone."""
+    """Sliding of a box beyond the angle of friction.
+
+    In 3-D along a diagonal, where friction boxes would hold more than the cone.
+    """
     bodies = bodies_of([box([0.1, 0.0], [0.3, 0.1], dimension)], dimension, friction=0.4)
     angle = np.arctan(slope)
     along = (
@@ -96,7 +108,7 @@ def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, 
         return
     pull = G * (np.sin(angle) - 0.4 * np.cos(angle))
     assert bodies.bodies[0].velocity @ along == pytest.approx(pull * time, rel=1e-6)
-    # symplectic Euler in steps of 0.01
+    # Symplectic Euler in steps of 0.01.
     assert way == pytest.approx(0.5 * pull * time * (time + 0.01), rel=1e-6)
 
 
@@ -130,7 +142,10 @@ def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes)
 
 @pytest.mark.parametrize("fast", [0, 1])
 def test_a_ball_does_not_fly_through_another_in_a_step(fast):
-    """It would go seven of its diameters; which of the two is named first makes no difference."""
+    """Fast ball against another: no tunnelling within a step.
+
+    It would move by seven of its diameters; the order of the two makes no difference.
+    """
     centers, settings = [[0.6, 0.5], [0.6, 0.5]], [{}, {}]
     centers[fast], settings[fast] = [0.2, 0.5], {"velocity": np.array([70.0, 0.0, 0.0])}
     bodies = bodies_of(
@@ -146,7 +161,7 @@ def test_a_ball_does_not_fly_through_another_in_a_step(fast):
 
 
 def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
-    """In space, with spin and friction."""
+    """Momentum and angular momentum of an oblique impact, with spin and friction."""
     made = [Sphere(center=[0.3, 0.45, 0.5], radius=0.1), box([0.5, 0.4], [0.7, 0.6], 3, 0.0)]
     start = [
         {"velocity": np.array([3.0, 0.3, 0.2]), "angular_velocity": np.array([0.0, 5.0, -10.0])},
@@ -191,7 +206,10 @@ def test_a_bouncing_ball_comes_to_rest():
 
 
 def test_a_ball_rolls_down_a_slope():
-    """Without slip: a disc accelerates by 2/3 of the slope's pull."""
+    """Rolling of a ball down a slope.
+
+    Without slip a disc accelerates by 2/3 of the slope's pull.
+    """
     bodies = bodies_of([Sphere(center=[0.1, 0.1], radius=0.1)], 2, friction=1.0)
     angle = 0.3
     run(bodies, 0.5, gravity=G * np.array([np.sin(angle), -np.cos(angle), 0.0]))
@@ -253,7 +271,7 @@ def test_round_bodies_rest_on_a_box(shape, rest):
 
 
 def test_a_cut_of_a_mesh_rests_in_the_plane():
-    """The torus is cut into a ring: it stands on its outside."""
+    """Rest of a mesh's cut in the plane: the torus becomes a ring."""
     ring = TriangleMesh(
         surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.4, [0.0], [0.5, 0.3], 2)
     )
@@ -263,7 +281,10 @@ def test_a_cut_of_a_mesh_rests_in_the_plane():
 
 
 def test_a_small_ball_rests_inside_a_ring():
-    """The distance to the cut of a mesh is that in the plane, also inside its hole."""
+    """Rest of a small ball inside a ring.
+
+    The distance to the cut of a mesh is that in the plane, also inside its hole.
+    """
     ring = TriangleMesh(
         surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.8, [0.0], [0.5, 0.5], 2)
     )
@@ -307,7 +328,8 @@ def test_a_plane_and_an_inverted_box_are_walls():
 
 
 def test_open_sides_have_no_wall():
-    bodies = bodies_of([Sphere(center=[0.5, 0.5], radius=0.1)], 2, open_sides=0b0100)  # the bottom
+    # The bottom is open.
+    bodies = bodies_of([Sphere(center=[0.5, 0.5], radius=0.1)], 2, open_sides=0b0100)
     run(bodies, 1.0)
     assert bodies.bodies[0].position[1] == pytest.approx(0.5 - 0.5 * G * 1.01, rel=1e-9)
 
@@ -331,7 +353,10 @@ def test_bodies_that_overlap_at_the_start_are_refused(shapes, says):
 
 
 def test_contacts_point_from_the_other_to_the_one():
-    """Every kind of pair, on both sides: the way along the normal parts them."""
+    """Direction of contacts: from the other body to the one.
+
+    For every kind of pair, on both sides, motion along the normal separates them.
+    """
     rng = np.random.default_rng(5150)
     shapes = [
         Box(lower=[-0.1, -0.1, -0.1], upper=[0.1, 0.1, 0.1]),
@@ -374,7 +399,10 @@ def test_obstacles_need_no_name_to_be_found():
 
 
 def begun(dimension=2, **settings):
-    """Return a box at rest on the floor, and its weight's impulse, in a step that has begun."""
+    """Return a box at rest on the floor and the impulse of its weight.
+
+    A step has begun.
+    """
     bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], dimension)], dimension, **settings)
     bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)
     return bodies, bodies.bodies[0], bodies.bodies[0].properties.mass * G * 0.01
@@ -442,7 +470,10 @@ def test_a_step_begun_anew_knows_nothing_of_the_first():
 
 
 def test_a_smooth_body_slides_away_under_a_rough_one():
-    """As far as both surfaces rub: the coefficient is the geometric mean."""
+    """Smooth body that slides from under a rough one.
+
+    The coefficient is the geometric mean of both surfaces.
+    """
     made = [box([0.3, 0.0], [0.6, 0.1], 2), box([0.35, 0.1], [0.55, 0.25], 2)]
     bodies = bodies_of(made, 2, settings=[{"friction": 0.0}, {"friction": 1.0}])
     bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)

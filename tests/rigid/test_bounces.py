@@ -1,4 +1,7 @@
-"""Bounces whatever the time step: heights go by the square of the restitution, and nothing gains energy."""
+"""Bounces with any time step.
+
+Heights scale with the square of the restitution, and the energy does not grow.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,10 @@ STEPS = {"fine": [0.002], "coarse": [0.02], "mixed": [0.011, 0.004, 0.007, 0.002
 
 
 def steps(bodies, lengths, duration):
-    """Advance as simulations do, with velocities of the middle of steps; yield the length of each step."""
+    """Advance as simulations do; yield the length of each step.
+
+    Velocities are those of the middle of steps.
+    """
     last, number = 0.0, 0
     while bodies.time < duration:
         dt = lengths[number % len(lengths)]
@@ -23,7 +29,10 @@ def steps(bodies, lengths, duration):
 
 
 def tops(bodies, number, floor, lengths, duration):
-    """Return the heights above a floor at which a body turns around [m]: at the end of a step it has y and v, at its top y + v^2 / 2 g."""
+    """Return the heights above a floor at which a body turns around [m].
+
+    At the end of a step it has y and v, at its top y + v^2 / 2 g.
+    """
     heights, rising = [], False
     for dt in steps(bodies, lengths, duration):
         body = bodies.bodies[number]
@@ -46,7 +55,7 @@ def test_heights_go_by_the_square_of_the_restitution(dimension, restitution, dro
     )
     found = tops(bodies, 0, 0.1, STEPS[lengths], 1.5)[:3]
     expected = drop * restitution ** (2.0 * np.arange(1, 1 + len(found)))
-    # slower ones rest
+    # Slower ones come to rest.
     fast = expected > 2.0 * (2.0 * G * max(STEPS[lengths]) * restitution) ** 2 / (2.0 * G)
     assert fast[0]
     np.testing.assert_allclose(found[fast], expected[fast], rtol=1e-9)
@@ -54,7 +63,10 @@ def test_heights_go_by_the_square_of_the_restitution(dimension, restitution, dro
 
 @pytest.mark.parametrize("lengths", STEPS)
 def test_a_ball_bounces_on_a_box_that_rests(lengths):
-    """The box does not fall with the ball, and the floor bears it at the time of the impact."""
+    """Bounce of a ball on a resting box.
+
+    The box does not fall with the ball, and the floor supports it at the time of the impact.
+    """
     shapes = [Sphere(center=[0.5, 0.8], radius=0.1), Box(lower=[0.3, 0.0], upper=[0.7, 0.2])]
     bodies = bodies_of(shapes, 2, open_sides=FLOOR, settings=[{"restitution": 0.8}, {}])
     found = tops(bodies, 0, 0.3, STEPS[lengths], 1.2)
@@ -64,7 +76,10 @@ def test_a_ball_bounces_on_a_box_that_rests(lengths):
 
 @pytest.mark.parametrize("lengths", STEPS)
 def test_balls_that_meet_in_the_air_go_as_far_whatever_the_step(lengths):
-    """Elastic, of masses 1 : 4 and both on parabolas: exact places a second after the start."""
+    """Elastic impact in the air, independent of the step.
+
+    Masses 1 : 4, both on parabolas: exact positions a second after the start.
+    """
     shapes = [Sphere(center=[0.2, 0.5], radius=0.05), Sphere(center=[0.8, 0.5], radius=0.1)]
     start = [{"velocity": np.array([1.0, 2.0, 0.0])}, {"velocity": np.array([-0.5, 2.0, 0.0])}]
     bodies = bodies_of(shapes, 2, open_sides=SIDES, restitution=1.0, settings=start)
@@ -97,7 +112,10 @@ def test_elastic_bodies_that_rest_stay_at_rest(lengths):
 @pytest.mark.parametrize(("lengths", "gain"), [("fine", 1e-4), ("mixed", 5e-3), ("coarse", 1e-2)])
 @pytest.mark.parametrize("restitution", [0.5, 1.0])
 def test_a_column_of_balls_gains_no_energy(restitution, lengths, gain):
-    """Several impacts in a step, of bodies that hit others on both sides."""
+    """Energy of a column of balls.
+
+    There are several impacts in a step, of bodies that hit others on both sides.
+    """
     bodies = bodies_of(
         [Sphere(center=[0.5, 0.15 + 0.25 * k], radius=0.1) for k in range(3)],
         2,
@@ -117,7 +135,10 @@ def test_a_column_of_balls_gains_no_energy(restitution, lengths, gain):
 
 
 def test_an_impact_at_an_angle_keeps_angular_momentum():
-    """Of two bodies that slide along each other while the gap closes, in a long step."""
+    """Angular momentum of an impact at an angle.
+
+    The bodies slide along each other while the gap closes, in a long step.
+    """
     shapes = [Sphere(center=[0.3, 0.5], radius=0.1), Box(lower=[0.5, 0.4], upper=[0.7, 0.6])]
     start = [
         {"velocity": np.array([3.0, 1.0, 0.0]), "angular_velocity": np.array([0.0, 0.0, 4.0])},

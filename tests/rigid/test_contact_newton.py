@@ -1,4 +1,7 @@
-"""Contacts that sweeps leave unsolved: stacks of heavy and light bodies in turn stand, and Newton's methods find what sweeps find."""
+"""Contacts that sweeps leave unsolved.
+
+Alternating stacks of heavy and light bodies stand, and Newton's methods agree with sweeps.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +21,7 @@ SIDE = 0.1
 
 
 def stack(count, ratio, dimension, heavy_on_top=True):
-    """Return cubes of two densities in turn, one on the other."""
+    """Return a stack of cubes of two densities in turn."""
     far = [[0.4], [0.4 + SIDE]] if dimension == 3 else [[], []]
     shapes = [
         Box(lower=[0.4, SIDE * k, *far[0]], upper=[0.4 + SIDE, SIDE * (k + 1), *far[1]])
@@ -36,7 +39,7 @@ def stack(count, ratio, dimension, heavy_on_top=True):
 
 
 def creep(bodies, steps, lengths):
-    """Return how far any body moves in its sides in some steps, and the largest residual."""
+    """Return the largest displacement, in sides of a cube, and the largest residual."""
     before, worst = np.array([body.position for body in bodies.bodies]), 0.0
     for _, dt in zip(range(steps), lengths, strict=False):
         bodies.begin_step(bodies.time, dt, GRAVITY, dt)
@@ -51,7 +54,10 @@ def creep(bodies, steps, lengths):
     ("dimension", "count", "ratio"), [(2, 20, 1e3), (3, 20, 1e2), (3, 8, 1e6), (2, 40, 1e1)]
 )
 def test_a_stack_of_heavy_and_light_boxes_stands(dimension, count, ratio, heavy_on_top):
-    """Steps differ in length, so that the last step's impulses are never those of the next."""
+    """Stack of heavy and light boxes at rest.
+
+    Steps differ in length, so that the last step's impulses are never those of the next.
+    """
     lengths = np.random.default_rng(2718).uniform(0.003, 0.01, 40)
     moved, residual = creep(stack(count, ratio, dimension, heavy_on_top), 40, lengths)
     assert moved < 1e-5
@@ -72,7 +78,7 @@ def test_fifty_boxes_stand_for_a_second(dimension, ratio):
 @pytest.mark.parametrize("seed", [611, 87, 9203])
 def test_newton_finds_the_impulses_of_sweeps(method, dimension, seed):
     made = problem_of(dimension, seed)
-    many = made.part(np.array([0, 1, 3, 4]))  # three bodies that touch
+    many = made.part(np.array([0, 1, 3, 4]))  # three bodies in contact
     swept, residual, _ = many.solve(StoppingCriteria(rtol=1e-10, max_iterations=20_000))
     assert residual <= 1e-9
     newton = ContactNewton(many, swept * np.random.default_rng(seed).uniform(0.9, 1.1, swept.shape))
@@ -83,7 +89,10 @@ def test_newton_finds_the_impulses_of_sweeps(method, dimension, seed):
 
 
 def test_islands_that_sweeps_solve_stay_as_they_are():
-    """The residual of the other groups is that of Newton's method."""
+    """Islands that sweeps solve stay unchanged.
+
+    The residual of the other groups is that of Newton's method.
+    """
     made = problem_of(3, 611)
     rough = StoppingCriteria(rtol=1e-9, max_iterations=16)
     swept, before, _ = made.solve(rough)
@@ -96,7 +105,11 @@ def test_islands_that_sweeps_solve_stay_as_they_are():
 
 @pytest.mark.slow
 def test_a_toppling_column_is_solved():
-    """Bodies that hit each other in a column that falls: interior points jam, and active sets start too far away."""
+    """Toppling column, solved.
+
+    Bodies that hit each other in a column that falls: interior points stall, and active sets start
+    too far away.
+    """
     bodies = stack(10, 1e2, 3)
     worst = 0.0
     for _ in range(80):

@@ -1,4 +1,7 @@
-"""The problem of contacts: the fused solve against the package's own residual and methods, its memory, and what it holds."""
+"""Contact problem: the fused solve, its memory, and supported bodies.
+
+It is compared with the package's own residual and methods.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ EXACT = StoppingCriteria(rtol=1e-7, max_iterations=2000)
 
 
 def problem_of(dimension, seed):
-    """Return contacts of four bodies: chains over three of them, and the fourth on its own."""
+    """Return contacts of four bodies: chains over three, and a separate one."""
     rng, q = np.random.default_rng(seed), 3 * dimension - 3
     first, second = np.array([0, 1, 3, 2, 0]), np.array([4, 0, 4, 1, 4])
     one, other = rng.normal(size=(5, dimension, q)), rng.normal(size=(5, dimension, q))
@@ -62,7 +65,10 @@ def stack(dimension, count=3):
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", [611, 87, 9203])
 def test_impulses_solve_the_lcp_with_affine_bounds(dimension, seed):
-    """The residual is recomputed by the package from the matrix, and its own NNCG finds the same impulses."""
+    """Impulses as the solution of the LCP with affine bounds.
+
+    The package recomputes the residual from the matrix, and its NNCG finds the same impulses.
+    """
     made = problem_of(dimension, seed)
     x, relative, _ = made.solve(EXACT)
     J = jacobian(made.first, made.second, made.one, made.other, made.bodies)
@@ -106,7 +112,10 @@ def test_too_few_iterations_are_told():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_stack_on_the_floor_is_held_to_its_top(dimension):
-    """Where the lowest one is held, those on it are too; one that floats beside them is not."""
+    """Supported stack on the floor, up to its top.
+
+    If the lowest one is supported, those on it are too; one that floats beside them is not.
+    """
     beside = Sphere(center=[0.8, 0.5, 0.5][:dimension], radius=0.1)
     bodies = bodies_of([*stack(dimension), beside], dimension)
     run(bodies, 0.05)
@@ -143,7 +152,10 @@ def test_a_state_with_contacts_is_continued_bit_for_bit():
 
 
 def test_a_warm_start_takes_what_the_last_step_found():
-    """The impulses from the floor bear the weight of the stack before anything is solved."""
+    """Warm start from the impulses of the last step.
+
+    The impulses from the floor bear the weight of the stack before any solve.
+    """
     bodies = bodies_of(stack(2), 2)
     run(bodies, 0.2)
     touching = bodies._solve.find(bodies.time, 0.01, GRAVITY)

@@ -1,4 +1,7 @@
-"""Contacts between points: capsules, boxes and meshes that meet with their edges, against dense samples and by falling on each other."""
+"""Edge contacts of capsules, boxes and meshes.
+
+Against dense samples, and by letting them fall on each other.
+"""
 
 import numpy as np
 import pytest
@@ -42,7 +45,7 @@ def test_the_gap_of_two_capsules_is_that_of_their_axes(seed):
     best = int(touch.gap.argmin())
     dense = to_segment(sampled(a), b).min() - 0.08
     assert dense - 1e-6 < touch.gap[best] <= dense + 1e-12
-    # halfway between both
+    # Halfway between both.
     np.testing.assert_allclose(
         to_segment(touch.point[best][None], a), 0.03 + 0.5 * touch.gap[best], atol=1e-7
     )
@@ -53,7 +56,10 @@ def test_the_gap_of_two_capsules_is_that_of_their_axes(seed):
 
 @pytest.mark.parametrize("seed", range(50, 80))
 def test_the_gap_of_a_capsule_and_a_box_is_that_of_its_axis(seed):
-    """Beside a face, across an edge, at a corner, or with the axis inside."""
+    """Gap of a capsule and a box: that of its axis.
+
+    The axis is beside a face, across an edge, at a corner, or inside.
+    """
     rng = np.random.default_rng(seed)
     capsule, ends = capsule_of(rng, 0.02)
     half, turned, at = (
@@ -83,7 +89,7 @@ def bar(low, high, tilt=(0.0, 0.0, 0.0)):
 
 
 def lying(kind, top, x):
-    """Return a long thin thing along z whose top is at a height."""
+    """Return a long thin body along z whose top is at a height."""
     y = top - HALF
     if kind == "capsule":
         return Capsule(start=[x, top - R, 0.1], end=[x, top - R, 0.9], radius=R)
@@ -96,7 +102,7 @@ def lying(kind, top, x):
 
 
 def across(kind, bottom):
-    """Return one along x whose bottom is at a height."""
+    """Return a long thin body along x whose bottom is at a height."""
     if kind == "capsule":
         return Capsule(start=[0.2, bottom + R, 0.47], end=[0.8, bottom + R, 0.47], radius=R)
     low, high = [0.1, bottom, 0.455], [0.9, bottom + 2.0 * HALF, 0.455 + 2.0 * HALF]
@@ -117,7 +123,10 @@ def across(kind, bottom):
     ],
 )
 def test_what_falls_across_two_others_comes_to_rest_on_them(falling, standing):
-    """At neither's ends nor middles, where points of a coarse sample lie."""
+    """Rest of a body that falls across two others.
+
+    Away from the ends and middles of both, where points of a coarse sample lie.
+    """
     raised = HALF * (np.sqrt(2.0) - 1.0) if standing == "edge" else 0.0
     solids = [
         PlacedSolid(geometry=lying(standing, 0.2, x), separating=True, name="solid", motion=None)
@@ -131,7 +140,10 @@ def test_what_falls_across_two_others_comes_to_rest_on_them(falling, standing):
 
 
 def test_capsules_that_fly_at_each_other_crosswise_meet():
-    """Two bodies, the nearest points of both between their sampled ones."""
+    """Crosswise impact of two flying capsules.
+
+    The nearest points of both lie between their sampled ones.
+    """
     shapes = [
         Capsule(start=[0.3, 0.2, 0.2], end=[0.3, 0.9, 0.2], radius=R),
         Capsule(start=[0.5, 0.53, 0.05], end=[0.5, 0.53, 0.61], radius=R),

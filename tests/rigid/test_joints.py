@@ -1,4 +1,7 @@
-"""Joints of rigid bodies beside integrations and closed forms of others: energy, period, momentum, limits, motors, drift."""
+"""Joints of rigid bodies against integrations and closed forms.
+
+The tests cover energy, period, momentum, limits, motors and drift.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from warp_lcp.rigid.mass_properties import mass_properties
 
 DOWN = np.array([0.0, -9.81, 0.0])
 Z = np.array([0.0, 0.0, 1.0])
-LENGTH, HALF = 0.5, 0.05  # of a bar and half its thickness [m]
+LENGTH, HALF = 0.5, 0.05  # length of a bar and half its thickness [m]
 
 
 def bar(number: int, dimension: int = 3) -> Box:
@@ -30,7 +33,7 @@ def system(
     method: str = JOINTED,
     tolerance: float = 1e-9,
 ) -> RigidBodies:
-    """Return bars of water in a row, with nothing around them."""
+    """Return a row of bars of water without surroundings."""
     shapes = [bar(number, dimension) for number in range(count)]
     bodies = [
         RigidBody(mass_properties(shape, dimension, density=1000.0), name=f"bar {i}")
@@ -60,7 +63,7 @@ def go(bodies: RigidBodies, dt: float, steps: int, gravity: np.ndarray = DOWN):
 
 
 def energy(bodies: RigidBodies, dt: float, gravity: np.ndarray = DOWN) -> float:
-    """Return the energy in the middle of the last step, of which velocities are."""
+    """Return the energy in the middle of the last step, the time of the velocities."""
     momentum = np.sum([body.momentum for body in bodies.bodies], axis=0)
     return (
         bodies.kinetic_energy()
@@ -70,7 +73,10 @@ def energy(bodies: RigidBodies, dt: float, gravity: np.ndarray = DOWN) -> float:
 
 
 def double_pendulum(duration: float, dimension: int) -> np.ndarray:
-    """Return the angles of two bars that fall from the horizontal, by Lagrange's equations and DOP853."""
+    """Return the angles of two bars that fall from the horizontal.
+
+    They follow from Lagrange's equations, integrated by DOP853.
+    """
     m = 1000.0 * LENGTH * (2 * HALF) ** (dimension - 1)
     inertia = m * (LENGTH**2 + (2 * HALF) ** 2) / 12
     c = 0.5 * LENGTH
@@ -97,7 +103,10 @@ def double_pendulum(duration: float, dimension: int) -> np.ndarray:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_double_pendulum_goes_as_lagrange_says(dimension):
-    """Second order: half the step, a quarter of the error. Energy is kept, and anchors stay together."""
+    """Double pendulum by Lagrange's equations, of second order.
+
+    Half the step gives a quarter of the error. The energy is conserved, and anchors stay together.
+    """
     wanted, errors = double_pendulum(0.4, dimension), []
     for dt in (0.016, 0.008):
         bodies = system(chain(2), 2, dimension=dimension)
@@ -116,7 +125,10 @@ def test_a_double_pendulum_goes_as_lagrange_says(dimension):
 
 
 def test_a_bar_swings_with_the_period_of_its_inertia():
-    """2 pi sqrt(I / (m g c)) for small swings, by the zeros of the angle."""
+    """Period of a bar: 2 pi sqrt(I / (m g c)) for small swings.
+
+    It is measured by the zeros of the angle.
+    """
     bodies, dt, tilt = system(chain(1), 1), 0.01, np.pi / 2 - 0.05
     turned = rotation_by(-tilt * Z)
     bodies.bodies[0].position, bodies.bodies[0].rotation = (
@@ -160,7 +172,7 @@ def test_joined_bodies_in_flight_keep_both_momenta(kind):
     before = momenta()
     for _ in go(bodies, 0.01, 40, np.zeros(3)):
         pass
-    # J is of the step's beginning, where anchors are 1e-9 apart
+    # J is that of the begin of the step, where anchors are 1e-9 apart.
     assert momenta() == pytest.approx(before, abs=1e-6)
     assert bodies.row()["joint_error"] < 1e-7
     if kind == "fixed":
@@ -183,7 +195,11 @@ def test_a_fixed_bar_stays_and_a_ball_lets_it_turn_about_any_axis():
 
 
 def test_a_limit_holds_a_bar_and_lets_go_of_it():
-    """It falls to -0.5 rad, rests there, and leaves when gravity points up; the other limit then holds it at 0.3."""
+    """Limit of a bar that holds and releases it.
+
+    It falls to -0.5 rad, rests there, and leaves when gravity points up; the other limit then holds
+    it at 0.3.
+    """
     bodies = system(chain(1, limits=(-0.5, 0.3)), 1)
     for _ in go(bodies, 0.01, 60):
         assert bodies.joints[0].angle(bodies.bodies) > -0.5 - 1e-7
@@ -194,12 +210,15 @@ def test_a_limit_holds_a_bar_and_lets_go_of_it():
 
 
 def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
-    """Without gravity the speed is torque / I t up to that which is wanted; 2 N m cannot lift 5 kg, 20 N m can."""
+    """Motor that reaches its speed with its torque.
+
+    Without gravity the speed is torque / I t up to the target; 2 N m cannot lift 5 kg, 20 N m can.
+    """
     bodies = system(chain(1, motor_speed=3.0, motor_torque=2.0), 1)
     body = bodies.bodies[0]
     inertia = body.properties.inertia[2, 2] + body.properties.mass * (LENGTH / 2) ** 2
     for step in go(bodies, 0.02, 45, np.zeros(3)):
-        # velocities are of the middle of steps, the first kick is half of one
+        # Velocities are those of the middle of steps; the first gravity step is half of one.
         middle = (step + 0.5) * 0.02
         assert body.angular_velocity[2] == pytest.approx(min(3.0, 2.0 / inertia * middle), rel=2e-3)
         torque = bodies.row()["joint0_torque"]
@@ -216,7 +235,11 @@ def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
 
 @pytest.mark.parametrize("method", [*BOXED, *STEWART_TRINKLE])
 def test_every_method_takes_the_equations_of_joints(method):
-    """Two steps of a pendulum of two bars with a limit and a motor are those of the pivoting method; sweeps need patience."""
+    """Equations of joints by every method.
+
+    Two steps of a pendulum of two bars with a limit and a motor are those of the pivoting method;
+    sweeps need many iterations.
+    """
     joints = (chain(2)[0], Joint(1, 0, np.array([LENGTH, 0.0, 0.0]), Z, (-0.001, 1.0), 0.5, 1.0))
     found = {}
     for name in ("lemke", method):
@@ -225,12 +248,15 @@ def test_every_method_takes_the_equations_of_joints(method):
             pass
         found[name] = np.array([body.state()[:3] for body in bodies.bodies])
         assert bodies.contact_residual <= 1e-5 or name == "projected-jacobi"
-    if method != "projected-jacobi":  # whose steps are too long for rows that couple so much
+    if method != "projected-jacobi":  # its steps are too long for rows that couple so much
         np.testing.assert_allclose(found[method], found["lemke"], atol=2e-5)
 
 
 def random_joints(rng: np.random.Generator) -> tuple[Joint, ...]:
-    """Return a tree of joints of all kinds between four bars, with limits and motors."""
+    """Return a random tree of joints of all kinds between four bars.
+
+    They have limits and motors.
+    """
     joints = []
     for first in range(4):
         kind = str(rng.choice(["ball", "hinge", "fixed"]))
@@ -261,7 +287,10 @@ def random_joints(rng: np.random.Generator) -> tuple[Joint, ...]:
 
 
 def check_rows(seed: int) -> None:
-    """Rows are derivatives of the errors: J v is their difference along a motion of the bodies; errors do not see a common motion."""
+    """Check that rows are the derivatives of the errors.
+
+    J v is their difference along a motion of the bodies; errors are invariant to a common motion.
+    """
     rng = np.random.default_rng(seed)
     joints, h = random_joints(rng), 1e-6
     bodies = system((), 4).bodies
@@ -281,7 +310,7 @@ def check_rows(seed: int) -> None:
     np.testing.assert_allclose(
         (rows.jacobian(4) @ v.ravel())[~rows.motors], slope[~rows.motors], atol=1e-7
     )
-    # a screw of all: joints in space see it, others do not
+    # A screw motion of all: joints to the world change, others do not.
     for body, (position, rotation) in zip(bodies, before, strict=True):
         turn, shift = rotation_by(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, -0.3])
         body.position, body.rotation = turn @ position + shift, turn @ rotation
@@ -297,7 +326,11 @@ def test_rows_are_derivatives_of_errors(seed):
 
 
 def test_what_does_not_collide():
-    """Bodies of a joint, and of one piece of fixed ones; a hinge to a piece says nothing about the others of it."""
+    """Pairs without collision.
+
+    Bodies of a joint, and bodies of one rigid group of fixed ones; a hinge to a group has no effect
+    on its other bodies.
+    """
     at = np.zeros(3)
     joints = (
         Joint(1, 0, at, kind="fixed"),

@@ -1,4 +1,7 @@
-"""What makes many bodies quick: pairs by a sweep along an axis, balls all at once, impulses recalled by the two that touch."""
+"""Fast paths of many bodies.
+
+They are pairs by a sweep along an axis, balls all at once, and impulses recalled by pairs.
+"""
 
 from types import SimpleNamespace
 
@@ -15,7 +18,7 @@ from warp_lcp.rigid.obstacles import Obstacle
 
 
 def test_close_pairs_are_those_that_overlap():
-    """Against all pairs, boxes that just touch among them."""
+    """Close pairs against all pairs, including boxes that just touch."""
     for seed in range(40):
         rng = np.random.default_rng(seed)
         n = int(rng.integers(1, 30))
@@ -32,7 +35,7 @@ def turned(rng):
 
 
 def placed(positions, rng):
-    """Bodies turned at random, with their centers of mass at some positions."""
+    """Return randomly turned bodies with given centers of mass."""
     unit = MassProperties(mass=1.0, center=np.zeros(3), inertia=np.eye(3))
     bodies = BodyStates([RigidBody(unit, name=f"body {i}") for i in range(len(positions))])
     bodies.position[:], bodies.rotation[:] = positions, [turned(rng) for _ in positions]
@@ -40,7 +43,10 @@ def placed(positions, rng):
 
 
 def test_balls_touch_where_each_two_of_them_do():
-    """Pair by pair by the distance to the other one; two have the same center."""
+    """Contacts of balls against pairwise distances.
+
+    Two have the same center.
+    """
     rng, n = np.random.default_rng(3), 25
     shapes = [
         ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3)
@@ -72,7 +78,10 @@ class Touching(SimpleNamespace):
 
 
 def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
-    """Each from at most one of the last step, to whose place no other is nearer."""
+    """Recalled impulses: from the nearest contact of the same pair.
+
+    Each from at most one of the last step, whose place is the nearest.
+    """
     recalled = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -114,7 +123,10 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
 
 
 def test_balls_touch_planes_where_each_of_them_does():
-    """Body by body and plane by plane, with a box among the balls and an obstacle that has moved."""
+    """Contacts of balls with planes, body by body and plane by plane.
+
+    With a box among the balls and an obstacle that has moved.
+    """
     rng, n = np.random.default_rng(8), 12
     shapes = [
         ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3)

@@ -1,4 +1,7 @@
-"""Mass, center and inertia of shapes, against closed forms of other derivations, sums over voxels and quadrature."""
+"""Mass, center and inertia of shapes.
+
+Against closed forms of other derivations, sums over voxels and quadrature.
+"""
 
 import itertools
 from dataclasses import replace
@@ -26,7 +29,10 @@ def box_mesh(lower, upper, placement=None):
 
 
 def sampled(geometry, bounds, dimension, count):
-    """Return area or volume, center and inertia at density 1 from the centers of voxels that lie inside."""
+    """Return area or volume, center and inertia at density 1.
+
+    From the centers of voxels that lie inside.
+    """
     low, high = bounds[:, :dimension]
     step = (high - low) / count
     axes = [low[a] + step[a] * (np.arange(count) + 0.5) for a in range(dimension)]
@@ -75,7 +81,10 @@ def test_mass_scales_the_inertia():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_of_a_capsule_by_quadrature(dimension):
-    """Slices across the axis: segments or discs."""
+    """Mass properties of a capsule by quadrature.
+
+    Slices across the axis are segments or discs.
+    """
     r, length = 0.4, 1.1
     end = [0.3, 0.2, 0.9][:dimension]
     axis = length * np.array([0.6, 0.8, 0.0])[:dimension]
@@ -126,7 +135,10 @@ def test_a_box_as_a_mesh_in_the_plane_is_the_rectangle():
 
 
 def test_far_from_the_origin_the_inertia_is_the_same():
-    """The parallel axis theorem: about the center nothing changes with the place."""
+    """Inertia far from the origin, by the parallel axis theorem.
+
+    About the center it does not depend on the place.
+    """
     near = mass_properties(box_mesh([0, 0, 0], [1, 2, 3]), 3, density=1.0)
     far = mass_properties(
         box_mesh([0, 0, 0], [1, 2, 3], Placement(translation=np.array([300.0, -200.0, 100.0]))),
@@ -186,7 +198,11 @@ def test_the_outline_has_the_inside_on_its_left():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_surface_of_a_shape_encloses_it(dimension):
-    """Triangles face outward, segments have the inside on the left: their integral is the shape's volume."""
+    """Surface of a shape that encloses it.
+
+    Triangles face outward, segments have the inside on the left: their integral is the shape's
+    volume.
+    """
     shapes = [
         Box(lower=[0.1] * dimension, upper=[0.3, 0.5, 0.4][:dimension]),
         Sphere(center=[0.2, 0.4, 0.6][:dimension], radius=0.2),

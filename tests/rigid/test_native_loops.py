@@ -1,7 +1,7 @@
-"""Native loops of rigid bodies against plain NumPy, step by step: motion, contacts in a plane, impulses, what holds bodies.
+"""Native loops of rigid bodies against plain NumPy, step by step.
 
-The loops take sums in the order of NumPy and OpenBLAS on processors with AVX2, whose bits they
-have; elsewhere rounding may differ.
+The loops are motion, planar contacts, impulses and supported bodies. They sum in the order of NumPy
+and OpenBLAS on processors with AVX2 and have their bits; elsewhere rounding may differ.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ def close(found, expected, atol=0.0):
 
 
 def drawn_states(rng, flat):
-    """Bodies anywhere, some at rest; in a plane if `flat`."""
+    """Return bodies anywhere, some at rest; in a plane if `flat`."""
     n, bodies = int(rng.integers(1, 6)), []
     for number in range(n):
         root = np.diag(rng.uniform(0.2, 2.0, 3)) if flat else rng.standard_normal((3, 3))
@@ -118,7 +118,10 @@ def test_motion_of_no_time_and_of_what_is_not_finite():
 
 
 def drawn_shape(rng):
-    """A box, disc or capsule; some at right angles and of round sizes, so that sides touch exactly."""
+    """Return a box, disc or capsule.
+
+    Some are at right angles and of round sizes, so that sides touch exactly.
+    """
     neat = rng.random() < 0.4
     size = rng.choice([0.05, 0.1], 2) if neat else rng.uniform(0.03, 0.15, 2)
     angle, scale = (
@@ -138,7 +141,10 @@ def drawn_shape(rng):
 
 
 def drawn_world(seed, most=6):
-    """Bodies, their shapes, and obstacles: walls, inverted boxes, planes, shapes that stand or move."""
+    """Return bodies, their shapes, and obstacles.
+
+    Walls, inverted boxes, planes, shapes that stand or move.
+    """
     rng = np.random.default_rng([2, seed])
     shapes = [drawn_shape(rng) for _ in range(int(rng.integers(1, most + 1)))]
     bodies = []
@@ -188,7 +194,10 @@ def solve_of(bodies, shapes, obstacles, loops=True):
 
 @pytest.mark.parametrize("first", range(0, 24, 6))
 def test_contacts_in_a_plane_are_those_of_the_detection(first):
-    """Bodies anywhere, through each other, on a lattice where sides touch exactly, and none near any other."""
+    """Planar contacts against the detection.
+
+    Bodies anywhere, overlapping, on a lattice where sides touch exactly, and far from others.
+    """
     touching = 0
     for seed in range(first, first + 6):
         rng, bodies, shapes, obstacles = drawn_world(seed)
@@ -228,7 +237,10 @@ def test_more_contacts_than_there_is_room_for_are_found_all_the_same():
 
 
 def test_overlaps_at_the_end_of_a_step_are_seen():
-    """Contacts that part leave no overlap after a long time, others keep theirs."""
+    """Overlaps at the end of a step.
+
+    Contacts that separate leave no overlap after a long time, others keep theirs.
+    """
     seen = []
     for seed in range(30, 50):
         _, bodies, shapes, obstacles = drawn_world(seed)
@@ -246,11 +258,14 @@ def test_overlaps_at_the_end_of_a_step_are_seen():
 
 
 def stepped(seed, loops, steps):
-    """What a world goes through: what holds its bodies, their values, contacts, and the impulses that are remembered."""
+    """Return the history of a world.
+
+    It consists of supported bodies, values, contacts, and remembered impulses.
+    """
     rng, bodies, shapes, obstacles = drawn_world(seed)
     world = object.__new__(RigidBodies)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ContactSolve, "check_start", lambda *_: None)  # drawn bodies may overlap
+        patch.setattr(ContactSolve, "check_start", lambda *_: None)  # random bodies may overlap
         world.__init__(bodies, shapes, list(range(len(bodies))), obstacles, 2)
     if not loops:
         world._solve._planar = None
@@ -269,7 +284,10 @@ def stepped(seed, loops, steps):
 
 @pytest.mark.parametrize("first", range(100, 112, 4))
 def test_a_world_steps_as_with_plain_numpy(first):
-    """Falls, rests, is pushed, bounces and is pushed apart, the same with the loops as without."""
+    """Steps of a world with and without the native loops.
+
+    It falls, rests, is pushed, bounces and is separated.
+    """
     for seed in range(first, first + 4):
         for found, expected in zip(stepped(seed, True, 6), stepped(seed, False, 6), strict=True):
             close(found, np.asarray(expected), atol=1e-9)  # solves stop at 1e-7 of the impulses

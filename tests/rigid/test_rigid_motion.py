@@ -1,4 +1,7 @@
-"""Free motion of a body: what is kept, what a fine reference says, and that poses are those of advance."""
+"""Free motion of a body: conservation, a fine reference, and poses.
+
+Poses are those of advance.
+"""
 
 from copy import copy
 
@@ -24,7 +27,10 @@ def body(inertia=UNEVEN, **kwargs):
 
 
 def tumbling():
-    """Near the middle axis, about which a free rotation is unstable."""
+    """Return a body that turns near its middle axis.
+
+    A free rotation about that axis is unstable.
+    """
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
     return body(
         turn @ UNEVEN @ turn.T,
@@ -44,13 +50,16 @@ def test_angular_momentum_is_kept_exactly_and_energy_does_not_drift():
         top.advance(0.01)
         energies.append(top.kinetic_energy / start - 1.0)
     assert (top.angular_momentum == momenta).all()
-    assert np.abs(energies).max() < 2e-4  # of the second order in the step
+    assert np.abs(energies).max() < 2e-4  # of second order in the step
     assert abs(np.mean(energies[-500:]) - np.mean(energies[:500])) < 2e-5
     assert np.abs(top.rotation @ top.rotation.T - np.eye(3)).max() < 1e-14
 
 
 def test_a_free_top_follows_a_fine_reference():
-    """Euler's equations in the body's axes, with quaternions, by a method of high order: it flips over more than once."""
+    """Free top against a fine reference: Euler's equations with quaternions.
+
+    In the body's axes, by a method of high order; it flips over more than once.
+    """
     top = tumbling()
     inertia = top.properties.inertia
     inverse = np.linalg.inv(inertia)
@@ -94,7 +103,7 @@ def test_poses_are_those_of_advance():
         dt = 0.02 + 0.01 * step
         before, predicted = motion.pose(top.time), motion.pose(top.time + dt)
         way = predicted.after(before.inverse())
-        field = (way.apply(points) - points) / dt  # what solids take for their velocity
+        field = (way.apply(points) - points) / dt  # the velocity that solids use
         top.advance(dt)
         now = motion.pose(top.time)
         np.testing.assert_allclose(predicted.rotation, now.rotation, atol=1e-13)
@@ -187,7 +196,11 @@ def test_an_impulse_changes_velocities_by_the_inverse_mass():
 
 @pytest.mark.parametrize("spread", [1.0, 10.0, 1e6])
 def test_the_inverse_mass_of_a_turned_body_is_exactly_symmetric(spread):
-    """Inverting and turning leave rounding that grows with how uneven the moments are; what solvers are given must not tell."""
+    """Exact symmetry of the inverse mass of a turned body.
+
+    Inversion and rotation cause rounding errors that grow with the ratio of the moments; the
+    solver's matrix must be symmetric.
+    """
     rng = np.random.default_rng(23)
     for rotation in Rotation.random(20, rng=rng).as_matrix():
         principal = Rotation.random(rng=rng).as_matrix()
@@ -254,7 +267,10 @@ def test_coefficients_out_of_range_are_refused(bad):
 
 
 def test_bodies_of_one_array_move_as_each_does_alone():
-    """Bit for bit, whatever the others do: some of them need more rounds of the fixed point, one does not turn at all."""
+    """Motion of bodies in one array: that of each alone, bit for bit.
+
+    Some need more rounds of the fixed point, and one does not turn at all.
+    """
     rng = np.random.default_rng(41)
     spin = [np.zeros(3), *rng.normal(size=(4, 3)) * [[0.1], [1.0], [10.0], [40.0]]]
     alone = [
@@ -278,12 +294,16 @@ def test_bodies_of_one_array_move_as_each_does_alone():
 
 
 def test_rotations_off_by_rounding_become_the_nearest_ones():
-    """Against the singular value decomposition, whose U V' is the nearest orthogonal matrix."""
+    """Rotations with rounding errors: the nearest orthogonal matrices.
+
+    They are compared with U V' of the singular value decomposition.
+    """
     rng = np.random.default_rng(6)
     off = Rotation.random(50, rng=rng).as_matrix() + 1e-9 * rng.normal(size=(50, 3, 3))
     u, _, vt = np.linalg.svd(off)
     near = orthonormal(off)
-    np.testing.assert_allclose(near, u @ vt, rtol=0.0, atol=1e-14)  # which has rounding of its own
+    # It has rounding errors of its own.
+    np.testing.assert_allclose(near, u @ vt, rtol=0.0, atol=1e-14)
     np.testing.assert_allclose(
         near @ near.swapaxes(1, 2), np.broadcast_to(np.eye(3), near.shape), rtol=0.0, atol=2e-15
     )

@@ -1,4 +1,4 @@
-"""Which modules a first solve compiles, and with which flags."""
+"""Modules that a first solve compiles, and their flags."""
 
 import json
 import subprocess
@@ -31,7 +31,11 @@ print(json.dumps({
 
 
 def test_a_first_default_solve_compiles_few_modules_and_no_kernel_that_it_does_not_launch():
-    """A module costs 0.04 CPU s, a kernel 0.03 to 0.3, each set of flags a precompiled header of a second."""
+    """First default solve: few modules, no unused kernel.
+
+    A module costs 0.04 CPU s, a kernel 0.03 to 0.3, each set of flags a precompiled header of a
+    second.
+    """
     run = subprocess.run(
         [sys.executable, "-c", FIRST_SOLVE], capture_output=True, text=True, check=True
     )

@@ -1,4 +1,7 @@
-"""Launches whose arguments are patched in memory of the device, as CUDA graphs hold them; here on the CPU, against NumPy."""
+"""Launches with arguments patched in device memory, as in CUDA graphs.
+
+The launches run on the CPU here and are compared with NumPy.
+"""
 
 from dataclasses import replace
 
@@ -25,12 +28,12 @@ def add_kernel(i, values: wp.array(dtype=wp.float32), change: float):
 
 @cell_kernel("test_device_graph.mark")
 def mark_kernel(k, j, i, factor: float, field: F32):
-    """Add a number that tells the cell."""
+    """Add a number that identifies the cell."""
     field[k, j, i] = field[k, j, i] + factor * float(100 * k + 10 * j + i)
 
 
 def boxes(seed: int, count: int) -> list[tuple[tuple[int, int, int], tuple[int, int, int]]]:
-    """Return random boxes within the grid, empty ones too, after the whole of it."""
+    """Return the whole grid and random boxes within it, empty ones too."""
     rng, made = np.random.default_rng(seed), [((0, 0, 0), SHAPE)]
     for _ in range(count):
         corners = np.sort([[rng.integers(0, n + 1), rng.integers(0, n + 1)] for n in SHAPE], axis=1)

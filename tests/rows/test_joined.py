@@ -1,4 +1,7 @@
-"""Recorded stretches whose graphs are joined run in order with all that stands between them; only with the plugin `emulated_cuda`."""
+"""Joined graphs of recorded stretches, in order with everything between them.
+
+The tests run with the plug-in `emulated_cuda` only.
+"""
 
 import gc
 import itertools
@@ -30,23 +33,23 @@ DEVICE = wp.get_device("cpu")
 
 @wp.kernel(enable_backward=False, module="test_joined")
 def affine_kernel(x: wp.array(dtype=wp.float64), factor: wp.float64, shift: wp.float64):  # type: ignore[valid-type]
-    """x = factor x + shift: two of them do not commute."""
+    """Set x = factor x + shift; two of these do not commute."""
     i = wp.tid()
     x[i] = factor * x[i] + shift
 
 
 @wp.kernel(enable_backward=False, module="test_joined")
 def add_kernel(x: wp.array(dtype=wp.float64), more: wp.array(dtype=wp.float64)):  # type: ignore[valid-type]
-    """x += more."""
+    """Add `more` to x."""
     i = wp.tid()
     x[i] += more[i]
 
 
 class Chain:
-    """Stretches x = factor x + shift on an array of the device, beside the same on the host.
+    """Stretches x = factor x + shift on the device, with the same on the host.
 
     Args:
-        factors: of each stretch.
+        factors: factor of each stretch.
     """
 
     def __init__(self, factors: list[float]) -> None:
@@ -81,7 +84,7 @@ def chain(monkeypatch: pytest.MonkeyPatch) -> Iterator[Chain]:
 
 
 def calls_of(step: Callable[[], None]) -> int:
-    """Return the launches of Python in a step that has come before."""
+    """Return the launches by Python in a step that has run before."""
     from benchmarks.emulated_cuda import meter
 
     step()
@@ -93,7 +96,11 @@ def calls_of(step: Callable[[], None]) -> int:
 
 @emulated
 def test_arrays_of_the_host_are_sent_in_order(chain: Chain) -> None:
-    """A stretch reads what was sent last before it, also where the same array is sent several times in a step; sending is no launch."""
+    """Host arrays, sent in order.
+
+    A stretch reads what was sent last before it, also where the same array is sent several times in
+    a step. Sending is no launch.
+    """
     sent = HostArray(3, wp.float64, DEVICE)
     adding = LaunchGraph(
         DEVICE, lambda: launch(add_kernel, 3, [chain.x, sent.array], device=DEVICE)
@@ -236,11 +243,15 @@ def test_graphs_go_with_their_stretches(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_no_function_of_warp_is_held_from_before_it_settles() -> None:
-    """A default argument or a partial would hold the function of Warp that knows of nothing that waits."""
+    """No reference to functions of Warp from before their replacement.
+
+    A default argument or a partial would hold the original function, which ignores deferred
+    launches.
+    """
     held = []
     for folder in ("warp_lcp", "fluids", "granular"):
         for file in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
-            if "distributed" not in file.parts:  # graphs of steps are of one process
+            if "distributed" not in file.parts:  # graphs of steps exist in one process only
                 held += [
                     f"{file.name}: {line.strip()}"
                     for line in file.read_text().splitlines()

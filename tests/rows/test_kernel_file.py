@@ -1,4 +1,4 @@
-"""Declarations of kernels in headers: what they become, what is wrong in them, and that each is taken by Python."""
+"""Declarations of kernels in headers: results, errors, and use in Python."""
 
 import re
 from pathlib import Path
@@ -106,7 +106,7 @@ for (int k = 0; k < n; ++k) y[k] = ({factor})*x[k];
         *(wp.zeros(4, dtype=wp.int32, device=device) for _ in range(2)),
     )
     a = first.bind(rows, x=x, y=y)
-    # before either is launched
+    # Before either is launched.
     assert sorted(a.form.run.module.kernels) == ["mine_first", "mine_second"]
     b = second.bind(rows, x=x, y=z)
     assert b.form.run.module is a.form.run.module
@@ -136,7 +136,7 @@ def test_errors_of_the_compiler_name_the_line_in_the_header(header):
     path = header(EVERY)
     lines, source = text(path, "mine.list.box").splitlines(), path.read_text().splitlines()
     number, seen = 0, list[str]()
-    for line in lines:  # what stands in a line is what the header has there
+    for line in lines:  # the text of a line is that of the header
         if found := re.fullmatch(r'#line (\d+) "area.h"', line):
             number = int(found[1])
             continue
@@ -249,7 +249,11 @@ def opened(module: Path) -> list[Path]:
 
 
 def test_every_kernel_and_snippet_is_taken():
-    """By its name, or the last word of it, as families put names together; `test_cuda_compiles.py` takes all of them."""
+    """Use of every kernel and snippet by Python.
+
+    By its name, or the last word of it, as families compose names; `test_cuda_compiles.py` takes
+    all of them.
+    """
     users = {header for source in SOURCES for header in opened(source)}
     assert len(users) > 35
     headers = [path for path in HEADER_FILES if path.parent != HEADERS] + [
@@ -277,7 +281,7 @@ def test_headers_are_of_areas():
 
 
 def test_python_declares_no_roles():
-    """Row passes are made by `kernel_file.py` alone, so that a kernel stands in one place."""
+    """Row passes made by `kernel_file.py` alone, so that a kernel stands in one place."""
     for path, source in SOURCES.items():
         assert path.name == "kernel_file.py" or not re.search(
             r"^[^#\n]*\b(?<!class )RowPass\(", source, re.MULTILINE

@@ -1,4 +1,4 @@
-"""What a script that uses the library says of its kernels: one line while they compile for the first time, nothing else."""
+"""Messages about kernels: one line while they compile for the first time."""
 
 import io
 import os
@@ -25,7 +25,7 @@ MODULE = "Module {} 0f1e2d3 load on device '{}' took 12.34 ms  ({})"
 
 
 class Said:
-    """A logger that remembers."""
+    """Logger that stores messages."""
 
     def __init__(self) -> None:
         self.messages: list[str] = []

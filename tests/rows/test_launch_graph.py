@@ -1,4 +1,7 @@
-"""Launches that are recorded once: what changes between runs is read from memory, and results are those of launching at once."""
+"""Recorded launches.
+
+Values that change between runs are read from memory; results are those of immediate launches.
+"""
 
 import functools
 import math
@@ -31,7 +34,10 @@ def threads(request):
 
 @pytest.fixture
 def guarded(monkeypatch):
-    """Record again in each run and compare; refuse direct launches and reads while recording."""
+    """Record again in each run and compare.
+
+    Direct launches and reads are refused while recording.
+    """
     monkeypatch.setattr(LaunchGraph, "verify", True)
 
     def refuse(owner, name):
@@ -61,7 +67,11 @@ def window(rng: np.random.Generator, *, sparse: bool) -> Window:
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_a_recorded_window_is_that_of_the_run(threads, sparse):
-    """Cells, rows of sums and numbers of a graph that is recorded for one window are those of the window in which it runs."""
+    """Recorded window: that of the run.
+
+    Cells, rows of sums and numbers of a graph that is recorded for one window are those of the
+    window in which it runs.
+    """
     rng = np.random.default_rng(11 + sparse)
     weight = wp.array(rng.uniform(0.0, 1.0, GRID.shape).astype(np.float32))
     kind = wp.array(rng.choice(np.array([AIR, FLUID, SOLID], dtype=np.int8), GRID.shape))
@@ -90,7 +100,11 @@ def test_a_recorded_window_is_that_of_the_run(threads, sparse):
 
 
 def test_a_recorded_list_is_that_of_the_run(threads, guarded):
-    """Passes over particles take as many as there are when they run, from the arrays in which these then lie."""
+    """Recorded list: that of the run.
+
+    Passes over particles take as many as there are when they run, from the arrays that then hold
+    them.
+    """
     rng = np.random.default_rng(5)
 
     def points(count: int) -> np.ndarray:
@@ -127,7 +141,11 @@ def test_a_recorded_list_is_that_of_the_run(threads, guarded):
 
 
 def test_numbers_are_read_when_launches_run():
-    """A kernel reads a number in its own type, products of it too; a launch at once takes it as it is."""
+    """Numbers are read when launches run.
+
+    A kernel reads a number in its own type, and products of it too; an immediate launch takes it as
+    it is.
+    """
     number = Scalar(3.0)
     third = scaled(number, 1.0 / 3.0)
     assert scaled(2.0, 0.5) == 1.0
@@ -181,7 +199,10 @@ def test_variants_are_recorded_for_themselves():
 
 
 def test_a_recording_outlives_its_team():
-    """Threads are set to others and back: the recording is valid, the team is another one."""
+    """Recording after a change of the thread pool.
+
+    The number of threads changes and changes back: the recording is valid, the pool is another one.
+    """
     before, a = wl.get_threads(), wp.ones(3, dtype=wp.float32)
     graph = LaunchGraph(a.device, lambda: clear(a))
     try:
@@ -196,7 +217,7 @@ def test_a_recording_outlives_its_team():
 
 
 def test_a_changed_recording_is_found(guarded):
-    """`verify` finds an array that was replaced without a slot."""
+    """Changed recording: `verify` finds a replaced array without a slot."""
     fields = [wp.zeros(3, dtype=wp.float32), wp.zeros(3, dtype=wp.float32)]
     graph = LaunchGraph(fields[0].device, lambda: clear(fields[0]))
     graph.run()
@@ -207,7 +228,10 @@ def test_a_changed_recording_is_found(guarded):
 
 
 def pairwise(values: list[float]) -> float:
-    """Add up as NumPy does: 8 accumulators over up to 128 values, halves beyond."""
+    """Return the sum as NumPy computes it.
+
+    NumPy has 8 accumulators over up to 128 values, and adds halves beyond.
+    """
     if len(values) < 8:
         total = -0.0
         for value in values:
@@ -231,7 +255,11 @@ def pairwise(values: list[float]) -> float:
     "counts", [(7, 5, 1), (9, 11, 37), (5, 130, 1), (6, 60, 150), (3, 260, 40)]
 )
 def test_rows_are_added_up_pairwise(counts):
-    """Sums of rows have the bits of pairwise summation over the rows of the box in order, in parts that fit 8192 values."""
+    """Pairwise sums of rows.
+
+    They have the bits of pairwise summation over the rows of the box in order, in parts that fit
+    8192 values.
+    """
     rng = np.random.default_rng(sum(counts))
     grid = StaggeredGrid(counts, 0.1, 2 if counts[2] == 1 else 3)
     host = {"base": np.full(grid.shape, AIR, dtype=np.int8)}
@@ -272,7 +300,7 @@ SCENES = {
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_step_records_nothing_that_changes(scene, guarded):
-    """The recorded launches of a step do not change from step to step."""
+    """Recorded launches of a step, unchanged from step to step."""
     resolution, _ = SCENES[scene]
     run = wl.Run(scene, resolution=resolution, device="cpu")
     simulation = next(iter(run)).simulation

@@ -1,4 +1,7 @@
-"""What passes, rows, waves and sequences refuse, and what they do at the edges: memory, names, empty grids, stages that are left out."""
+"""Refusals and edge cases of passes, rows, waves and sequences.
+
+Memory, names, empty grids, omitted stages.
+"""
 
 import gc
 import weakref
@@ -67,7 +70,7 @@ def test_elements_lie_side_by_side_on_the_rows_device(double):
 
 @dataclass(frozen=True, slots=True)
 class Fields:
-    """More than a kernel takes: arrays of any length."""
+    """More fields than a kernel takes: arrays of any length."""
 
     x: Any
     y: Any
@@ -76,7 +79,7 @@ class Fields:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One member alone."""
+    """Single field."""
 
     y: Any
 
@@ -182,7 +185,7 @@ def test_what_else_cannot_be_declared(row_pass):
         TypeError, match=r"misuse\.wrong: \['v'\]: expected numbers of the types float32, "
     ):
         row_pass("wrong", ";", writes={"y": "S"}, numbers={"v": wp.uint8})
-    with pytest.raises(ValueError, match=r"misuse\.wrong: \['x'\]"):  # whose shape s1 and s2 are
+    with pytest.raises(ValueError, match=r"misuse\.wrong: \['x'\]"):  # s1 and s2 are its shape
         row_pass("wrong", ";", wp.float64, box={"x": wp.float64, "y": wp.float64}, optional=("x",))
     with pytest.raises(
         TypeError, match=r"misuse\.halves: y is float16: a letter stands for uint8, "
@@ -246,7 +249,7 @@ def test_grids_without_cells_are_left_alone(add, row_pass):
         y = zeros(rows.size)
         bound = add.bind(rows, y=y)
         bound.launch()
-        Sequence("test_misuse.none", [bound]).launch()  # a division by no rows ended the process
+        Sequence("test_misuse.none", [bound]).launch()  # a division by 0 rows crashed the process
         assert not y.numpy().any() and rows.places == 0
 
 
@@ -282,7 +285,10 @@ def test_waves_reach_all_planes_whatever_is_left_out(add):
 
 @pytest.mark.parametrize("planes", [1, 3, 4, 5])
 def test_a_wave_visits_a_coarse_plane_once(add, row_pass, planes):
-    """The last stage is so far behind that the wave goes on after the last fine plane."""
+    """Wave that visits each coarse plane once.
+
+    The last stage is so far behind that the wave continues after the last fine plane.
+    """
     count = row_pass("count", EACH + "c[k] += x[2*k];", writes={"c": "S"}, other={"x": "S"})
     fine, coarse = (
         Rows.of(Padding(counts), CPU) for counts in ((planes, 4, 4), ((planes + 1) // 2, 2, 2))

@@ -14,7 +14,7 @@ DEVICE = wp.get_device("cpu")
 
 
 class Others:
-    """Somebody who has three times as much of everything."""
+    """Communicator whose other ranks have three times this rank's values."""
 
     def sum(self, values):
         return 4.0 * np.asarray(values)
@@ -45,14 +45,14 @@ def test_sums_are_of_all_parts():
 
 @wp.kernel(enable_backward=False, module="test_program")
 def count_down_kernel(left: wp.array(dtype=wp.int32), odd: wp.array(dtype=wp.int32)):
-    """One run less is left."""
+    """Reduce the number of remaining runs by one."""
     left[0] = left[0] - 1
     odd[0] = left[0] % 2
 
 
 @pytest.fixture(params=[1, 2, 3, 7])
 def threads(request, monkeypatch):
-    """Have so many threads, and cut what is small."""
+    """Set the number of threads, and split small work too."""
     before = wl.get_threads()
     wl.set_threads(request.param)
     for module in ("team", "wave", "program"):
@@ -62,7 +62,10 @@ def threads(request, monkeypatch):
 
 
 def counting(left: wp.array, odd: wp.array) -> tuple[Program, wp.array, wp.array]:
-    """Return a program that adds 1 to a field in each run, and doubles another after every odd number of runs left."""
+    """Return a program that adds 1 to a field in each run.
+
+    It doubles another field after every odd number of remaining runs.
+    """
     ones, a, b = (
         wp.full(5000, value, dtype=wp.float64, device=DEVICE) for value in (1.0, 0.0, 1.0)
     )
@@ -77,7 +80,10 @@ def counting(left: wp.array, odd: wp.array) -> tuple[Program, wp.array, wp.array
 @pytest.mark.cpu_form("the team is the CPU's")
 @pytest.mark.parametrize("runs", [0, 1, 2, 9])
 def test_a_loop_runs_while_its_condition_holds(runs, threads, monkeypatch):
-    """The same where native code comes back every few microseconds."""
+    """Loop that runs while its condition holds.
+
+    The same if native code returns every few microseconds.
+    """
     left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
     assert loops_on_device(DEVICE)
     program, a, b = counting(left, odd)
@@ -97,7 +103,10 @@ def test_a_loop_runs_while_its_condition_holds(runs, threads, monkeypatch):
 
 @pytest.mark.cpu_form("the team is the CPU's")
 def test_a_loop_ends_with_what_has_failed_in_it(threads):
-    """As an exchange between ranks, after which the condition may never be 0."""
+    """Loop that ends with an error inside it.
+
+    As an exchange between ranks, after which the condition may never be 0.
+    """
     left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
     program, a, _ = counting(left, odd)
 

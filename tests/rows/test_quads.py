@@ -1,4 +1,7 @@
-"""Passes whose threads take four cells of a row, on CUDA, against the same by single cells; only with the plugin `emulated_cuda`."""
+"""Quad passes, four cells of a row per thread, against single cells.
+
+They run as on CUDA, with the plug-in `emulated_cuda` only.
+"""
 
 import os
 import sys
@@ -19,13 +22,16 @@ EMULATED = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
 )
 SEEDS = [1, 2, int(os.environ.get("SEED", "3414447061"))]  # SEED=... draws other grids
-# of rows: full quads alone, with some cells left, and none
+# Widths of rows: full quads alone, with some cells left, and none.
 WIDTHS = (1, 2, 3, 4, 5, 7, 8, 11, 13, 18, 30)
 
 
 @pytest.fixture
 def checked(monkeypatch):
-    """Have each pass by quads run by cells as well; return the counts of launches and of differences."""
+    """Run each quad pass by cells as well.
+
+    Return the counts of launches and of differences.
+    """
     from benchmarks import emulated_cuda
 
     monkeypatch.setattr(
@@ -40,7 +46,10 @@ def checked(monkeypatch):
 
 
 def drawn_problem(seed):
-    """Return a problem on a grid of an odd width, with periodic sides, holes, spans or fields of coefficients, as it comes."""
+    """Return a problem on a grid of an odd width.
+
+    With random periodic sides, holes, spans or fields of coefficients.
+    """
     rng = np.random.default_rng(seed)
     shape = (*rng.integers(2, 7, 2), rng.choice(WIDTHS))
     cells = np.where(rng.random(shape) < 0.85, wl.FLUID, rng.choice([wl.SOLID, wl.AIR], shape))
@@ -71,7 +80,7 @@ def test_fields_have_the_bits_of_a_thread_a_cell(seed, checked):
     launched, otherwise = checked
     problem = drawn_problem(seed)
     stopping = wl.StoppingCriteria(rtol=1e-6, max_iterations=8)
-    # small levels launch by launch, transfers too
+    # Small levels launch by launch, transfers too.
     cycle = CycleSettings(one_launch_cuda=0, coarsest_cuda=2)
     multigrid = (wl.ProjectedMultigrid(), wl.ProjectedMultigrid(cycle=cycle))
     for method in (
@@ -111,7 +120,10 @@ for (int k = 0; k < n; ++k) if (z[k] > 700000) { z[k] = -z[k]; changed[P.row] = 
 @EMULATED
 @pytest.mark.parametrize("seed", SEEDS)
 def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
-    """Such sums are exact in every order: no cell is left out, and none counts twice."""
+    """Equal sums of whole numbers.
+
+    They are exact in every order: no cell is left out, and none counts twice.
+    """
     (tmp_path / "quads.h").write_text(HEADER)
     kernel, rng, device = (
         KernelFile(tmp_path / "quads.h")["quads.whole"],

@@ -1,4 +1,7 @@
-"""Row passes against NumPy: pieces, chunks and spans, sums, transfers, waves; and what is said of a launch that is wrong."""
+"""Row passes against NumPy.
+
+Row segments, chunks and spans, sums, transfers, waves; messages about wrong launches.
+"""
 
 from pathlib import Path
 
@@ -92,7 +95,10 @@ def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
     ids=str,
 )
 def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
-    """The second is what CUDA has: thread t sums elements t, t + 64, ...; 1000 is no multiple of 64."""
+    """Flat field on one thread, or strided over many.
+
+    The second is CUDA's way: thread t sums elements t, t + 64, ...; 1000 is no multiple of 64.
+    """
     squares = row_pass(
         tmp_path,
         "squares",
@@ -117,7 +123,11 @@ def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
 
 @pytest.mark.cpu_form("how many cells a thread takes")
 def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
-    """As on CUDA: a cell a thread, several planes a place for sums; cells outside the spans are not visited."""
+    """Slabs, chunks and spans that share the same cells.
+
+    As on CUDA: a thread per cell, and one place for the sums of several planes; cells outside the
+    spans are not visited.
+    """
     A, _, x, _ = scene(wp.float64, {})
     whole, y = wp.zeros_like(x), wp.zeros_like(x)
     out = wp.zeros(5 * 6 * 37, dtype=wp.float64, device="cpu")
@@ -187,7 +197,11 @@ def test_a_wave_is_its_passes_one_after_another(product, tmp_path):
 
 
 def test_fields_of_another_level_and_of_ghost_cells(tmp_path):
-    """The aggregate of each cell is found, on either side; ghost cells are visited without the cells beside them."""
+    """Fields of another level, and ghost cells.
+
+    The aggregate of each cell is found, on either side; ghost cells are visited without their
+    neighbors.
+    """
     inject = row_pass(
         tmp_path,
         "inject",
@@ -253,7 +267,11 @@ def test_a_wrong_launch_is_named(product, change, error, message):
 
 
 def test_a_changed_header_is_compiled_anew(tmp_path):
-    """Headers go in as text, so that Warp's hash covers what they include; the compiler still knows file and line."""
+    """Recompilation of a changed header.
+
+    Headers are inserted as text, so that Warp's hash covers included ones; the compiler still
+    reports file and line.
+    """
     hashes = []
     for value in (1, 2):
         folder = tmp_path / str(value)

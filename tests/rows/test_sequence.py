@@ -1,4 +1,7 @@
-"""Passes in one launch: each sees what those before it wrote, however many threads share the rows."""
+"""Passes in one launch: each reads the results of those before it.
+
+Any number of threads may share the rows.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ COUNTS = (3, 4, 21)
 
 @pytest.fixture(scope="module")
 def passes(tmp_path_factory):
-    """y = x + below, and x = factor y; below is the row under this one."""
+    """Return y = x + below, and x = factor y; `below` is the row under this one."""
     folder = tmp_path_factory.mktemp("headers")
     (folder / "add.h").write_text("for (int k = 0; k < n; ++k) y[k] = x[k] + x[k + ym];\n")
     (folder / "scale.h").write_text("for (int k = 0; k < n; ++k) x[k] = factor*y[k];\n")
@@ -50,10 +53,10 @@ def test_stages_follow_each_other(passes, cells, threads):
     )
     sequence = Sequence("test_sequence.all", [adding, halving, adding, adding, doubling])
     assert len(sequence.tables.order) == 5
-    assert len(sequence.tables.pieces0) == 1  # what is the same object is kept once
+    assert len(sequence.tables.pieces0) == 1  # equal objects are stored once
     if threads == 1:
         sequence.launch()
-    else:  # barriers are CUDA's: here a launch a stage stands for them
+    else:  # barriers are CUDA's: a launch per stage replaces them here
         for i in range(5):
             wp.launch(sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu")
     expected, inner = host, (slice(1, -1),) * 3

@@ -1,4 +1,7 @@
-"""A team of threads: the bits of one, whoever calls, forks, interrupts or leaves; and the same without it."""
+"""Thread pool: the bits of one thread, whatever interrupts, forks or leaves.
+
+The results without a pool are the same.
+"""
 
 import math
 import os
@@ -31,7 +34,7 @@ pytestmark = pytest.mark.cpu_form("the team is the CPU's")
 
 @pytest.fixture(autouse=True)
 def threads_as_before():
-    """Leave as many threads as there were."""
+    """Restore the number of threads."""
     before = wl.get_threads()
     yield
     wl.set_threads(before)
@@ -39,7 +42,7 @@ def threads_as_before():
 
 @pytest.fixture
 def small_pieces(monkeypatch):
-    """Cut what is small, too."""
+    """Split small work, too."""
     monkeypatch.setattr(team, "CELLS", 64)
     monkeypatch.setattr("warp_lcp.rows.wave.CELLS", 64)
     monkeypatch.setattr("warp_lcp.rows.program.CELLS", 64)
@@ -65,7 +68,10 @@ def test_bits_do_not_depend_on_the_number_of_threads(method, bounds, small_piece
 
 
 def passes(folder) -> tuple[RowPass, RowPass, RowPass]:
-    """What a wave must get right: x moves in place, t is what is beside x then, in a ring of planes, x what is beside t."""
+    """Return passes that a wave must keep in order.
+
+    x moves in place; t is the neighbors of x then, in a ring of planes, and x those of t.
+    """
     (folder / "move.h").write_text("for (int k = 0; k < n; ++k) x[k] += 1 + P.k;\n")
     (folder / "into.h").write_text(
         "for (int k = 0; k < n; ++k) t[k] = x[k] + x[k + zm] - 2*x[k + zp];\n"
@@ -96,7 +102,10 @@ def passes(folder) -> tuple[RowPass, RowPass, RowPass]:
 
 @pytest.mark.parametrize("planes", [3, 22, 23, 47, 64])
 def test_slabs_of_a_wave_are_one_stream(planes, tmp_path, small_pieces):
-    """Whole numbers, so that a plane that is missed, done twice or done too early shows."""
+    """Slabs of a wave as one stream.
+
+    Whole numbers, so that a missed, repeated or early plane shows.
+    """
     move, into, out = passes(tmp_path)
     padding = Padding((planes, 5, 9))
     rows = Rows.of(padding, CPU)
@@ -146,7 +155,11 @@ def test_slabs_fill_their_threads(planes, threads):
     [(1, 1), (9, 30000), (68, 65536), (500, 98), (1850, 98), (10**6, 1), (10**6, 20)],
 )
 def test_pieces_of_a_pass_are_as_many_for_each_thread(tasks, cells, threads):
-    """Pieces cover all tasks, none is small, and the thread with the most has hardly more than its share."""
+    """Pieces of a pass, equal for each thread.
+
+    They cover all tasks, none is small, and the thread with the most has hardly more than its
+    share.
+    """
     wl.set_threads(threads)
     stage = team.Stage.__new__(team.Stage)
     stage.tasks, stage.words = tasks, (0,) * 10
@@ -237,7 +250,10 @@ def test_the_interpreter_ends_with_the_team():
 
 
 def test_an_interruption_is_heard_between_pieces():
-    """A table that would take minutes ends soon after Ctrl-C, and the next solve is right."""
+    """Interruption between pieces.
+
+    A table that would take minutes ends soon after Ctrl-C, and the next solve is right.
+    """
     done = run_python(
         SOLVE
         + """
@@ -308,7 +324,10 @@ def test_a_table_keeps_no_arrays_once_it_is_gone():
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize("control", [False, True])
 def test_threads_race_for_nothing(control, tmp_path):
-    """ThreadSanitizer finds no race in the team, and finds the one that slabs without gaps between them would be."""
+    """Races of threads, by ThreadSanitizer.
+
+    It finds none in the pool, and finds the race of slabs without gaps between them.
+    """
     source, program = Path(__file__).parent / "native" / "team.cpp", tmp_path / "team"
     text = source.read_text().replace(
         "stage(next, &none, 1)", f"stage(next, &none, {0 if control else 1})"
@@ -339,7 +358,7 @@ def test_threads_race_for_nothing(control, tmp_path):
 
 @wp.struct
 class Mixed:
-    """Members of several sizes, with a gap between them."""
+    """Struct of several sizes, with a gap between members."""
 
     flag: wp.bool
     values: wp.array(dtype=wp.float64)
@@ -349,7 +368,7 @@ class Mixed:
 
 @wp.struct
 class Small:
-    """Members of four bytes, and so aligned."""
+    """Struct of four-byte members, aligned accordingly."""
 
     count: int
     weight: float
@@ -373,12 +392,15 @@ def packing_kernel(
     c: wp.array2d(dtype=wp.vec2i),
     last: bool,
 ):
-    """a[n] = y, of arguments of all kinds."""
+    """Set a[n] = y, with arguments of all kinds."""
     a[n] = y
 
 
 def drawn_arguments(rng):
-    """Return arguments of `packing_kernel`: arrays, some of them strided or empty, vectors, a struct, numbers."""
+    """Return arguments of `packing_kernel`.
+
+    They are arrays, some of them strided or empty, vectors, a struct, and numbers.
+    """
     m, small, sizes = Mixed(), Small(), rng.integers(0, 6, 7)
     small.count, small.weight, small.place = (
         int(rng.integers(9)),
@@ -417,7 +439,11 @@ def drawn_arguments(rng):
 
 
 def test_arguments_are_packed_as_warp_packs_them():
-    """Arguments of all kinds that the team packs by itself; whatever else comes is left to Warp, which converts or refuses it."""
+    """Packed arguments against Warp's.
+
+    Arguments of all kinds that the pool packs itself; all others are left to Warp, which converts
+    or refuses them.
+    """
     signature = team.signature_of(packing_kernel)
     for seed in range(50):
         inputs = drawn_arguments(np.random.default_rng(seed))

@@ -1,4 +1,4 @@
-"""What `check` says of a run before it begins, against the run."""
+"""Estimates of `check` against the run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ def call(*arguments: object) -> Result:
     ("name", "every"), [("dam-break-2d", 0), ("dam-break", 1), ("mesh-obstacle", 1)]
 )
 def test_the_parts_add_up_to_what_a_simulation_takes(name: str, every: int) -> None:
-    """Without the table the density correction takes its part when it first acts."""
+    """Sum of the parts: memory of a simulation.
+
+    Without its table the density correction allocates its part when it first acts.
+    """
     scene = load_scene(name, [f"density_correction.every={every}"])
     forget_peak()
     before = array_bytes()
@@ -108,7 +111,7 @@ def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(
 ) -> None:
     found = devices.free_memory("cpu")
     assert found is None or found > 2**20
-    # of the machine, and of a limit that this process may have
+    # Limits of the machine, and of this process.
     for source in ("MEMORY", "OWN_SIZE"):
         monkeypatch.setattr(claims, source, tmp_path / "nothing")
     assert devices.free_memory("cpu") is None

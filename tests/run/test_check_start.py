@@ -1,4 +1,8 @@
-"""`check` refuses what a run refuses before its first step, says what a run says at its start, and foretells no fewer particles."""
+"""Messages of `check` before a run.
+
+It refuses what a run refuses before its first step, gives the messages of a run's start, and does
+not underestimate the number of particles.
+"""
 
 from __future__ import annotations
 
@@ -138,7 +142,7 @@ def assert_foretold(scene: Scene, steps: int) -> None:
 
 
 def generated(chance: random.Random) -> dict[str, Any]:
-    """A scene of boxes and balls that lie anywhere, with or without sources."""
+    """Return a scene of boxes and balls anywhere, with or without sources."""
 
     def shape() -> dict[str, Any]:
         low = [chance.uniform(0.0, 0.7), chance.uniform(0.0, 0.7)]

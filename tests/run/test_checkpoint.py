@@ -143,13 +143,17 @@ def test_a_failed_write_leaves_the_file_as_it_was(tmp_path):
 
 
 def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
-    """Bits of the zip's directory: what they change is the kind of an array's packing, its place, size, name and checksum."""
+    """Cost of a flipped bit: at most one checkpoint.
+
+    Bits of the zip's directory change the kind of an array's packing, its place, size, name and
+    checksum.
+    """
     folder.write(Checkpoint(20, 0.5, STATE))
     path = folder.path(20)
     good = path.read_bytes()
     found = {20: 0, 12: 0}
     begin = good.index(b"PK\x01\x02")
-    # all of the version, the flags and the packing
+    # All bits of the version, the flags and the packing.
     first = [(begin + number // 8, number % 8) for number in range(8 * 16)]
     for at, bit in [*first, *((at, at % 8) for at in range(begin, len(good), 11))]:
         path.write_bytes(good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :])
@@ -159,7 +163,7 @@ def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
         for name, array in STATE.items():
             np.testing.assert_array_equal(newest.state[name], array)
         assert len(refused) == (newest.step == 12)
-    assert min(found.values()) > 20  # a date, say, is of no importance
+    assert min(found.values()) > 20  # a date, for example, does not matter
 
 
 @pytest.mark.parametrize(

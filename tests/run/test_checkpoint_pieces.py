@@ -1,4 +1,4 @@
-"""Checkpoints in pieces: when they count, what becomes of old and damaged ones, and who continues them."""
+"""Checkpoints in parts: validity, old and damaged ones, resuming."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_a_rank_writes_its_piece_and_then_the_whole(tmp_path):
         piece["velocity"]
     assert folder.complete(found)
     before = (tmp_path / "c" / "rank_0000" / "step_000004.npz").stat().st_mtime_ns
-    folder.write(Checkpoint(4, 0.5, state(0, 4)))  # the one that the run goes on from stays
+    folder.write(Checkpoint(4, 0.5, state(0, 4)))  # the one that the run resumed from stays
     assert (tmp_path / "c" / "rank_0000" / "step_000004.npz").stat().st_mtime_ns == before
 
 

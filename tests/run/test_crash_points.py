@@ -1,4 +1,4 @@
-"""A run that is killed before any one of its operations on files, resumed, is the run that was not."""
+"""Runs killed before any file operation and resumed: equal to uninterrupted ones."""
 
 import csv
 import json
@@ -22,12 +22,12 @@ from warp_lcp.scene.scene_file import load_scene
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"),
-    # the child runs NumPy and its own threads
+    # The child runs NumPy and its own threads.
     pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
 ]
 
 SHORT = ["time.duration=0.1", "output.checkpoint_every=2", "output.checkpoints_kept=2"]
-# audit events: raised before the system is asked
+# Audit events are raised before the system call.
 OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
 
 
@@ -37,7 +37,10 @@ def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: boo
 
 
 def contents(out: Path) -> dict[str, Any]:
-    """Return what equal runs have in common: frames, collections, the log but for its seconds, checkpoints, the scene."""
+    """Return the common contents of equal runs.
+
+    They are frames, collections, the log without seconds, checkpoints, and the scene.
+    """
     found: dict[str, Any] = {
         str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]
     }
@@ -54,14 +57,17 @@ def contents(out: Path) -> dict[str, Any]:
 
 
 def killed(run: Callable[[], Any], folder: Path, operation: int) -> bool:
-    """Run in a child that dies before its `operation`-th operation on a file of the folder; return whether it got that far."""
+    """Run in a child that dies before its `operation`-th file operation.
+
+    Return whether it got that far.
+    """
     child = os.fork()
     if child == 0:
         left = [operation]
 
         def hook(event: str, arguments: tuple) -> None:
             name = str(arguments[0]) if event in OPERATIONS else ""
-            # a temporary file's, relative to its folder
+            # A temporary file's name, relative to its folder.
             if name and (name.startswith(str(folder)) or name.endswith(SUFFIX)):
                 left[0] -= 1
                 if left[0] == 0:
@@ -77,7 +83,7 @@ def killed(run: Callable[[], Any], folder: Path, operation: int) -> bool:
 
 
 def revive(scene: Path, out: Path) -> int:
-    """Resume, or begin if the run had not begun; return the step that it went on from."""
+    """Resume, or begin a run that had not begun; return the first step."""
     try:
         resumed = go(scene, out, resume=True)
     except OutputError as error:
@@ -93,7 +99,10 @@ def revive(scene: Path, out: Path) -> int:
 
 
 def crash_everywhere(scene: Path, folder: Path, stride: int) -> list[int]:
-    """Kill a run at every `stride`-th operation and compare what is resumed; return the steps resumed from."""
+    """Kill a run at every `stride`-th operation and compare the resumed one.
+
+    Return the steps resumed from.
+    """
     whole = folder / "whole"
     go(scene, whole)
     expected, steps = contents(whole), []
@@ -116,7 +125,7 @@ def test_killed_anywhere(scene_file, tmp_path):
 def test_killed_everywhere(scene_file, tmp_path):
     steps = crash_everywhere(scene_file, tmp_path, 1)
     assert len(steps) > 80
-    assert steps == sorted(steps)  # the later it is killed the later it goes on
+    assert steps == sorted(steps)  # the later it is killed, the later it resumes
 
 
 @pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.slow)])
@@ -138,7 +147,10 @@ def test_killed_while_it_resumes(scene_file, tmp_path, stride):
 
 @pytest.mark.parametrize("stride", [6, pytest.param(1, marks=pytest.mark.slow)])
 def test_killed_while_force_deletes(scene_file, tmp_path, stride):
-    """Another run lay in the folder: its steps are not continued, nor are its files left over."""
+    """Runs killed while --force deletes another run.
+
+    Its steps are not continued, and none of its files remains.
+    """
     go(scene_file, tmp_path / "whole")
     expected, count, other = contents(tmp_path / "whole"), 0, tmp_path / "other"
     go(scene_file, other, "physics.density=900.0", "time.duration=0.15")

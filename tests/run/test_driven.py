@@ -1,4 +1,4 @@
-"""Runs that Python drives: the bits of the command line's, what callbacks change, and what is refused."""
+"""Runs driven from Python: bits of the command line's, callbacks, refusals."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ POOL = {
     "domain": {"size": (1.0, 0.5), "resolution": 24},
     "liquid": [{"shape": "box", "min": np.array([0.0, 0.0]), "max": [1.0, 0.2]}],
 }
-# two steps a frame
+# Two steps per frame.
 FINE = {**POOL, "time": {"duration": 0.2, "frames_per_second": 50, "dt_max": 0.012}}
 CRATE = {
     **POOL,
@@ -35,7 +35,10 @@ SHORT = {"duration": 0.1, "resolution": 32}
 
 
 def contents(folder: Path) -> dict:
-    """Return what equal runs have in common: frames, collections, the log but for its times, and what checkpoints hold."""
+    """Return the common contents of equal runs.
+
+    They are frames, collections, the log without times, and checkpoints.
+    """
     found = {
         str(p.relative_to(folder)): p.read_bytes()
         for p in [*folder.glob("frames/*"), *folder.glob("*.pvd"), folder / "scene.toml"]
@@ -163,7 +166,10 @@ def fail() -> None:
 
 
 def test_a_callback_that_fails_in_any_step_costs_no_frame(tmp_path):
-    """Of the steps some end a frame: the run that goes on writes it, and hands it to its loop."""
+    """Callback that fails in any step: no frame is lost.
+
+    Some of the steps end a frame: the resumed run writes it and passes it to its loop.
+    """
     whole = tmp_path / "whole"
     steps = [
         (frame.index, frame.row["step"])
@@ -197,7 +203,7 @@ def test_a_frame_of_which_a_file_was_deleted_is_written_again(tmp_path):
     assert [frame.index for frame in run] == [2]
     assert not [warning for warning in run.record.warnings if "missing" in warning]
     assert without_checkpoints(out) == without_checkpoints(whole)
-    (out / "frames" / "grid_000001.vtu").unlink()  # before the checkpoint: told, as ever
+    (out / "frames" / "grid_000001.vtu").unlink()  # before the checkpoint: reported, as usual
     run = wl.Run.resume(out, device="cpu", frames=3)
     assert [frame.index for frame in run] == [3]
     assert [warning for warning in run.record.warnings if "grid 1 are missing" in warning]
@@ -244,7 +250,7 @@ def test_ctrl_c_in_a_step_waits_for_its_end(dots, scene_file, tmp_path):
 
 
 def test_a_second_ctrl_c_does_not_wait(dots, scene_file, tmp_path):
-    """In a callback, which may take long: the step is kept."""
+    """Second Ctrl-C in a long callback: it does not wait, and the step is kept."""
 
     def twice() -> None:
         signal.raise_signal(signal.SIGINT)
@@ -326,7 +332,11 @@ def test_an_impulse_is_what_the_body_s_momentum_changes_by():
 
 
 def test_gravity_can_turn():
-    """What falls freely gains the new gravity's velocity: half of it in the step of the change, by the leapfrog."""
+    """Gravity that changes its direction.
+
+    A free fall gains the new gravity's velocity: half of it in the step of the change, by the
+    leapfrog.
+    """
     drop = {
         **POOL,
         "liquid": [{"shape": "sphere", "center": [0.5, 0.3], "radius": 0.08}],
@@ -348,7 +358,7 @@ def test_added_material_fills_what_is_empty_and_has_its_velocity():
     for frame in run:
         counts.append(frame.particles.count)
         if frame.index == 2:
-            # its lower half is full
+            # Its lower half is full.
             added = run.add(shape="box", min=[0.25, 0.1], max=[0.5, 0.4], velocity=[0.5, 0.0])
             assert (
                 frame.particles.velocity.numpy()[-1] == pytest.approx([0.5, 0.0, 0.0])
@@ -363,7 +373,11 @@ def test_added_material_fills_what_is_empty_and_has_its_velocity():
 
 
 def test_added_material_is_in_the_checkpoint(tmp_path):
-    """A run that is left after material came, and goes on, has the frames of one that was not left."""
+    """Added material in the checkpoint.
+
+    A run that is stopped after material was added, and resumed, has the frames of an uninterrupted
+    one.
+    """
 
     def drive(folder, leave):
         run = wl.Run(POOL, folder=folder, device="cpu")

@@ -1,4 +1,7 @@
-"""One process a folder: refused while another holds it, taken over when that one was killed."""
+"""Lock of a run folder: one process at a time.
+
+Refused while another holds it, taken over when that one was killed.
+"""
 
 import json
 import os
@@ -43,7 +46,7 @@ def test_the_file_says_who_and_goes_with_the_lock(tmp_path):
     with locked(tmp_path) as remarks:
         assert remarks == []
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
-        # nobody else writes it, and it is no program
+        # Others cannot write it, and it is not executable.
         assert (tmp_path / LOCK).stat().st_mode & 0o133 == 0
     assert list(tmp_path.iterdir()) == []
 
@@ -58,7 +61,7 @@ def test_a_second_process_is_refused_and_a_killed_one_is_not_waited_for(tmp_path
             locked(tmp_path),
         ):
             pass
-        assert (tmp_path / LOCK).is_file()  # the one who is refused takes nothing away
+        assert (tmp_path / LOCK).is_file()  # a refused process removes nothing
     finally:
         end(process)
     assert (tmp_path / LOCK).is_file()
@@ -70,7 +73,10 @@ def test_a_second_process_is_refused_and_a_killed_one_is_not_waited_for(tmp_path
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"pid": "x"}'])
 def test_any_file_in_the_way_is_taken_over(tmp_path, text):
-    """It is the system's lock that counts: a number that some other process has today keeps nobody out."""
+    """Any existing file at the lock's path.
+
+    The system's lock counts: a number of another running process does not block it.
+    """
     (tmp_path / LOCK).write_text(text)
     with locked(tmp_path) as remarks:
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
@@ -93,7 +99,11 @@ def test_within_one_process_too(tmp_path):
 
 
 def test_a_file_that_its_holder_removed_is_not_held(tmp_path, monkeypatch):
-    """Between opening the file and locking it, the holder ends and removes it: the lock must be on the file that others will find."""
+    """File removed by its holder: not locked.
+
+    Between opening the file and locking it, the holder ends and removes it. The lock must be on the
+    file that others will find.
+    """
     from warp_lcp.run import folder_lock
 
     flock, taken = folder_lock.fcntl.flock, []

@@ -1,4 +1,4 @@
-"""What `check` foretells of a run, against the run: steps and bytes; and the doubts that it has about scenes."""
+"""Estimates of `check` against the run: steps and bytes; warnings about scenes."""
 
 from pathlib import Path
 
@@ -139,7 +139,11 @@ def test_what_was_hardly_meant_is_told() -> None:
     ],
 )
 def test_what_is_wrong_with_a_mesh_is_told_with_its_repair(spoil, words, tmp_path: Path) -> None:
-    """Flipped and repeated triangles are repaired by the run itself; surfaces that cross themselves have a rule."""
+    """Report of a defective mesh, with its repair.
+
+    Flipped and repeated triangles are repaired by the run itself; self-intersecting surfaces have a
+    rule.
+    """
     torus = builtin_mesh("torus")
     vertices, triangles = spoil(torus.vertices, torus.triangles)
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in (map(float, p) for p in vertices)]

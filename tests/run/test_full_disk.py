@@ -1,4 +1,4 @@
-"""A disk that is full at any moment ends a run with a status that is true, with what was written before, and the run goes on later."""
+"""Full disk at any moment: true status, kept output, and a later resumption."""
 
 import builtins
 import errno
@@ -23,13 +23,15 @@ from warp_lcp.run.folder import OutputError, RunRecord
 
 
 class Disk:
-    """Files of a folder that take no more than some bytes together: what is opened by `open` fails beyond.
+    """Files of a folder with a limited total size.
+
+    Files opened by `open` fail beyond the limit.
 
     Args:
-        folder: whose files count.
-        size: how much they may take [bytes].
-        code: of the error.
-        block: bytes that a file's size is rounded up to.
+        folder: folder of the counted files.
+        size: limit of their total size [bytes].
+        code: code of the error.
+        block: block size to which a file's size is rounded up [bytes].
     """
 
     def __init__(self, folder: Path, size: int, code: int = errno.ENOSPC, block: int = 1) -> None:
@@ -40,7 +42,7 @@ class Disk:
         return -(-size // self.block) * self.block
 
     def used(self) -> int:
-        """Return the bytes taken; a file that another thread renames in between may be missed."""
+        """Return the used bytes; a file that another thread renames may be missed."""
         sizes = []
         for path in self.folder.rglob("*"):
             with suppress(FileNotFoundError):
@@ -75,7 +77,7 @@ class Disk:
 
 
 class Limited(io.FileIO):
-    """A file on such a disk."""
+    """File on such a disk."""
 
     def __init__(self, file: Any, mode: str, *, path: str, disk: Disk) -> None:
         super().__init__(file, mode)
@@ -93,7 +95,7 @@ class Limited(io.FileIO):
 
 
 def ends_truly(out: Path, record: RunRecord) -> None:
-    """Check that run.json says what has become of the run, and that nothing is left half-written."""
+    """Check that run.json has the true status, and that no file is incomplete."""
     assert json.loads((out / "run.json").read_text())["status"] == record.status == "failed"
     assert record.reason.startswith("the disk is full: ")
     assert [path.name for path in out.rglob(".*")] == []
@@ -102,7 +104,10 @@ def ends_truly(out: Path, record: RunRecord) -> None:
 def fill(
     scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSPC, block: int = 1
 ) -> dict[str, int]:
-    """Run on disks of these sizes and go on on larger ones; return in which kinds of files the disks were full first."""
+    """Run on disks of these sizes and resume on larger ones.
+
+    Return the kinds of files at which the disks were full first.
+    """
     go(scene, folder / "whole")
     expected, where = contents(folder / "whole"), {}
     for size in sizes:
@@ -111,7 +116,7 @@ def fill(
         with Disk(out, size, code, block).mounted() as disk:
             try:
                 record = go(scene, out)
-            except OutputError:  # before it began
+            except OutputError:  # before the run began
                 assert not (out / "run.json").exists()
                 record = None
         if not disk.refused:
@@ -143,7 +148,7 @@ def whole_size(scene: Path, folder: Path) -> int:
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Leave out what only counts if power fails."""
+    """Leave out operations that matter only in a power failure."""
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
 
 
@@ -179,7 +184,7 @@ def test_full_at_every_moment(quick, scene_file, tmp_path, code, block, stride):
     ],
 )
 def test_full_in_each_kind_of_file(quick, scene_file, tmp_path, monkeypatch, name):
-    """And from then on in every file."""
+    """Full disk at each kind of file, and from then on at every file."""
     out, write, full = tmp_path / "out", Limited.write, []
 
     def fails(self: Limited, data: Any) -> int:
@@ -191,7 +196,7 @@ def test_full_in_each_kind_of_file(quick, scene_file, tmp_path, monkeypatch, nam
     monkeypatch.setattr(Limited, "write", fails)
     with Disk(out, 10**9).mounted():
         record = go(scene_file, out)
-    if name == "profile":  # that was not asked for
+    if name == "profile":  # not requested here
         assert record.status == "finished"
     elif name == "run.json.spare":
         assert record.status == "failed"
@@ -214,7 +219,7 @@ def test_a_reason_of_some_length_has_its_room(quick, tmp_path):
 
 @contextmanager
 def mounted(folder: Path, size: int) -> Iterator[None]:
-    """Mount a disk of some size at a folder, which only root can."""
+    """Mount a disk of some size at a folder, as root."""
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
     if (
@@ -231,7 +236,7 @@ def mounted(folder: Path, size: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("left", [0, 12_288, 36_864, 53_248])
 def test_a_real_disk(dots, scene_file, tmp_path, monkeypatch, left):
-    """Its free space is not known beforehand: others write there too."""
+    """Real disk, whose free space is not known beforehand: others write there too."""
     monkeypatch.setattr(run_folder.RunFolder, "check_space", lambda self, needed: None)
     disk = tmp_path / "disk"
     with mounted(disk, 1 << 20):
@@ -250,7 +255,7 @@ def test_a_real_disk(dots, scene_file, tmp_path, monkeypatch, left):
 
 
 def test_a_disk_that_becomes_read_only(dots, scene_file, tmp_path):
-    """Nothing can be written there any more: the run says so, and its folder is free."""
+    """Disk that becomes read-only: the run reports it and releases its folder."""
     disk = tmp_path / "disk"
 
     def before_step(simulation: Any, dt: float) -> None:

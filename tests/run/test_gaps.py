@@ -1,4 +1,4 @@
-"""A run that goes on names what is missing of its steps and frames, and how to have it again."""
+"""Missing steps and frames of a resumed run: named, with a remedy."""
 
 import csv
 import json
@@ -19,13 +19,13 @@ from warp_lcp.run.gaps import spans
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
-STEP = 20  # that the run is stopped at; there are checkpoints of steps 12, 16 and 20
+STEP = 20  # step at which the run stops; checkpoints are those of steps 12, 16 and 20
 KINDS = ("particles", "grid")
 
 
 @pytest.fixture
 def out(scene_file: Path, tmp_path: Path) -> Path:
-    """A run that was stopped."""
+    """Return a stopped run."""
     asked = iter(range(1, 10_000))
     run_into(
         load_scene(scene_file),
@@ -37,7 +37,10 @@ def out(scene_file: Path, tmp_path: Path) -> Path:
 
 
 def resumed(out: Path) -> list[str]:
-    """Resume for a frame, see that the terminal says what run.json warns of, and return that."""
+    """Resume for a frame; return the warning of run.json.
+
+    The terminal must show it too.
+    """
     frames = json.loads((out / "run.json").read_text())["frames"]
     result = CliRunner().invoke(
         cli.app,
@@ -167,7 +170,10 @@ def test_a_folder_in_the_place_of_a_file_or_a_file_in_that_of_a_folder(out, scen
     ],
 )
 def test_whatever_is_missing_is_named(out, seed):
-    """Holes in the log and among the frames are those that the lines tell, and the collections are of the frames that there are."""
+    """Names of whatever is missing.
+
+    Missing rows and frames are those of the messages, and the collections list the existing frames.
+    """
     rng = random.Random(seed)
     every = frames(out, "grid")
     for kind in KINDS:

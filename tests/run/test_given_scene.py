@@ -1,4 +1,4 @@
-"""A run that goes on keeps what --set has given it; what is given anew counts, and is told."""
+"""Resumed runs keep --set overrides; new ones replace them, with a message."""
 
 import json
 import random
@@ -19,14 +19,14 @@ def call(*arguments: Any) -> Any:
 
 
 def ran(out: Path, given: GivenScene) -> None:
-    """Write what a run leaves that matters here."""
+    """Write the files of a run that matter here."""
     out.mkdir(exist_ok=True)
     (out / "scene.toml").write_text(dump_scene(given.scene))
     (out / "run.json").write_text(json.dumps({"overrides": given.overrides}))
 
 
 def edit(file: Path, **changes: str) -> None:
-    """Give keys, whose names are unique in a file, other values."""
+    """Set keys, whose names are unique in a file, to other values."""
     lines = file.read_text().splitlines()
     file.write_text(
         "\n".join(
@@ -117,7 +117,7 @@ def test_an_edit_of_what_was_overridden_counts(scene_file, tmp_path):
 def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
     out, source = tmp_path / "out", str(scene_file)
     ran(out, given_scene(source, ["domain.resolution=16"]))
-    (out / "run.json").write_text("{}")  # of a version that did not remember
+    (out / "run.json").write_text("{}")  # of a version that did not store it
     with pytest.raises(
         OutputError,
         match=r"domain.resolution is 16, but 8 in .*dots.toml: use --set domain.resolution=8 to "
@@ -159,13 +159,16 @@ TABLE = {"duration": "time", "dt_max": "time", "checkpoint_every": "output"}
 
 @pytest.mark.parametrize("seed", range(5200, 5240))
 def test_the_last_word_counts(dots, scene_file, tmp_path, seed):
-    """Whatever was set or edited before, a key has the value that was last given to it, by --set or in the file."""
+    """Last value of a key.
+
+    Whatever was set or edited before, a key has its last value, by --set or in the file.
+    """
     rng, source, out = random.Random(seed), str(scene_file), tmp_path / "out"
     in_file = {name: values[0] for name, values in VALUES.items()}
     wanted, settled = dict(in_file), True
     for part in range(8):
         route = "scene" if part == 0 else rng.choice(["scene", "scene", "own", "none"])
-        if route == "scene" and settled:  # what is edited is read before anything else is set
+        if route == "scene" and settled:  # edits are read before anything else is set
             for name in rng.sample(list(VALUES), rng.choice([0, 0, 1])):
                 value = rng.choice(VALUES[name])
                 wanted[name] = wanted[name] if value == in_file[name] else value

@@ -1,4 +1,7 @@
-"""Every signal that asks a process to end leaves a checkpoint, a status that is true and a message; before the first step at once."""
+"""Signals that end a run: a checkpoint, a true status and a message.
+
+Before the first step the run ends at once.
+"""
 
 import json
 import os
@@ -21,7 +24,10 @@ EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name
 
 @pytest.fixture(autouse=True)
 def nothing_is_ignored():
-    """As in a terminal, whatever started the tests: nohup ignores SIGHUP, shells ignore SIGINT and SIGQUIT of what is in the background."""
+    """Restore the default signals, as in a terminal.
+
+    nohup ignores SIGHUP; shells ignore SIGINT and SIGQUIT for background processes.
+    """
     fresh = {
         number: signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
         for number in SIGNALS
@@ -136,7 +142,7 @@ def test_a_second_ctrl_c_does_not_wait(dots, run, tmp_path):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows")
 def test_what_is_ignored_stays_ignored(dots, run, tmp_path):
-    """As under nohup."""
+    """Ignored signals stay ignored, as under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         dots.before_step = at(5, signal.SIGHUP)
@@ -147,7 +153,10 @@ def test_what_is_ignored_stays_ignored(dots, run, tmp_path):
 
 
 def test_a_compiler_is_not_waited_for(monkeypatch):
-    """Python hands a signal on only once native code is back."""
+    """Signals during a compilation.
+
+    Python runs a signal handler only after native code has returned.
+    """
 
     class Compiling(Interruption):
         def _take(self, given: int, frame: Any) -> None:

@@ -1,4 +1,4 @@
-"""Compiled kernels that are damaged on the disk are compiled again; a folder that cannot be used is named."""
+"""Damaged cached kernels are recompiled; an unusable folder is named."""
 
 import os
 import random
@@ -50,7 +50,10 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """A cache with a module, its folder, and a function that launches its kernel as a new process would."""
+    """Return a cache with a module, its folder, and a function that launches a kernel.
+
+    It launches as a new process would.
+    """
     before, cache = wp.config.kernel_cache_dir, tmp_path_factory.mktemp("cache")
     load = wp.Module.load
     watch_loads()
@@ -77,7 +80,7 @@ def test_damaged_files_are_compiled_again(compiled, damage, suffix):
     whole = file.read_bytes()
     DAMAGES[damage](file)
     assert launch() == 3.0
-    if suffix == ".cpp":  # nobody reads it
+    if suffix == ".cpp":  # it is never read
         write(file, whole)
     assert file.is_file()
     assert not mend(folder)
@@ -99,7 +102,7 @@ def test_whole_modules_are_left_alone(compiled):
     assert not mend(folder.with_name("none"))
     load = wp.Module.load
     watch_loads()
-    assert wp.Module.load is load  # it is watched already
+    assert wp.Module.load is load  # it is already wrapped
 
 
 def test_a_cache_that_cannot_be_written(compiled, tmp_path):

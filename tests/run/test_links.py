@@ -1,4 +1,7 @@
-"""A run writes through no link, hard link or pipe that another user has put into its folder."""
+"""Protection against links in a run folder.
+
+A run writes through no link, hard link or pipe that another user has put there.
+"""
 
 import os
 import shutil
@@ -85,7 +88,7 @@ def go(scene: Scene, out: Path, **options: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def whole(scene, tmp_path_factory) -> Path:
-    """A run of which all that can be written was written."""
+    """Return a run with all possible output."""
     out = tmp_path_factory.mktemp("whole") / "out"
     assert go(scene, out).status == "finished"
     return out
@@ -93,14 +96,17 @@ def whole(scene, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def begun(scene, tmp_path_factory) -> Path:
-    """The same run after its first frame."""
+    """Return the same run after its first frame."""
     out = tmp_path_factory.mktemp("begun") / "out"
     assert go(scene, out, last_frame=1).status == "finished"
     return out
 
 
 def names(whole: Path) -> list[str]:
-    """Return all files that a run writes, the temporary ones of its simplest kind, and its folders."""
+    """Return the names of all files and folders that a run writes.
+
+    Temporary files of the simplest kind are included.
+    """
     found = sorted(str(path.relative_to(whole)) for path in whole.rglob("*"))
     return [
         LOCK,
@@ -116,7 +122,7 @@ def names(whole: Path) -> list[str]:
 
 
 def lay(link: Path, precious: Path) -> None:
-    """Put a link in the place of a file or a folder."""
+    """Replace a file or a folder by a link."""
     folder = link.is_dir()
     if folder and not link.is_symlink():
         shutil.copytree(link, precious)
@@ -162,9 +168,13 @@ def test_everything_is_written(whole):
 
 
 def test_a_resumed_run_writes_through_no_link(scene, whole, begun, tmp_path):
-    """In the place of each file and folder: the run is refused, or the link goes and the file behind it stays."""
+    """Links before a resumed run.
+
+    In place of each file and folder: the run is refused, or the link is removed and the file behind
+    it stays.
+    """
     for number, name in enumerate(names(whole)):
-        if name == "problems":  # named by --record-problems, where the user wants it
+        if name == "problems":  # named by --record-problems, in a place of the user's choice
             continue
         out, precious = (
             shutil.copytree(begun, tmp_path / f"{number}"),
@@ -186,7 +196,11 @@ def test_a_resumed_run_writes_through_no_link(scene, whole, begun, tmp_path):
 
 
 def test_links_that_come_while_it_runs(scene, whole, tmp_path):
-    """Laid after the first step: in place of what is still to be written, and under every name that a temporary file had before."""
+    """Links that appear while the run is active.
+
+    Created after the first step: in place of pending files, and under every name that a temporary
+    file had before.
+    """
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     elsewhere.mkdir()
 
@@ -194,7 +208,8 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
         def step(self, row: Any) -> None:
             super().step(row)
             for number, name in enumerate(names(whole) if row["step"] == 1 else ()):
-                checkpoint = name.startswith("checkpoints/step")  # newer ones, which count as such
+                # Newer ones, which count as checkpoints.
+                checkpoint = name.startswith("checkpoints/step")
                 if not checkpoint and not (out / name).exists() and not (out / name).is_symlink():
                     lay(out / name, elsewhere / f"{number}")
 
@@ -212,7 +227,7 @@ def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
         def step(self, row: Any) -> None:
             super().step(row)
             if row["step"] == 2:
-                # written beside the run, after the first frame
+                # Written beside the run, after the first frame.
                 while not (out / "checkpoints" / "step_000001.npz").exists():
                     time.sleep(0.01)
                 shutil.copytree(out / name, elsewhere)
@@ -253,7 +268,7 @@ def test_images(drawn, tmp_path, name):
 
 
 def test_images_elsewhere_may_go_through_links(drawn, tmp_path):
-    """A folder that the user names is the user's."""
+    """Images in another folder: links are allowed, since the user names it."""
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")
     list(render_run(drawn, looks=Looks(cut=True), out=tmp_path / "link"))
@@ -316,7 +331,7 @@ def test_a_lock_that_is_no_plain_file(tmp_path, kind):
         pass
     assert precious.read_text() == PRECIOUS
     assert not (tmp_path / "new").exists()
-    assert os.path.lexists(lock)  # nothing is taken away
+    assert os.path.lexists(lock)  # nothing is removed
 
 
 def test_temporary_names_are_not_known_before(tmp_path):
@@ -334,7 +349,10 @@ def test_temporary_names_are_not_known_before(tmp_path):
 
 
 def test_the_folder_that_was_opened_counts(tmp_path):
-    """Its path leads elsewhere meanwhile; the file is where it was to be."""
+    """Folder that was opened, although its path now leads elsewhere.
+
+    The file is in the opened folder.
+    """
     folder = tmp_path / "folder"
     folder.mkdir()
     (tmp_path / "elsewhere").mkdir()
@@ -364,12 +382,15 @@ def test_folders_within(tmp_path):
     for folder in ("frames", "frames/rank_0000"):
         with pytest.raises(OSError, match="is a link"):
             make_folder(tmp_path / "run" / folder, within=tmp_path / "run")
-    make_folder(tmp_path / "run" / "frames" / "mine")  # whoever names the folder may
+    make_folder(tmp_path / "run" / "frames" / "mine")  # whoever names the folder may do this
     assert (tmp_path / "elsewhere" / "mine").is_dir()
 
 
 def test_two_threads_write_one_file(tmp_path):
-    """Each its own temporary file; one of them is there at the end, whole."""
+    """Two threads that write one file: each has its own temporary file.
+
+    One complete file remains.
+    """
 
     def write(letter: str) -> None:
         for _ in range(50):

@@ -1,4 +1,4 @@
-"""A power failure leaves what had been brought to the disk, and that is a run which goes on."""
+"""Power failures: what was flushed to the disk is a run that can be resumed."""
 
 import os
 import re
@@ -22,7 +22,7 @@ from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.simulation import Surface
 
-Names = dict[str, int]  # of a folder, with the numbers of what they stand for
+Names = dict[str, int]  # names in a folder, with the inode numbers of their files
 AUDITED = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
 
 pytestmark = pytest.mark.skipif(
@@ -32,14 +32,14 @@ pytestmark = pytest.mark.skipif(
 
 @dataclass(frozen=True)
 class Moment:
-    """What a disk may hold if the power fails now.
+    """Possible contents of a disk if the power fails now.
 
     Args:
-        names: of each folder, as they are.
-        durable: of each folder, as `fsync` has brought them to the disk.
-        files: what `fsync` has brought to the disk of each file.
-        promised: the newest step whose checkpoint had been written, for all that the run knew; -1
-            if none.
+        names: present names in each folder.
+        durable: names in each folder that `fsync` has flushed to the disk.
+        files: contents of each file that `fsync` has flushed to the disk.
+        promised: newest step whose checkpoint had been written, as known to the run; -1 if
+            none.
     """
 
     names: dict[int, Names]
@@ -48,18 +48,18 @@ class Moment:
     promised: int
 
     def durable_file(self, root: int, folder: str, name: str) -> bytes:
-        """Return what is in a file after the failure at the latest."""
+        """Return the contents of a file after the failure."""
         number = self.durable.get(self.durable.get(root, {}).get(folder, 0), {}).get(name, 0)
         return self.files.get(number, b"")
 
     def restore(self, root: int, out: Path, *, ahead: bool) -> None:
-        """Make a folder what it is after the failure.
+        """Set a folder to its state after the failure.
 
         Args:
-            root: the number of the folder above.
-            out: the folder, which is not there.
-            ahead: names have reached the disk at once, before what is in the files; they may also
-                come as late as they can.
+            root: inode number of the folder above.
+            out: the folder, which does not exist yet.
+            ahead: whether names reach the disk at once, before the contents of the files;
+                otherwise as late as possible.
         """
         known = self.names if ahead else self.durable
         waiting = [(known.get(root, {}).get(out.name), out)]
@@ -74,10 +74,10 @@ class Moment:
 
 @dataclass
 class Disk:
-    """Watches what is done to a folder and remembers each moment.
+    """Recorder of all operations on a folder, with the state at each moment.
 
     Args:
-        root: above the folder.
+        root: the folder above.
     """
 
     root: Path
@@ -86,7 +86,8 @@ class Disk:
     files: dict[int, bytes] = field(default_factory=dict)
     durable: dict[int, Names] = field(default_factory=dict)
     promised: int = -1
-    _held: list[int] = field(default_factory=list)  # so that no number is used again
+    # Keeps files open, so that no inode number is reused.
+    _held: list[int] = field(default_factory=list)
     _lock: Any = field(default_factory=threading.RLock)
     _busy: bool = False
     on: bool = True
@@ -105,7 +106,7 @@ class Disk:
     def look(self) -> None:
         try:
             now = self.names()
-        except FileNotFoundError:  # another thread was faster: the next moment is soon
+        except FileNotFoundError:  # another thread was faster: the next moment follows soon
             return
         last = self.moments[-1] if self.moments else None
         moment = Moment(
@@ -118,7 +119,7 @@ class Disk:
             self.moments.append(moment)
 
     def sync(self, descriptor: int) -> None:
-        """What `os.fsync` does."""
+        """Record the effect of `os.fsync`."""
         if not self.on:
             return
         with self.quietly():
@@ -187,7 +188,7 @@ def disk(tmp_path, monkeypatch) -> Iterator[Disk]:
         return path
 
     monkeypatch.setattr(CheckpointFolder, "write", promise)
-    sys.addaudithook(disk.hook)  # for good: it cannot be taken back, only be quiet
+    sys.addaudithook(disk.hook)  # for ever: a hook cannot be removed, only disabled
     yield disk
     disk.close()
 
@@ -195,7 +196,10 @@ def disk(tmp_path, monkeypatch) -> Iterator[Disk]:
 def survives(
     scene: Path, folder: Path, disk: Disk, run: Callable[[Path], Any], stride: int
 ) -> list[int]:
-    """Let the power fail at every `stride`-th moment of a run; return the steps that were gone on from."""
+    """Simulate a power failure at every `stride`-th moment of a run.
+
+    Return the steps that were resumed from.
+    """
     whole = folder / "whole"
     go(scene, whole)
     expected, steps = contents(whole), []
@@ -231,14 +235,17 @@ def test_at_any_moment(disk, scene_file, tmp_path, stride):
 
 @pytest.mark.parametrize("stride", [29, pytest.param(1, marks=pytest.mark.slow)])
 def test_without_frames(disk, scene_file, tmp_path, stride):
-    """Whose collections would bring the folder's names to the disk along with theirs."""
+    """Run without frames, whose collections would flush the folder's names too."""
     scene_file.write_text(scene_file.read_text() + "particles = false\ngrid = false\n")
     survives(scene_file, tmp_path, disk, lambda out: go(scene_file, out), stride)
 
 
 @pytest.mark.parametrize("stride", [29, pytest.param(1, marks=pytest.mark.slow)])
 def test_over_another_run(disk, scene_file, tmp_path, stride):
-    """What --force has deleted does not come back as the checkpoints of the run that took its place."""
+    """Run over another run.
+
+    Files deleted by --force do not return as checkpoints of the run that replaced it.
+    """
 
     def twice(out: Path) -> None:
         go(scene_file, out, "time.duration=0.2")
@@ -268,7 +275,7 @@ def test_the_end_is_durable(disk, scene_file, tmp_path):
     disk.look()
     disk.moments[-1].restore(disk.number, tmp_path / "out", ahead=False)
     found = contents(tmp_path / "out")
-    # a checkpoint that was deleted may be there again
+    # A deleted checkpoint may be there again.
     assert found == found | contents(disk.root / "out")
     assert (tmp_path / "out" / "run.json").read_bytes() == (
         disk.root / "out" / "run.json"
@@ -290,7 +297,10 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_the_order_of_calls(disk, name):
-    """Of files that no run depends on, too: written, brought to the disk, named, and the name brought to the disk."""
+    """Order of calls, also for files on which no run depends.
+
+    A file is written, flushed and named; then the name is flushed.
+    """
     folder = disk.root / "files"
     folder.mkdir()
     disk.calls.clear()

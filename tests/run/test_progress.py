@@ -1,4 +1,4 @@
-"""The time left, and what is shown of a step."""
+"""Remaining time, and the progress line of a step."""
 
 import io
 
@@ -35,7 +35,7 @@ def test_time_left_follows_the_recent_rate():
         now += 1.0
         left = advance(0.1 + 0.2 * step)
     assert left == pytest.approx((10.0 - 2.1) / 0.2, abs=1.0)
-    for step in range(1, 41):  # it grows ten times slower: the past fades
+    for step in range(1, 41):  # it grows ten times slower: older steps count less
         now += 1.0
         left = advance(2.1 + 0.02 * step)
     assert left == pytest.approx((10.0 - 2.9) / 0.02, rel=0.01)
@@ -95,7 +95,7 @@ def test_a_count_has_a_line_now_and_then():
         for done in range(1, 13):
             now += 2.0
             told(done, 12)
-    # each 5 s later than the one before, and not the end, which has words of its own
+    # Each 5 s later than the one before, and not the end, which has its own message.
     told_of = [3, 6, 9]
     lines = [f"drawing: {done} of 12 images  0:00:{2 * (12 - done):02d} left" for done in told_of]
     assert stream.getvalue().splitlines() == lines

@@ -1,4 +1,7 @@
-"""Continue runs from their states after every step: the next step, its row of the log and its frame are the same bit for bit."""
+"""Runs resumed after every step: equal next step, row of the log and frame.
+
+They are equal bit for bit.
+"""
 
 import pytest
 
@@ -15,7 +18,7 @@ CELLS = {
     "river": 256,
     "waterfall": 32,
     "wave-maker": 30,
-}  # along the longest side, where 24 and 12 do not fit
+}  # along the longest side, where 24 and 12 are too small
 IN_BAND = {
     "scene": {"simulator": "fluids"},
     "time": {"duration": 1.0, "frames_per_second": 20},
@@ -33,7 +36,10 @@ def test_built_in_scenes(name):
 
 
 def test_a_solid_that_moves_through_a_band():
-    """The interior counts the cells where the solid was, not those where the scene places it."""
+    """Moving solid in a band.
+
+    The interior counts the cells at the solid's current place, not at that of the scene.
+    """
     solid = {
         "shape": "sphere",
         "center": [0.8, 0.25],
@@ -46,7 +52,10 @@ def test_a_solid_that_moves_through_a_band():
 
 
 def test_a_band_whose_surface_pulls_itself_together():
-    """What acts on the particles' gradients knows the cells of those that the band has just added."""
+    """Band with surface tension.
+
+    The effect on the particles' gradients includes the cells of newly added particles.
+    """
     column = [{"shape": "box", "min": [0.0, 0.0], "max": [0.75, 0.6]}]
     tables = IN_BAND | {"surface_tension": {"coefficient": 0.07}, "liquid": column}
     assert differences_by_step(LiquidScene.model_validate(tables), 13, 2) == {}

@@ -1,4 +1,4 @@
-"""The run loop on a fake simulator: times, retries, ends, and resumption bit for bit."""
+"""Run loop on a fake simulator: times, retries, ends, exact resumption."""
 
 import csv
 import errno
@@ -26,11 +26,11 @@ from warp_lcp.scene.scene import SceneError, Time
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
 
-VOLATILE = "seconds"  # the log's only column that a repetition does not repeat
+VOLATILE = "seconds"  # the only column of the log that differs in a repetition
 
 
 class Watcher(Lines):
-    """An observer that remembers the remarks."""
+    """Observer that stores the remarks."""
 
     def __init__(self) -> None:
         super().__init__(Console(quiet=True))
@@ -55,7 +55,10 @@ def record(out: Path) -> dict[str, Any]:
 
 
 def contents(out: Path) -> dict[str, Any]:
-    """Return what two equal runs have in common: every frame, collection and log row, and the last checkpoint."""
+    """Return the common contents of two equal runs.
+
+    They are every frame, collection and log row, and the last checkpoint.
+    """
     found: dict[str, Any] = {
         str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]
     }
@@ -97,9 +100,9 @@ def bounds(**changes: float) -> Time:
         (0.05, 0.5, 0.05),
         (0.3, 0.5, 0.1),  # dt_max
         (1e-9, 0.5, 0.001),  # dt_min
-        (0.05, 0.05, 0.05),  # exactly to the frame
+        (0.05, 0.05, 0.05),  # exactly at the frame
         (0.05, 0.04, 0.04),
-        (0.05, 0.051, 0.0255),  # no sliver of 0.001
+        (0.05, 0.051, 0.0255),  # no tiny step of 0.001
         (0.05, 0.0999, 0.04995),
         (0.05, 0.1, 0.05),
         (np.inf, 0.01, 0.01),
@@ -170,12 +173,16 @@ def test_as_many_checkpoints_are_kept_as_the_scene_says(dots, scene_file, tmp_pa
     names = sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir())
     every = [*range(0, result.steps, 4), result.steps]
     assert names == [f"step_{step:06d}.npz" for step in every[-kept:]]
-    assert max(most) <= kept + 1  # a new one is there before an old one goes
-    assert most[0] == 1  # a run can be continued from its first step on
+    assert max(most) <= kept + 1  # a new one is written before an old one is deleted
+    assert most[0] == 1  # a run can be resumed from its first step on
 
 
 def test_checkpoints_by_the_clock(dots, scene_file, tmp_path, monkeypatch):
-    """Every third step lasts a minute: with a checkpoint at least every 1.5 minutes there is one after each sixth step."""
+    """Checkpoints by wall time.
+
+    Every third step lasts a minute: with a checkpoint at least every 1.5 minutes there is one after
+    each sixth step.
+    """
     now = [0.0]
     monkeypatch.setattr(run_module.clock, "monotonic", lambda: now[0])
     written = []
@@ -202,7 +209,7 @@ def test_checkpoints_by_the_clock(dots, scene_file, tmp_path, monkeypatch):
         "output.checkpoint_minutes=1.5",
         last_frame=3,
     ).steps
-    assert written[:5] == [0, 5, 9, 10, 15]  # the clock starts anew with each
+    assert written[:5] == [0, 5, 9, 10, 15]  # the clock restarts with each
     assert written[-1] == steps
 
 
@@ -344,7 +351,7 @@ def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path
 
     def full(*arguments: Any) -> Any:
         parts.append(arguments)
-        if len(parts) > 8:  # two a frame
+        if len(parts) > 8:  # two per frame
             yield b"half a fra"
             raise OSError(errno.ENOSPC, "No space left on device")
         yield from write(*arguments)
@@ -361,7 +368,7 @@ def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path
 
 
 def slow_frames(monkeypatch: pytest.MonkeyPatch, seconds: float, fails: int = -1) -> None:
-    """Make frames take their time, and one of them fail."""
+    """Delay the writing of frames, and make one of them fail."""
     write = FrameFolder.write
 
     def slow(self: FrameFolder, index: int, *arguments: Any) -> list[Path]:
@@ -419,7 +426,7 @@ def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(
 ):
     out = tmp_path / "out"
     slow_frames(monkeypatch, 0.2, fails=1)
-    # soon after frame 1, and before it is found that it cannot be written
+    # Soon after frame 1, before its write failure is detected.
     dots.before_step = fail_on(6)
     result = go(scene_file, out, "output.checkpoint_every=50")
     assert result.status == "failed"
@@ -496,7 +503,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_good_one(
         patch.setattr(np, "savez", fails)
         result = go(scene_file, out)
     assert result.status == "failed"
-    assert result.steps >= 12  # it is written while the run goes on
+    assert result.steps >= 12  # it is written while the run continues
     assert result.reason.startswith(reason)
     assert result.reason.endswith("files written before are intact")
     names = sorted(path.name for path in (out / "checkpoints").iterdir())
@@ -528,7 +535,7 @@ def test_a_simulator_that_cannot_change_grids(scene_file, tmp_path):
         SceneError, match=r"domain.resolution: must stay 8: dots cannot change grids"
     ):
         go(scene_file, out, "domain.resolution=16", resume=True)
-    assert record(out)["status"] == "stopped"  # nothing was touched
+    assert record(out)["status"] == "stopped"  # nothing was changed
     assert go(scene_file, out, resume=True).resumed_from_step == 5
 
 

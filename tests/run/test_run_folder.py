@@ -1,4 +1,4 @@
-"""Whose folder it is, and what may be deleted."""
+"""Ownership of a run folder, and files that may be deleted."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from warp_lcp.run.continuation import fingerprint
 from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
 from warp_lcp.scene.scene_file import load_scene
 
-SPARE = ".run.json.spare.part"  # room for the last run.json, while a run is on
+SPARE = ".run.json.spare.part"  # room for the last run.json, while a run is active
 RUN_FILES = [
     "run.json",
     "scene.toml",
@@ -84,7 +84,7 @@ def test_force_never_deletes_what_is_no_runs(folder, name):
 
 
 def test_a_folder_without_a_record_is_no_run(folder):
-    fill(folder, ["scene.toml"])  # perhaps the user's own
+    fill(folder, ["scene.toml"])  # possibly the user's own
     with pytest.raises(OutputError, match="files that do not belong to a run"):
         folder.check_new(force=True)
 
@@ -139,7 +139,11 @@ def test_a_run_killed_before_its_first_step_begins_anew(folder):
 
 
 def test_a_half_deleted_run_is_not_continued(folder, monkeypatch):
-    """Checkpoints go first, the record never: whatever --force has not deleted yet when it is killed, no run goes on from it."""
+    """Half-deleted run: it is not continued.
+
+    Checkpoints are deleted first, the record never. Whatever --force has not deleted yet when it is
+    killed, no run resumes from it.
+    """
     fill(folder, RUN_FILES)
     deleted: list[str] = []
     unlink = Path.unlink
@@ -215,7 +219,7 @@ def test_another_resolution_is_told_from_the_checkpoint(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
     finer = changed(folder, scene_file, "domain.resolution=16")
     assert finer.resume().resampled_from == 8
-    # killed here: scene.toml is new, the checkpoint is old
+    # Killed here: scene.toml is new, the checkpoint is old.
     finer.go_on(RunRecord("dots", "dots", "cpu"), 8)
     assert finer.resume().resampled_from == 8
 
@@ -255,7 +259,7 @@ def test_a_mesh_counts_by_what_is_in_it(dots, tmp_path):
         r"began",
     ):
         edited.resume()
-    # nor does a checkpoint by itself take the new mesh for the old
+    # A checkpoint alone also distinguishes the new mesh from the old.
     assert edited.checkpoints.newest()[0] is None
 
     mesh.write_text("v 0 0 0\n")
@@ -296,7 +300,7 @@ def test_going_on_clears_what_was_half_written(folder):
         "step_000008.npz",
     ]
     assert (folder.path / "frames" / "grid_000001.vtu").is_file()
-    folder.check_new(force=True)  # all of it is a run's
+    folder.check_new(force=True)  # all files belong to a run
 
 
 def test_fingerprint_ignores_what_may_differ(scene_file: Path):

@@ -1,4 +1,7 @@
-"""How a run is cut into steps: frames exactly, no slivers, and the same steps after an interruption, whatever starts and stops when."""
+"""Time steps of a run: exact frames, no tiny steps, same after an interruption.
+
+Whatever starts and stops when.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,15 @@ from warp_lcp.run.stepping import SHARE, plan_dt, take_step
 from warp_lcp.scene.scene import Time
 from warp_lcp.simulation import StepFailed
 
-SMOOTH = 1.1  # by so much the stable time step changes from one step to the next at the most
+SMOOTH = 1.1  # largest factor of the stable time step from one step to the next
 ROUNDING = 1e-12
 
 
 class Clockwork:
-    """A simulation that is a clock: its stable time step varies smoothly over time, some steps fail, and things happen at given times."""
+    """Simulation with a clock alone.
+
+    Its stable time step varies smoothly, some steps fail, and events happen at given times.
+    """
 
     def __init__(self, seed: int) -> None:
         draw = np.random.default_rng(seed)
@@ -32,12 +38,12 @@ class Clockwork:
         self.period, self.fails = draw.uniform(40.0, 80.0) * self.middle, draw.random() < 0.3
         many, length = draw.integers(0, 12), self.bounds.duration
         times = draw.uniform(-0.1, 1.1, many) * length
-        # close to a frame
+        # Close to a frame.
         frames = self.bounds.frame_time(3) + draw.uniform(-1.0, 1.0, 4) * 10.0 ** draw.uniform(
             -7.0, -2.0, 4
         )
-        close = times[:3] + 10.0 ** draw.uniform(-7.0, -2.0, len(times[:3]))  # to each other
-        # keyframes that were recorded
+        close = times[:3] + 10.0 ** draw.uniform(-7.0, -2.0, len(times[:3]))  # close to each other
+        # Recorded keyframes.
         dense = np.arange(0.3, 0.6, 10.0 ** draw.uniform(-3.0, -1.5)) if draw.random() < 0.3 else []
         self.times = np.sort(np.concatenate([times, frames, close, dense]))
         self.time, self.step_count = 0.0, 0
@@ -59,7 +65,10 @@ class Clockwork:
 
 
 def run(clock: Any, stop: int = 10**6) -> list[tuple[float, float, int, float]]:
-    """Step to the end, or so many times; return start, end, number of retries and what CFL and bounds allow of each step."""
+    """Step to the end, or so many times.
+
+    Return start, end, number of retries, and the limits by CFL and bounds of each step.
+    """
     rows, bounds = [], clock.bounds
     for frame in range(1, bounds.frame_count + 1):
         end = bounds.frame_time(frame)
@@ -74,7 +83,7 @@ def run(clock: Any, stop: int = 10**6) -> list[tuple[float, float, int, float]]:
 
 
 def check(seed: int) -> None:
-    """Assert what holds of all runs."""
+    """Assert the invariants of all runs."""
     clock = Clockwork(seed)
     rows = np.array(run(clock))
     starts, ends, retried, allowed = rows.T
@@ -88,7 +97,7 @@ def check(seed: int) -> None:
     whole = np.isin(np.round(starts / ROUNDING), np.round(frames / ROUNDING)) & np.isin(
         np.round(ends / ROUNDING), np.round(frames / ROUNDING)
     )
-    free = ~whole  # a step from frame to frame is as short as those are close
+    free = ~whole  # a step from frame to frame is as short as their distance
     disturbed = np.convolve(retried > 0, np.ones(5), "same") > 0  # as short as a retry has left it
     assert (steps >= SHARE / SMOOTH * allowed)[free & ~disturbed].all()
     neighbors = np.maximum(np.append(steps[1:], 0.0), np.insert(steps[:-1], 0, 0.0))
@@ -124,12 +133,12 @@ def test_any_run_hits_its_frames_and_has_no_slivers() -> None:
 @pytest.mark.parametrize(
     ("remaining", "events", "expected"),
     [
-        (0.5, [0.0001], 0.05),  # across, as it has just begun
+        (0.5, [0.0001], 0.05),  # across, since it has just begun
         (0.5, [0.02], 0.02),
         (0.5, [0.0501], 0.02505),
         (0.5, [0.02, 0.04], 0.04),  # across the first
         (0.5, [0.12, 0.3], 0.05),
-        (0.04, [0.039], 0.04),  # across, as the frame is near
+        (0.04, [0.039], 0.04),  # across, since the frame is near
         (0.04, [0.02], 0.02),
         (0.08, [0.075], 0.04),
         (0.5, [], 0.05),

@@ -1,4 +1,7 @@
-"""What files and arguments hold never reaches the terminal as controls, whatever command reads them."""
+"""Control characters in files and arguments never reach the terminal.
+
+Whatever command reads them.
+"""
 
 import errno
 import io
@@ -36,7 +39,10 @@ MTX = "%%MatrixMarket matrix coordinate real general\n"
 
 
 def call(*arguments: object) -> str:
-    """Run a command; return all that it wrote, which holds nothing but printing characters and its own lines."""
+    """Run a command; return its output.
+
+    The output may contain only printing characters and the command's own line breaks.
+    """
     result: Result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), repr(
         result.exception
@@ -56,7 +62,7 @@ def quoted(text: str) -> str:
 
 
 def scenes(text: str, folder: Path) -> list[str]:
-    """Return scenes that hold a text wherever a scene can."""
+    """Return scenes that contain a text wherever a scene can."""
     key, mesh = quoted(text), folder / "mesh.obj"
     mesh.write_text(f"v 0 0 {text}\nf {text} 2 3\n", encoding="utf-8")
     solid = f'{MINIMAL}\n[[solid]]\nshape = "mesh"\n'
@@ -77,7 +83,7 @@ def scenes(text: str, folder: Path) -> list[str]:
 
 
 def hostile(text: str, folder: Path, scene: Path) -> None:
-    """Run every command on files that hold a text, and with it among the arguments."""
+    """Run every command on files that contain a text, and with it as an argument."""
     folder.mkdir()
     for number, content in enumerate(scenes(text, folder)):
         file = folder / f"scene_{number}.toml"
@@ -146,7 +152,7 @@ def test_matrices(tmp_path, text):
 
 @pytest.mark.parametrize("text", [ALL.replace("/", ""), f"x\n{FORGED}"], ids=ascii)
 def test_what_lies_in_the_folder_of_a_run(scene_file, tmp_path, text):
-    """The files of a run come from elsewhere, too."""
+    """Files in the folder of a run, which may come from elsewhere."""
     out = tmp_path / "out"
     run = ["run", scene_file, "--out", out, "--device", "cpu", "--frames"]
     call(*run, 1)

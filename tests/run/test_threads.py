@@ -1,4 +1,7 @@
-"""Every built-in scene, small, has the same bits on any number of threads, however small the pieces are."""
+"""Small built-in scenes: equal bits on any number of threads.
+
+However small the pieces are.
+"""
 
 import hashlib
 from pathlib import Path
@@ -11,7 +14,7 @@ from warp_lcp.rows import team
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
-CELLS = {  # whose sizes need others
+CELLS = {  # scenes that need other sizes
     "jet": 128,
     "mesh-obstacle": 15,
     "retracting-wall": 25,
@@ -24,7 +27,7 @@ CELLS = {  # whose sizes need others
 
 
 def digests(name: str, count: int, steps: int) -> list[str]:
-    """Digests of the state after each step."""
+    """Return digests of the state after each step."""
     wl.set_threads(count)
     scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 16)}"])
     simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
@@ -41,7 +44,7 @@ def digests(name: str, count: int, steps: int) -> list[str]:
     return found
 
 
-# scenes of more than three seconds, like shorter ones
+# Scenes of more than three seconds, otherwise like shorter ones.
 LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")
 
 

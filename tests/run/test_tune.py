@@ -1,4 +1,4 @@
-"""Tuning: the distance between runs, the search among settings, and the command."""
+"""Tuning: distance between runs, search among settings, command."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -69,7 +69,10 @@ def test_runs_that_were_looked_at_otherwise_are_not_compared() -> None:
 
 
 def test_a_trial_is_the_run() -> None:
-    """The same steps as a run takes, the same again and again, and the mass of the liquid in its boxes."""
+    """Trial equal to the run.
+
+    The same steps as in a run, reproducible, and the mass of the liquid in its boxes.
+    """
     scene = load_scene("dam-break-2d", SMALL)
     first, again = (trial(scene, device="cpu", frames=3) for _ in range(2))
     assert first.steps == again.steps
@@ -83,11 +86,11 @@ def test_a_trial_is_the_run() -> None:
 
 
 class Model:
-    """In the place of trials: distance and seconds by formula of time.cfl and tolerance.
+    """Replacement of trials: distance and seconds by a formula of cfl and tolerance.
 
     Args:
-        distance: of a cfl of 1.
-        fails: from which cfl on runs fail.
+        distance: distance at a cfl of 1.
+        fails: least cfl at which runs fail.
     """
 
     def __init__(self, distance: float, fails: float = np.inf, drift: float = 0.0) -> None:
@@ -144,10 +147,13 @@ def test_the_volume_counts_too(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Blurred(Model):
-    """Runs as good as the reference lie a distance from it, and every other one that much beside its own.
+    """Replacement of trials with a distance of the reference runs.
+
+    Runs as good as the reference are at this distance from it; all others have it in addition to
+    their own.
 
     Args:
-        noise: that distance.
+        noise: distance of runs as good as the reference.
     """
 
     def __init__(self, distance: float, noise: float, drift: float = 0.0) -> None:
@@ -199,11 +205,11 @@ def test_what_shorter_steps_bring_tells_what_would_help(monkeypatch: pytest.Monk
 
 
 class Steps(Model):
-    """Runs of 10 / cfl steps whose distance has a part that no step lessens.
+    """Replacement of trials: 10 / cfl steps, and an irreducible part of the distance.
 
     Args:
-        stays: that part.
-        falls: what is beside it of a cfl of 1.
+        stays: irreducible part of the distance.
+        falls: remaining part of the distance at a cfl of 1.
     """
 
     def __init__(self, stays: float, falls: float) -> None:
@@ -221,7 +227,11 @@ class Steps(Model):
 def test_nothing_can_be_nearer_than_references_are_to_each_other(
     distance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The longest step whose own distance keeps the bound is found beneath a noise of four times the bound, as its square adds up."""
+    """No run nearer to the references than they are to each other.
+
+    The longest step whose own distance meets the bound is found beneath a noise of four times the
+    bound, since distances add up in quadrature.
+    """
     model = Blurred(distance, noise=0.12)
     found = tuned(monkeypatch, model)
     bound = price_table()["fluids"].presets["standard"].distance

@@ -1,4 +1,4 @@
-"""Scene keys of rigid bodies: what they mean, and what is refused."""
+"""Scene keys of rigid bodies: meaning and refusals."""
 
 from pathlib import Path
 from typing import Any

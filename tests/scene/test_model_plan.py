@@ -1,4 +1,4 @@
-"""What `check` says of a scene's models, and the list of prices that it says it by."""
+"""Messages of `check` about a scene's models, and its price list."""
 
 from __future__ import annotations
 

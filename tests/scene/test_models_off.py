@@ -1,4 +1,4 @@
-"""What a scene does not ask for is not there: no kernel module is loaded for it, no byte allocated, no column logged."""
+"""Models that are off: no loaded kernel module, no memory, no log column."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ ROOT = Path(__file__).parents[2]
 
 @dataclass
 class Traces:
-    """What a simulation has left: names of the kernel modules it asked for, bytes allocated beneath each source file and in all."""
+    """Traces of a simulation: kernel modules and allocated bytes.
+
+    Bytes are by source file, and in total.
+    """
 
     modules: set[str] = field(default_factory=set)
     bytes: dict[str, int] = field(default_factory=lambda: defaultdict(int))
@@ -34,7 +37,10 @@ class Traces:
 
 @contextmanager
 def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
-    """Note each kernel module that a launch asks for and each allocation with the source files on the stack."""
+    """Record each kernel module of a launch, and each allocation.
+
+    Allocations are recorded with the source files on the stack.
+    """
     traces, prepared = Traces(), program.prepared
     allocator = type(wp.get_device("cpu").default_allocator)
     load, allocate, entry, make_array = (
@@ -124,14 +130,14 @@ def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) 
 
 @dataclass(frozen=True)
 class Case:
-    """A model, on and off.
+    """Model, on and off.
 
     Args:
         on, off: tables of the scene with the model, and of the nearest one without it.
-        modules: names, or their beginnings, of the kernel modules that are the model's own.
-        files: source files beneath which what it allocates is allocated.
-        columns: its own.
-        sand: whether the scene is one of sand.
+        modules: names, or their beginnings, of the model's own kernel modules.
+        files: source files on the stack of the model's allocations.
+        columns: log columns of the model.
+        sand: whether the scene has sand.
     """
 
     on: dict[str, Any]
@@ -303,7 +309,7 @@ CASES = {
 }
 
 
-# take another's place, only look, or are numbers of kernels that are there anyway
+# They replace another model, only read, or are settings of kernels that are there anyway.
 PLACED_ELSEWHERE = (
     "cut cells",
     "diagnostics",
@@ -322,7 +328,7 @@ def test_a_model_that_is_off_leaves_no_trace(name: str, monkeypatch: pytest.Monk
     case = CASES[name]
     off = traces_of(monkeypatch, case.off, sand=case.sand)
     on = traces_of(monkeypatch, case.on, sand=case.sand)
-    for own in case.modules:  # what tells the model's traces must be able to
+    for own in case.modules:  # the detection of the model's traces must work
         assert any(module.startswith(own) for module in on.modules), (
             f"{own} is not among {sorted(on.modules)}"
         )
@@ -340,7 +346,7 @@ def test_without_a_separating_wall_bounds_take_no_memory(monkeypatch: pytest.Mon
     off, on = (
         traces_of(monkeypatch, {"wall": wall}, sand=False) for wall in ("free-slip", "separating")
     )
-    cells = 3 * 10 * 18  # stored
+    cells = 3 * 10 * 18  # stored cells
     assert on.total - off.total >= 8 * cells, "a lower bound"
 
 
@@ -348,7 +354,11 @@ def test_without_a_separating_wall_bounds_take_no_memory(monkeypatch: pytest.Mon
 def test_walls_without_friction_are_not_launched(
     slips: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The kernel of Coulomb friction on walls runs and reads faces only where a wall rubs; a solid that does counts its own alone."""
+    """Walls without friction: no launches.
+
+    The kernel of Coulomb friction on walls runs and reads faces only where a wall has friction; a
+    solid with friction counts its own faces alone.
+    """
     simulation = small_sands.create(
         small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3}))
     )
@@ -359,7 +369,7 @@ def test_walls_without_friction_are_not_launched(
         "entry",
         lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1],
     )
-    walls, faces = simulation.stress.walls, 2 * (16 + 8)  # those of the box
+    walls, faces = simulation.stress.walls, 2 * (16 + 8)  # walls of the box
     assert walls.count == (0 if slips else faces)
     simulation.step(1e-3)
     assert simulation.stress.residual()[0] >= 0.0

@@ -1,4 +1,4 @@
-"""The key `motion` of a solid: what is accepted, what is refused in which words, and where the solid then is."""
+"""Key `motion` of a solid: accepted values, messages of refusals, positions."""
 
 import json
 
@@ -33,7 +33,7 @@ def complaint(motion: object, dimension: int = 2, solids: str = "cut-cell") -> s
 
 
 def place(motion: dict, time: float, point: list[float]) -> list[float]:
-    """Return where a point of the solid as placed is at a time."""
+    """Return the position at a time of a point of the solid as placed."""
     dimension = len(point)
     read = build(motion, dimension).solid[0].motion.to_motion(dimension)
     assert isinstance(read, motions.Motion)

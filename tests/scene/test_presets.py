@@ -1,4 +1,7 @@
-"""Presets: what they fill in, what they leave alone, and that the loss grows with the speed."""
+"""Presets: values that they set, and growing error with speed.
+
+Explicit keys stay unchanged.
+"""
 
 from pathlib import Path
 
@@ -108,7 +111,10 @@ def test_changed_settings_leave_what_is_off_alone(scene_file: Path) -> None:
 
 
 def test_faster_presets_take_fewer_steps_and_lie_further_away(scene_file: Path) -> None:
-    """Steps are counted, not seconds; distances are from the reference run of the same resolution."""
+    """Faster presets: fewer steps and a larger distance.
+
+    Steps are counted, not seconds; distances are from the reference run of the same resolution.
+    """
     scene = load_scene(scene_file)
     prices = price_table()["fluids"]
     reference = trial(changed(scene, prices.reference), device="cpu", frames=6)

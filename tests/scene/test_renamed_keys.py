@@ -1,4 +1,7 @@
-"""Old names of scene keys are read with a warning, and `warp-lcp check --fix` rewrites them."""
+"""Old names of scene keys: read with a warning.
+
+`warp-lcp check --fix` rewrites them.
+"""
 
 import tomllib
 import warnings

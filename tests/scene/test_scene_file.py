@@ -154,7 +154,7 @@ def test_built_in_scenes_are_valid(name):
     scene = load_scene(name)
     assert scene.scene.name == name
     assert scene.scene.description
-    # minutes, not hours, on two cores
+    # Minutes, not hours, on two cores.
     assert np.prod(getattr(scene, "covered_counts", 0)) < 200_000
     check_shapes(scene, name)
 

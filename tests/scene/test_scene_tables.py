@@ -1,4 +1,4 @@
-"""The tables of a scene: what is accepted, what is refused, and in which words."""
+"""Tables of a scene: accepted values, and messages of refusals."""
 
 import copy
 import math
@@ -17,7 +17,7 @@ BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 
 
 def build(changes: dict[str, Any]) -> Scene:
-    """Return the base scene with keys replaced; `time.cfl` reaches into a table."""
+    """Return the base scene with keys replaced; `time.cfl` is a key of a table."""
     data = copy.deepcopy(BASE)
     for path, value in changes.items():
         table, _, key = path.partition(".")

@@ -1,4 +1,7 @@
-"""Settings that look like mistakes are told by `check` and at the start of a run, with the value, what is usual, and the unit."""
+"""Suspicious settings: reported by `check` and at the start of a run.
+
+The report has the value, the usual range, and the unit.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ POOL: Tables = {
 SAND: Tables = {**POOL, "scene": {"simulator": "granular"}, "sand": POOL["liquid"]}
 del SAND["liquid"]
 BALL = {"shape": "sphere", "center": [0.7, 0.4], "radius": 0.05}
-DROP: Tables = {  # of 1 um
+DROP: Tables = {  # a drop of 1 um
     **POOL,
     "time": {"duration": 1e-4, "frames_per_second": 1e5},
     "domain": {"size": [4e-6, 4e-6], "resolution": 16},
@@ -186,7 +189,10 @@ def test_what_may_well_be_meant_is_not_told(more: Tables) -> None:
 def test_check_and_run_name_a_shortest_step_that_surface_tension_does_not_bear(
     tmp_path: Path,
 ) -> None:
-    """A drop of 1 um reached many times its speed, and the one warning blamed the CFL number."""
+    """Shortest step that is unstable with surface tension: named by check and run.
+
+    A drop of 1 um reached many times its speed, and the only warning was about the CFL number.
+    """
     scene, out = tmp_path / "drop.toml", tmp_path / "out"
     scene.write_bytes(tomli_w.dumps(DROP).encode())
     said = "time.dt_min = 1e-06 s is longer, and steps would be unstable: use 6e-09"

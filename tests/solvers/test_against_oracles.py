@@ -1,4 +1,7 @@
-"""Every method on every operator against dense oracles: Lemke, exhaustive search, NumPy's linear solve."""
+"""Every method on every operator against dense oracles.
+
+Lemke, exhaustive search, NumPy's linear solve.
+"""
 
 import numpy as np
 import pytest
@@ -25,7 +28,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 
 
 def planted(A, rng, active=0.3):
-    """Right-hand side with a known solution x >= 0, y >= 0, x'y = 0, strictly complementary."""
+    """Return a right-hand side with a known solution x >= 0, y >= 0, x'y = 0.
+
+    It is strictly complementary.
+    """
     held = rng.random(len(A)) < active
     x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))
     y = np.where(held, rng.uniform(0.1, 1.0, len(A)), 0.0)

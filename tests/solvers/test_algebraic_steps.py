@@ -1,4 +1,4 @@
-"""Domains on which cycles of blocks are slow: the default goes on by steps on the matrix."""
+"""Domains where cycles of blocks are slow: the default continues on the matrix."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,10 @@ from warp_lcp.solvers.fallback import FIRST
 
 
 def spiral(n):
-    """Return a channel one cell wide that winds inward between walls one cell thick, AIR at its outer end."""
+    """Return a channel one cell wide that winds inward, AIR at its outer end.
+
+    The walls between its turns are one cell thick.
+    """
     cells, at, turn = np.full((n, n), wl.SOLID), [0, 0], [0, 1]
     cells[0, 0] = wl.FLUID
     blocked = 0
@@ -76,7 +79,7 @@ def test_spiral_is_one_channel():
     degree = np.diag(assemble(cells))[fluid.ravel()]
     assert fluid.sum() > 150
     assert (degree[degree != 2] == 1).all()
-    assert (degree == 1).sum() == 1  # where it ends; the other end has AIR
+    assert (degree == 1).sum() == 1  # its inner end; the other end has AIR
 
 
 def test_easy_solves_stay_on_the_grid():

@@ -1,4 +1,7 @@
-"""The ball obstacle, whose exact solution is known: order of the error, and iterations that do not grow with the grid."""
+"""Ball obstacle with a known solution: order of the error, iterations.
+
+Iterations do not grow with the grid.
+"""
 
 import dataclasses
 
@@ -38,7 +41,7 @@ def test_exact_solution_and_its_free_boundary():
         lambda a: a**2 * (np.log(2) - np.log(a)) - (1 - a**2), 0.1, 0.99, xtol=1e-15
     )
     assert pytest.approx(root, abs=1e-14) == RADIUS
-    # both are continuously differentiable where their pieces meet
+    # Both are continuously differentiable where their pieces meet.
     for r, h in ((RADIUS, 1e-6), (EDGE, 1e-6)):
         for f in (ball_height, membrane_height):
             left, right = (
@@ -81,7 +84,7 @@ def test_error_falls_with_order_three_halves(sizes):
         s = np.linspace(-2, 2, n)[1:-1]
         contact = x == p.lower[1:-1, 1:-1]
         r = np.hypot(*np.meshgrid(s, s))
-        # the contact set is the disk, to within three cells
+        # The contact set is the disk, to within three cells.
         assert contact[r < RADIUS - 3 * 4 / (n - 1)].all()
         assert not contact[r > RADIUS + 3 * 4 / (n - 1)].any()
     slope = -np.polyfit(np.log(np.array(sizes) - 1), np.log(errors), 1)[0]

@@ -1,4 +1,7 @@
-"""ProjectedMultigrid moves x in place: the best iterate is had back by taking a step back, or from a copy once x has gone on from there."""
+"""Best iterate of ProjectedMultigrid, which moves x in place.
+
+It is restored by reverting a step, or from a copy once x has moved on.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from warp_lcp.reduced import grid_step_kernels as kernels
 
 
 def started(precision="mixed", faces=None, closed=False):
-    """A workspace at the start of a solve, with its problem and solver."""
+    """Return a workspace at the start of a solve, with its problem and solver."""
     cells = np.ones((9, 10, 11), dtype=int)
     if not closed:
         cells[-1] = wl.AIR
@@ -43,8 +46,8 @@ def test_the_best_iterate_comes_back(before, beyond, closed, precision):
     moved = np.abs(work.x.numpy() - best).max()
     assert moved > 0
     work.restore()
-    # a step back is exact but for the rounding of the direction, in float32, where a bound cut the
-    # step
+    # A reverted step is exact up to the rounding of the direction, in float32, where a bound cut
+    # the step.
     np.testing.assert_allclose(work.x.numpy(), best, atol=1e-6 * moved)
     assert work.residual.evaluate(work.x) == pytest.approx(norm, rel=1e-5)
     solver.step(problem, work, work.x)
@@ -78,7 +81,10 @@ def test_a_solve_that_never_rises_keeps_one_iterate():
 
 @pytest.mark.parametrize("solver", [wl.FischerNewton(), wl.InteriorPoint()])
 def test_cycles_that_serve_another_method_keep_no_iterate(solver):
-    """The method that they start keeps the best one itself: a second copy would be a field of memory."""
+    """Cycles that serve another method: no stored iterate.
+
+    The calling method stores the best one; a second copy would be another field of memory.
+    """
     problem, _, _ = started()
     work = solver.init(problem)
     result = wl.solve(problem, solver, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-6))

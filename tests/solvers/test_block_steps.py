@@ -1,4 +1,7 @@
-"""Blocked Gauss-Seidel and staggering iterate by iterate against plain loops: subproblems, friction within blocks and across them."""
+"""Blocked Gauss-Seidel and staggering, iterate by iterate against plain loops.
+
+The tests cover subproblems, and friction within blocks and across them.
+"""
 
 import itertools
 
@@ -28,19 +31,22 @@ def operators(A, device):
 
 
 def held_others(A, b, x, block):
-    """[Book] eq. 2.66: A_BB and b_B + A_BC x_C, C the other unknowns."""
+    """Return A_BB and b_B + A_BC x_C of [Book] eq. 2.66, C the other unknowns."""
     others = np.setdiff1d(np.arange(len(b)), block)
     return A[np.ix_(block, block)], b[block] + A[np.ix_(block, others)] @ x[others]
 
 
 def contact_bounds(normal, x):
-    """Both sides of |t| <= mu n and n >= 0."""
+    """Return both sides of |t| <= mu n and n >= 0."""
     limit = FRICTION * x[np.maximum(normal, 0)]
     return np.where(normal >= 0, -limit, 0.0), np.where(normal >= 0, limit, np.inf)
 
 
 def sliding_block(A, b, normal):
-    """A block with friction inside, by trying each unknown free, at its lower and at its upper bound, which may be affine in another."""
+    """Solve a block with friction inside, by enumeration.
+
+    Each unknown free, at its lower and at its upper bound, which may be affine in another.
+    """
     n = len(b)
     for kind in itertools.product("fLU", repeat=n):
         M, r = A.copy(), -b
@@ -66,7 +72,7 @@ def sliding_block(A, b, normal):
 
 
 def steps_of(problem, method, count):
-    """Iterates from clip(0, l, u)."""
+    """Return iterates from clip(0, l, u)."""
     work = method.init(problem)
     problem.bounds.refresh()
     work.residual.start(work.x, keep=False)
@@ -80,7 +86,10 @@ def steps_of(problem, method, count):
 @pytest.mark.parametrize("direction", list(ORDERS))
 @pytest.mark.parametrize("omega", [1.0, 0.7, 1.4])
 def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device):
-    """Each block solved by exhaustive search, x moved by omega of the way and projected."""
+    """Sweeps over blocks against the algorithm.
+
+    Each block is solved by exhaustive search; x moves by omega of the way and is projected.
+    """
     rng = np.random.default_rng(4801)
     A, b = spd(11, 4801), 2 * rng.standard_normal(11)
     lower, upper = (
@@ -110,7 +119,11 @@ def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device)
 
 @pytest.mark.parametrize("omega", [1.0, 0.7])
 def test_contacts_with_friction_are_blocks_whose_limits_are_part_of_them(omega, device):
-    """n >= 0 and |t| <= mu n at once; the normal force, whose bounds are constant, is projected before those that its size limits."""
+    """Contacts with friction as blocks with their limits.
+
+    n >= 0 and |t| <= mu n at once; the normal force, whose bounds are constant, is projected before
+    the forces that it limits.
+    """
     normal, states = (
         np.tile([-1, 0, 0], 3) + np.repeat([0, 3, 6], 3) * (np.tile([0, 1, 1], 3)),
         set(),
@@ -136,7 +149,11 @@ def test_contacts_with_friction_are_blocks_whose_limits_are_part_of_them(omega, 
 @pytest.mark.parametrize("method", [Staggering, BlockedGaussSeidel])
 @pytest.mark.parametrize("direction", ["forward", "symmetric"])
 def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, device):
-    """A_BB x_B + (b_B + A_BC x_C) within its own bounds, by a method that solves to rounding; unsymmetric, so that rows are no columns."""
+    """Rounds over subproblems against the algorithm.
+
+    A_BB x_B + (b_B + A_BC x_C) within its own bounds, by a method that solves to rounding; A is
+    unsymmetric, so that rows and columns differ.
+    """
     rng = np.random.default_rng(4821)
     C = rng.standard_normal((12, 12))
     A, b = spd(12, 4821) + 0.2 * (C - C.T), 2 * rng.standard_normal(12)
@@ -173,7 +190,11 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
 
 
 def test_normal_and_tangential_forces_in_turn(device):
-    """[Book] 2.2.4: normal forces with friction held, then friction within the limits of these normal forces, from round to round."""
+    """Normal and tangential forces in turn, [Book] 2.2.4.
+
+    Each round solves for normal forces with friction fixed, then for friction within the limits of
+    these normal forces.
+    """
     normal = np.repeat(np.arange(0, 9, 3), 3)
     normal[::3] = -1
     normals, tangential = np.flatnonzero(normal < 0), np.flatnonzero(normal >= 0)
@@ -201,7 +222,10 @@ def test_normal_and_tangential_forces_in_turn(device):
 
 
 def test_grid_blocks_see_the_others_cells_as_boundary_values(device):
-    """Left and right of a 2-D grid with AIR and SOLID in turn, each solved to rounding."""
+    """Grid blocks with the other cells as boundary values.
+
+    Left and right of a 2-D grid with AIR and SOLID in turn, each solved to rounding.
+    """
     rng = np.random.default_rng(4841)
     cells = np.ones((3, 6), dtype=int)
     cells[0, 0], cells[1, 3], cells[2, 5] = wl.AIR, wl.SOLID, wl.AIR

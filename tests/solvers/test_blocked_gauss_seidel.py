@@ -1,4 +1,8 @@
-"""Blocks of one are projected Gauss-Seidel, one block is its solver; in between strong coupling inside blocks costs nothing."""
+"""Blocked Gauss-Seidel.
+
+Blocks of one are projected Gauss-Seidel, one block is its solver; in between, strong coupling
+inside blocks costs nothing.
+"""
 
 import itertools
 
@@ -28,7 +32,7 @@ def operators(A, device):
 
 
 def block_sweep(A, b, lower, upper, x, blocks):
-    """One sweep with exhaustive search in the blocks."""
+    """Return one sweep with exhaustive search in the blocks."""
     for block in blocks:
         rest = b[block] + A[block] @ x - A[np.ix_(block, block)] @ x[block]
         x[block] = boxed(A[np.ix_(block, block)], rest, lower[block], upper[block])
@@ -59,7 +63,10 @@ def test_a_sweep_solves_each_block_exactly(size, device):
 
 
 def test_contacts_in_space_are_blocks_without_being_asked_for(device):
-    """Three unknowns each: where nothing else couples them, one sweep solves all."""
+    """Default blocks of 3-D contacts: three unknowns each.
+
+    Where nothing else couples them, one sweep solves all.
+    """
     rng = np.random.default_rng(163)
     contacts, b = [spd(3, seed) for seed in range(5)], -rng.random(15)
     A = scipy.sparse.block_diag(contacts).toarray()
@@ -113,7 +120,11 @@ def test_one_block_is_its_solver(sub_solver, device):
 
 
 def test_strong_coupling_inside_blocks_costs_no_sweeps(device):
-    """Pairs coupled by 0.999, weakly with others: scalar sweeps contract by 0.998, block sweeps at once."""
+    """Strong coupling inside blocks, at no cost in sweeps.
+
+    Pairs are coupled by 0.999, weakly with others: scalar sweeps contract by 0.998, block sweeps at
+    once.
+    """
     pairs, rng = 10, np.random.default_rng(163)
     A = np.kron(np.eye(pairs), [[1.0, 0.999], [0.999, 1.0]])
     A += 1e-4 * spd(2 * pairs, 5)
@@ -133,7 +144,11 @@ def test_strong_coupling_inside_blocks_costs_no_sweeps(device):
 
 
 def test_blocks_that_active_sets_cycle_on_are_solved_all_the_same(device):
-    """Newton's changes of the set cycle on this P-matrix; the least index ends that. Every right-hand side of signs +-1."""
+    """Blocks on which active sets cycle: solved nevertheless.
+
+    Newton's changes of the set cycle on this P-matrix; the least index ends that. Every right-hand
+    side of signs +-1.
+    """
     A = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
     for signs in itertools.product((-1.0, 1.0), repeat=3):
         b = np.array(signs)
@@ -147,7 +162,10 @@ def test_blocks_that_active_sets_cycle_on_are_solved_all_the_same(device):
 
 
 def test_singular_blocks_take_a_set_that_is_regular(device):
-    """Rank one: x_0 + x_1 = 1 has many solutions, of which one at a bound is taken."""
+    """Singular blocks: a regular set is used.
+
+    Rank one: x_0 + x_1 = 1 has many solutions, of which one at a bound is returned.
+    """
     problem = wl.LCP(wl.DenseOperator(np.ones((2, 2)), device=device), -np.ones(2), 0.0, 1.0)
     result = wl.solve(problem, BlockedGaussSeidel(blocks=2), stopping=TIGHT)
     assert result

@@ -1,4 +1,7 @@
-"""Grids with a term of low rank, as bodies in a liquid have: against dense oracles, and iterations whatever the bodies weigh."""
+"""Grids with a low-rank term, as of bodies in a liquid.
+
+Against dense oracles; iterations do not depend on the weight of the bodies.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +16,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=400)
 
 
 def small(device, dtype=wp.float64):
-    """A grid with three columns on a few cells, its dense matrix and which cells are unknowns."""
+    """Return a grid with three columns on a few cells.
+
+    Also its dense matrix and which cells are unknowns.
+    """
     rng = np.random.default_rng(43)
     cells = rng.choice(3, (8, 9), p=[0.1, 0.8, 0.1])
     cells[0, 0] = wl.AIR
@@ -37,7 +43,10 @@ def small(device, dtype=wp.float64):
     [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()],
 )
 def test_the_dense_oracle_agrees(solver, weights, scale, device):
-    """Weights may be singular: a body that rests against a wall cannot move in all directions."""
+    """Agreement with the dense oracle.
+
+    Weights may be singular: a body that rests against a wall cannot move in all directions.
+    """
     grid, U, stencil, fluid = small(device)
     u, W = U.reshape(-1, 3), scale * weights
     dense = (stencil + u @ W @ u.T)[np.ix_(fluid, fluid)]
@@ -51,7 +60,10 @@ def test_the_dense_oracle_agrees(solver, weights, scale, device):
 
 
 def tank(n, bodies, ratio, device):
-    """A 3-D tank with boxes of so many times the liquid's density in it: unknowns, columns of their motions, and the operator."""
+    """Return a 3-D tank with boxes of some density ratio.
+
+    The result is unknowns, columns of their motions, and the operator.
+    """
     cells = np.ones((n, n, n), dtype=int)
     cells[:, -n // 5 :] = wl.AIR
     blocks, weights = [], []
@@ -69,7 +81,7 @@ def tank(n, bodies, ratio, device):
         U = np.zeros((*cells.shape, 6))
         for axis, storage in enumerate((2, 1, 0)):
             for step in (-1, 1):
-                # the body lies `step` cells on
+                # The body lies `step` cells further.
                 beside = np.roll(solid, -step, axis=storage) & fluid
                 place = [x - center[0], y - center[1], z - center[2]]
                 place[axis] = place[axis] + 0.5 * step / n
@@ -103,10 +115,13 @@ def tank(n, bodies, ratio, device):
 
 
 def falls(cells, columns):
-    """The outflow of a liquid and bodies that fall, with noise; walls let go of the liquid where it touches them."""
+    """Return the outflow of a falling liquid and falling bodies, with noise.
+
+    Walls separate from the liquid where it touches them.
+    """
     fluid, rng = cells == wl.FLUID, np.random.default_rng(53)
     b = 0.05 * rng.standard_normal(cells.shape)
-    b[:, 0] -= 1.0  # nothing leaves through the floor: what falls is stopped there
+    b[:, 0] -= 1.0  # no outflow through the floor: it stops the fall
     lower = np.full(cells.shape, -np.inf)
     lower[np.abs(columns).sum(axis=-1) > 0] = 0.0
     lower[:, 0] = 0.0
@@ -131,7 +146,10 @@ def test_iterations_hardly_depend_on_what_bodies_weigh(solver, bodies, device):
 
 @pytest.mark.parametrize("bodies", [1, 3])
 def test_iterations_where_walls_let_go(bodies, device):
-    """With bounds, the active set has to be found as well: for the lightest bodies that takes longer."""
+    """Iterations with separating walls.
+
+    The active set must be found as well; for the lightest bodies that takes longer.
+    """
     counts = {}
     for ratio in (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3):
         cells, columns, A, _ = tank(24, bodies, ratio, device)
@@ -154,7 +172,10 @@ def test_iterations_where_walls_let_go(bodies, device):
 
 
 def test_a_plain_preconditioner_is_not_enough(device):
-    """The correction is what the counts above are due to."""
+    """Plain preconditioner: not enough.
+
+    The correction is the reason for the counts above.
+    """
     cells, columns, A, _ = tank(24, 1, 1e-3, device)
     problem = wl.LCP(A, falls(cells, columns)[0], -np.inf)
     counts = []
@@ -194,12 +215,13 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
         correction.begin()
         work.hierarchy.cycle.run()
         correction.end()
-        np.testing.assert_allclose(finest.b.numpy(), side, atol=1e-12)  # what `begin` took is back
+        # The effect of `begin` is reverted.
+        np.testing.assert_allclose(finest.b.numpy(), side, atol=1e-12)
         z.append(finest.x.numpy().copy())
     assert z[0] @ r[1] == pytest.approx(z[1] @ r[0], rel=1e-8)
     assert z[0] @ r[0] > 0 < z[1] @ r[1]
     # M (A + U W U') is near 1 on the potentials of the columns, where a cycle alone would give the
-    # mass ratio
+    # mass ratio.
     U = work._low.columns
     e = np.zeros(U.rank)
     e[1] = 1.0
@@ -237,7 +259,10 @@ def test_a_closed_box_full_of_liquid_is_solved_if_b_is_compatible(net, device):
 
 
 def test_bodies_may_come_and_go_in_place(device):
-    """A workspace serves columns and weights that change: of bodies that touch nothing, and then do."""
+    """Bodies that appear and disappear in place.
+
+    A workspace serves columns and weights that change: of bodies that touch nothing, and then do.
+    """
     cells, columns, A, _ = tank(16, 1, 0.05, device)
     low = A.second
     rows, blocks, values = low.columns.entries()
@@ -261,7 +286,11 @@ def test_bodies_may_come_and_go_in_place(device):
 
 @pytest.mark.parametrize(("weight", "precision"), [(1e4, "mixed"), (1e6, "mixed"), (1e8, "double")])
 def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision):
-    """Projections leap there, projected cycles of the grid hardly move: the active set went round in a circle, and the solve stagnated."""
+    """Very light bodies with separating walls.
+
+    Projections jump there, and projected cycles of the grid hardly move: the active set cycled, and
+    the solve stagnated.
+    """
     rng = np.random.default_rng(7919)
     cells, U = np.ones((14, 15, 24), dtype=int), np.zeros((14, 15, 24, 2))
     cells[:, -1] = wl.AIR
@@ -290,7 +319,11 @@ def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision)
 
 @pytest.mark.parametrize("cycles", [1, 2, 3])
 def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, device, monkeypatch):
-    """Projected cycles keep every unknown free and make no correction. The first correction comes after them."""
+    """Correction of the free set after the projected cycles.
+
+    Projected cycles keep every unknown free and make no correction. The first correction comes
+    after them.
+    """
     taken, made = [], []
     renew = LowRankCorrection.renew
 

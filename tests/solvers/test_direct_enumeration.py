@@ -1,4 +1,4 @@
-"""Direct enumeration against exhaustive search and by hand; batches against single problems."""
+"""Direct enumeration against exhaustive search and by hand; batches."""
 
 import itertools
 import time
@@ -26,7 +26,7 @@ def solve(A, b, lower=0.0, upper=np.inf):
 
 
 def random_bounds(rng, n):
-    """All kinds of rows: equations, one-sided, boxes, fixed values."""
+    """Return all kinds of rows: equations, one-sided, boxes, fixed values."""
     kind = rng.integers(0, 5, n)
     lower = np.where(np.isin(kind, (1, 3)), -rng.random(n), np.where(kind == 4, 0.3, -np.inf))
     upper = np.where(np.isin(kind, (2, 3)), rng.random(n), np.where(kind == 4, 0.3, np.inf))
@@ -36,7 +36,10 @@ def random_bounds(rng, n):
 @settings(max_examples=200, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 4))
 def test_any_matrix_any_bounds(seed, n):
-    """Unsymmetric and indefinite: whether a solution exists, exhaustive search in NumPy tells."""
+    """Any matrix with any bounds.
+
+    Unsymmetric and indefinite: exhaustive search in NumPy decides whether a solution exists.
+    """
     rng = np.random.default_rng(seed)
     A, b = rng.standard_normal((n, n)), rng.standard_normal(n)
     lower, upper = random_bounds(rng, n)
@@ -70,7 +73,10 @@ def test_all_solutions(A, b, expected):
 
 
 def test_singular_free_blocks():
-    """Two equations with one unknown too many have a basic solution; incompatible ones have none."""
+    """Singular free blocks.
+
+    Two equations with one unknown too many have a basic solution; incompatible ones have none.
+    """
     A = np.array([[1.0, 1.0], [1.0, 1.0]])
     result = solve(A, np.array([-2.0, -2.0]), lower=-np.inf)
     assert result
@@ -107,9 +113,9 @@ def test_batch(n, dtype, device):
                 natural_residual(A[k], b[k], lower[k], upper[k], x[k])
                 <= (1e-10 if exact else 1e-4) * scale
             )
-            for i in range(n):  # the set says where x is
+            for i in range(n):  # the set determines x
                 assert [x[k, i] == lower[k, i], True, x[k, i] == upper[k, i]][sets[k] // 3**i % 3]
-    # float32 cannot tell the nearly parallel ones
+    # float32 cannot distinguish the nearly parallel ones.
     assert wrong == 0 if exact else wrong <= m // 100
 
 
@@ -160,7 +166,7 @@ def test_kernels_compile_for_cuda(tmp_path):
 
 
 def python_enumeration(A, b):
-    """The same search in NumPy, first solution wins: what a user would write."""
+    """Return the solution by a plain search in NumPy, the first one found."""
     n = len(b)
     for free in itertools.product((False, True), repeat=n):
         rows = np.flatnonzero(free)

@@ -1,4 +1,7 @@
-"""Small and narrow problems: whole Newton steps on the host, what they hand over, Lemke's banded basis."""
+"""Small and narrow problems: whole Newton steps on the host, fallbacks.
+
+Lemke's banded basis is tested too.
+"""
 
 import itertools
 
@@ -16,7 +19,7 @@ from warp_lcp.solvers.lemke import BandedBasis, Basis
 
 DIRECT = wl.MinimumMapNewton(direct=True)
 TIGHT = wl.StoppingCriteria(rtol=1e-9)
-# nearly skew bands have cycles of whole steps, and defeat proximal points now and then
+# On nearly skew bands whole steps cycle, and proximal points sometimes fail.
 SURE = set(FAMILIES) - {"definite"}
 PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
 
@@ -44,7 +47,11 @@ def steps(result):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_default_solves_random_problems(family, device):
-    """P-matrices have one solution, so that a residual by NumPy says all; few unknowns are tried set by set as well."""
+    """Default method on random problems.
+
+    P-matrices have one solution, so that a residual by NumPy decides; few unknowns are enumerated
+    as well.
+    """
     for seed in range(5300, 5325):
         p = FAMILIES[family](seed)
         result = wl.solve(lcp(p, device), stopping=TIGHT, x0=p.start)
@@ -70,7 +77,10 @@ def test_m_matrices_take_whole_steps_alone(family):
 
 
 def test_a_contact_set_does_not_creep_back_by_a_layer_a_step():
-    """Releases that succeed in a row reach out; a plain active set takes a step a layer."""
+    """Contact set that shrinks by many layers in a step.
+
+    Successful releases in a row extend further; a plain active set needs a step for each layer.
+    """
     for seed in (5501, 5505):
         p = string(seed, n=2000, between=False)
         result = wl.solve(lcp(p), stopping=TIGHT)
@@ -126,7 +136,10 @@ def test_entries_and_bounds_that_change_in_place_count(device):
 
 @pytest.mark.parametrize("width", [0, 1, 2, 3])
 def test_banded_and_dense_factors_agree(width):
-    """A badly scaled unsymmetric matrix, so that pivots and held rows of other sizes tell."""
+    """Agreement of banded and dense factors.
+
+    The matrix is badly scaled and unsymmetric, so that pivots and fixed rows of other sizes matter.
+    """
     rng = np.random.default_rng(5519 + width)
     n = 40
     A = np.triu(np.tril(rng.standard_normal((n, n)), width), -width) + 4 * np.eye(n)
@@ -162,10 +175,11 @@ def test_cycles_are_handed_over():
     ],
 )
 def test_other_matrices_end_as_by_the_safeguarded_steps(A, b, lower):
-    """Singular blocks, none that solves, skew, negative, empty rows: the same status, dense and sparse, with what takes over.
+    """Other matrices: ends of the safeguarded steps.
 
-    Where the method stops at a negative diagonal entry, the default's pivots prove that there is no
-    solution.
+    The matrices are singular blocks with and without a solution, skew ones, negative ones, and ones
+    with empty rows. Dense and sparse ones have the same status, with fallbacks. Where the method
+    stops at a negative diagonal entry, the default's pivots prove that there is no solution.
     """
     proved = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
     for form in (A, scipy.sparse.csr_array(A)):
@@ -233,7 +247,11 @@ def test_direct_is_for_small_and_narrow_matrices():
 
 @pytest.mark.parametrize("flipped", [False, True])
 def test_lemke_makes_the_same_pivots_with_banded_factors(flipped):
-    """Against the inverse of the same problem, and the default's answer; upper bounds alone are the mirror image."""
+    """Lemke's pivots with banded factors: equal.
+
+    Against the inverse of the same problem, and the default's answer; upper bounds alone are the
+    mirror image.
+    """
     p = string(5557, n=150, between=False)
     if flipped:
         p = SmallProblem("", p.A, -p.b, np.full(150, -np.inf), -p.lower)
@@ -254,7 +272,10 @@ def test_lemke_makes_the_same_pivots_with_banded_factors(flipped):
 
 @pytest.mark.parametrize("form", ["box", "some boxes", "mirrored"])
 def test_lemke_makes_the_same_pivots_in_narrow_boxes(form):
-    """Rows s = u - l - z stand beside their z: the bandwidth of 1 becomes 3 at most."""
+    """Lemke's pivots in narrow boxes: equal.
+
+    Rows s = u - l - z stand beside their z: the bandwidth of 1 becomes 3 at most.
+    """
     for seed in range(5569, 5575):
         p, rng = string(seed, n=60, between=False), np.random.default_rng(seed)
         lower, upper = p.lower, p.lower + rng.uniform(0.01, 0.5, 60)
@@ -281,7 +302,10 @@ def test_lemke_makes_the_same_pivots_in_narrow_boxes(form):
 
 @pytest.mark.parametrize("size", [1e9, 1e110])
 def test_lemke_on_narrow_matrices_with_far_bounds_alone(size):
-    """Left out at first, they would leave rows without a bound, of which the narrow form takes none."""
+    """Lemke on narrow matrices with far bounds alone.
+
+    Left out at first, they would leave rows without a bound, which the narrow form does not take.
+    """
     A = scipy.sparse.diags_array([-1.0, 4.0, -1.0], offsets=[-1, 0, 1], shape=(50, 50)).tocsr()
     b = np.random.default_rng(5581).standard_normal(50)
     result = wl.solve(wl.LCP(A, b, -size, np.inf), wl.Lemke(), stopping=TIGHT)
@@ -305,7 +329,10 @@ def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():
 
 
 def test_lemke_widens_where_banded_factors_are_singular():
-    """Zeros on the diagonal: the basis without z0's column is singular, with it it is not."""
+    """Lemke with a wider basis where banded factors are singular.
+
+    With zeros on the diagonal the basis without z0's column is singular, with it it is not.
+    """
     n = 40
     A = scipy.sparse.diags_array(
         [np.tile([1.0, 0.0], 20)[:-1], np.tile([-1.0, 0.0], 20)[:-1]], offsets=[-1, 1], shape=(n, n)

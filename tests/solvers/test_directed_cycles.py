@@ -1,4 +1,7 @@
-"""I - rho S with a stochastic S: couplings go one way along the cycles of a directed graph, where algebraic multigrid fails."""
+"""Directed graphs, I - rho S with a stochastic S.
+
+Couplings go one way along cycles, where algebraic multigrid fails.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,11 @@ from warp_lcp.reduced.principal_system import principal_system
 
 
 def stochastic(rng, n, kind):
-    """S with row sums 1: a shift in natural order, one cycle or several in a random order, or a weighted graph of 2 to 5 arcs a node."""
+    """Return S with row sums 1.
+
+    A shift in natural order, one cycle or several in a random order, or a weighted graph of 2 to 5
+    arcs per node.
+    """
     order, ones = rng.permutation(n), np.ones(n)
     if kind == "shift":
         return scipy.sparse.csr_array((ones, (np.arange(n), (np.arange(n) + 1) % n)), shape=(n, n))
@@ -26,7 +33,7 @@ def stochastic(rng, n, kind):
 
 
 def drawn(seed, largest):
-    """A = I - rho S with rho from .9 to 1 - 1e-9, and b."""
+    """Return A = I - rho S with rho from 0.9 to 1 - 1e-9, and b."""
     rng = np.random.default_rng([seed, 52])
     n, rho = int(np.exp(rng.uniform(np.log(300), np.log(largest)))), 1 - 10 ** rng.uniform(-9, -1)
     S = stochastic(rng, n, rng.choice(["shift", "one cycle", "several cycles", "graph"]))
@@ -35,7 +42,10 @@ def drawn(seed, largest):
 
 
 def by_active_sets(A, b):
-    """x by active sets and SuperLU: for an M-matrix each set is part of the one before."""
+    """Return x by active sets and SuperLU.
+
+    For an M-matrix each set is part of the one before.
+    """
     x, active = np.zeros(len(b)), np.zeros(len(b), dtype=bool)
     for _ in range(len(b)):
         rows = np.flatnonzero(~active)
@@ -62,7 +72,10 @@ def check(seed, largest):
 
 
 def test_cycles_are_solved_by_default():
-    """Half of these ended MAX_ITERATIONS or STAGNATED, with relative residuals up to .96."""
+    """Cycles, solved by default.
+
+    Half of these ended with MAX_ITERATIONS or STAGNATED, with relative residuals up to 0.96.
+    """
     for seed in range(16):
         check(seed, 3000)
 
@@ -76,13 +89,16 @@ def test_the_solution_is_that_of_active_sets():
         wl.MinimumMapNewton(precision="double"),
         stopping=tight,
     ).x.numpy()
-    inverse = np.abs(exact).max() / np.abs(b).max()  # what A's inverse multiplies a residual by
+    inverse = np.abs(exact).max() / np.abs(b).max()  # factor of A's inverse on a residual
     assert np.abs(x - exact).max() <= 1e-10 * inverse * np.abs(exact).max(), seed
 
 
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_factors_take_over_from_a_hierarchy_that_fails(real):
-    """And stay for the next free set; an update of the entries gives the hierarchy another chance."""
+    """Factors after a failure of the hierarchy.
+
+    They stay for the next free set; an update of the entries gives the hierarchy another chance.
+    """
     rng, n = np.random.default_rng(8), 2500
     A = (scipy.sparse.eye_array(n) - 0.999999 * stochastic(rng, n, "several cycles")).tocsr()
     operator = wl.SparseOperator(A, device="cpu")
@@ -98,7 +114,7 @@ def test_factors_take_over_from_a_hierarchy_that_fails(real):
         iterations, _ = system.solve(1e-5 * system.norm(), 200)
         inside = np.flatnonzero(free)
         e = system.e.numpy()[inside].astype(np.float64)
-        # what rounding e itself leaves
+        # Rounding error of e itself.
         stored = np.finfo(wp.dtype_to_numpy(real)).eps * np.linalg.norm(e)
         assert (
             np.linalg.norm(A[inside][:, inside] @ e - r[inside])
@@ -115,7 +131,7 @@ def test_factors_take_over_from_a_hierarchy_that_fails(real):
 
 
 def test_shifts_are_weighed_as_before():
-    """Norms of a shifted system are measured in units of the shifted diagonal, whoever solves."""
+    """Norms of shifted systems, in units of the shifted diagonal for every solver."""
     rng, n = np.random.default_rng(9), 1200
     A = (scipy.sparse.eye_array(n) - 0.9999999 * stochastic(rng, n, "shift")).tocsr()
     system = principal_system(

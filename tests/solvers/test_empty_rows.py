@@ -1,4 +1,7 @@
-"""Rows of a matrix that couple nothing: y = b there, so x is the bound that b's sign asks for, whatever the method."""
+"""Empty rows of a matrix: y = b there, so x is at the bound of b's sign.
+
+That holds for every method.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ NAMES = [
 
 
 def chain():
-    """A tridiagonal matrix with some unknowns cut out."""
+    """Return a tridiagonal matrix with some unknowns cut out."""
     A = scipy.sparse.diags_array([-1.0, 2.05, -1.0], offsets=[-1, 0, 1], shape=(N, N)).toarray()
     A[list(EMPTY)], A[:, list(EMPTY)] = 0.0, 0.0
     b = np.random.default_rng(8).standard_normal(N)
@@ -86,7 +89,7 @@ def test_the_rows_are_found_again_when_the_entries_change(device):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_x_that_is_not_finite_is_no_solution(value, device):
-    """y says nothing of an x whose column is empty."""
+    """Solution x must be finite: y does not depend on an x whose column is empty."""
     problem = wl.LCP(
         wl.SparseOperator(scipy.sparse.csr_array((2, 2)), device=device),
         np.array([0.0, 0.0]),

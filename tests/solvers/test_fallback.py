@@ -1,4 +1,4 @@
-"""`wl.Fallback` against a plain loop: which method is asked in which step, what it is handed, and who is named."""
+"""`wl.Fallback` against a plain loop: methods by step, data, reported names."""
 
 import ast
 import pickle
@@ -23,7 +23,7 @@ LINES = wl.StoppingCriteria(rtol=1e-12, max_iterations=60)
 
 
 class Memory(IterateMemory):
-    """Of a toy: where each start was, and with what tolerance."""
+    """Memory of a toy method: each start, and its tolerance."""
 
     def start(self, *, warm, tolerance):
         self.begun, self.warm, self.tolerance, self.taken = (
@@ -36,7 +36,7 @@ class Memory(IterateMemory):
 
 @dataclass(frozen=True)
 class Shrink:
-    """Multiply the distance to the solution 1 of x = 1 by a rate in each step."""
+    """Toy method that multiplies the distance to the solution 1 by a rate."""
 
     rate: float
     name: str = "shrink"
@@ -57,7 +57,7 @@ class Shrink:
 
 @dataclass(frozen=True)
 class Refuses:
-    """A method that takes no such problem."""
+    """Toy method that refuses the problem."""
 
     name: ClassVar[str] = "refuses"
 
@@ -69,12 +69,15 @@ class Refuses:
 
 
 def lines(n=3):
-    """x_i = 1, equations."""
+    """Return the equations x_i = 1."""
     return wl.LCP(np.eye(n), -np.ones(n), -np.inf, np.inf)
 
 
 def plain(chain, problem, most):
-    """The same by a loop over plain numbers: names and distances to 1 before each step; `chain` has (rate, name, when)."""
+    """Return names and distances to 1 before each step, by a plain loop.
+
+    `chain` has (rate, name, when).
+    """
     distance, size, place, told = 1.0, np.sqrt(3), 0, Progress(problem, 1e-12 * np.sqrt(3))
     names, distances = [chain[0][1]], [1.0]
     for _ in range(most):
@@ -121,7 +124,10 @@ def test_the_chain_is_a_plain_loop(first):
 
 
 def test_the_best_iterate_is_handed_on_after_a_failure():
-    """The first method doubles the distance and fails; x = 0, the best so far, is where the second begins."""
+    """Best iterate, passed on after a failure.
+
+    The first method doubles the distance and fails; the second begins at x = 0, the best so far.
+    """
     second = Shrink(0.1, "b")
     result = wl.solve(
         lines(), wl.Fallback(Shrink(2.0, "a", fails_after=3), (second, wl.fails)), stopping=LINES
@@ -141,7 +147,10 @@ def test_the_last_iterate_is_handed_on_otherwise():
 
 @pytest.mark.parametrize("rate", [0.9, 0.1])
 def test_a_restarted_method_begins_cold_and_hands_on_what_it_was_given(rate):
-    """Whether its own iterates are better or not: the best one is kept for the end."""
+    """Restarted method: it begins cold and passes on its given iterate.
+
+    Whether its own iterates are better or not: the best one is kept for the end.
+    """
     restarted, last = Shrink(rate, "b", fails_after=2), Shrink(0.1, "c")
     chain = wl.Fallback(
         Shrink(0.5, "a"), wl.FallbackEntry(restarted, after(3), restart=True), (last, wl.fails)
@@ -156,7 +165,7 @@ def test_a_batch_counts_as_one_step():
     chain = wl.Fallback(Shrink(1.0, "a"), wl.FallbackEntry(Shrink(0.5, "b"), after(1), batch=10))
     result = wl.solve(lines(), chain, stopping=LINES)
     steps = [record for record in result.history if record.method == "b"]
-    # the first power below a tenth
+    # The first power below a tenth.
     np.testing.assert_allclose(steps[0].residual, np.sqrt(3) * 0.5**4)
     assert steps[0].linear_iterations == 1 + 4
 
@@ -198,7 +207,10 @@ def test_nothing_is_handed_over_at_the_rounding_floor():
 
 @dataclass(frozen=True)
 class AtFloor:
-    """Set x next to the solution 1, where the residual is what rounding leaves but not 0, and stay there."""
+    """Toy method that stays next to the solution 1.
+
+    The residual there is that of rounding, but not 0.
+    """
 
     name: str = "floor"
 
@@ -211,7 +223,10 @@ class AtFloor:
 
 
 def test_a_restarted_method_hands_over_at_the_rounding_floor():
-    """A path that leads nowhere ends, and the solve with FLOOR, not with MAX_ITERATIONS."""
+    """Restarted method at the rounding floor.
+
+    An unsuccessful path ends, and the solve with FLOOR, not with MAX_ITERATIONS.
+    """
     entries = [
         wl.FallbackEntry(AtFloor(), after(3), restart=True),
         (Shrink(1.0, "c", fails_after=2), wl.stalls),
@@ -280,7 +295,10 @@ def test_a_path_creeps():
 
 
 def test_a_workspace_is_used_again():
-    """The second solve begins with the first method, from its own start."""
+    """Reused workspace: the second solve begins with the first method.
+
+    From its own start.
+    """
     first, second = Shrink(0.5, "a", fails_after=3), Shrink(0.1, "b")
     problem, chain = lines(), wl.Fallback(first, (second, wl.fails))
     work = chain.init(problem)
@@ -333,7 +351,11 @@ def quarter_turn(kind=scipy.sparse.csr_array):
 )
 @pytest.mark.parametrize("kind", [np.array, scipy.sparse.csr_array], ids=["dense", "sparse"])
 def test_newton_and_active_sets_end_in_a_status_of_their_own(kind, method):
-    """Free blocks of one unknown are 0: neither method solves the problem alone, and no step is another method's."""
+    """Newton and active sets alone: a status of their own.
+
+    Free blocks of one unknown are 0: neither method solves the problem alone, and no step is
+    another method's.
+    """
     result = wl.solve(quarter_turn(kind), method)
     assert result.status in (
         wl.SolveStatus.STAGNATED,
@@ -350,7 +372,7 @@ def test_newton_and_active_sets_end_in_a_status_of_their_own(kind, method):
 
 
 def maze(n=61):
-    """A comb of channels one cell wide, in which cycles of whole blocks crawl."""
+    """Return a comb of channels one cell wide, where cycles of whole blocks are slow."""
     cells = np.full((n, n), wl.SOLID)
     cells[::2] = wl.FLUID
     cells[1::4, -1], cells[3::4, 0] = wl.FLUID, wl.FLUID
@@ -363,7 +385,11 @@ def maze(n=61):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_blocks_of_staggering_have_a_chain_of_their_own(seed):
-    """Two linear programs with their duals: free blocks are singular, where Newton's method alone ends with NON_DESCENT."""
+    """Fallbacks of the blocks of staggering.
+
+    Two linear programs with their duals: free blocks are singular, where Newton's method alone ends
+    with NON_DESCENT.
+    """
     rng = np.random.default_rng(seed)
     G, z = rng.standard_normal((9, 9)), np.maximum(rng.standard_normal(18), 0)
     S = np.block([[np.zeros((9, 9)), -G.T], [G, np.zeros((9, 9))]])
@@ -399,7 +425,10 @@ def test_without_fallback_the_first_method_ends_the_solve():
 
 
 def test_a_chain_costs_easy_grids_nothing():
-    """The bits and the steps are those of the first method, with kept workspaces too."""
+    """Fallbacks without cost on easy grids.
+
+    Bits and steps are those of the first method, with spare workspaces too.
+    """
     cells = np.ones((20, 30), dtype=np.int8)
     cells[0] = 0
     b = np.where(cells == 1, np.random.default_rng(6).standard_normal(cells.shape), 0.0)
@@ -434,7 +463,10 @@ def test_a_users_chain():
 
 
 def test_methods_import_no_other_inside_functions():
-    """A method that turns into another one would have to."""
+    """Imports of methods inside functions: none.
+
+    A method that turned into another one would need one.
+    """
     found = []
     for file in Path(wl.__file__).parent.joinpath("solvers").glob("*.py"):
         for function in (

@@ -1,4 +1,4 @@
-"""Finite bounds from 1e15 to 1e308: the solution without them, or an honest status."""
+"""Far finite bounds, 1e15 to 1e308: the same solution, or an honest status."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,9 @@ import warp_lcp as wl
 from oracle import boxed
 from warp_lcp.problem.protocol import families
 
-DRAWS = 4  # problems a method, dense and sparse, each with two sizes of bounds
+DRAWS = 4  # problems for each method, dense and sparse, each with two sizes of bounds
 SIZES = (1e15, 1e20, 1e30, 1e60, 1e100, 1e160, 1e200, 1e300, 1e308)
-# dense: these are sure of it
+# Dense: these methods always solve it.
 ANSWERS = (
     "lemke",
     "fischer-newton",
@@ -21,7 +21,7 @@ ANSWERS = (
 
 
 def drawn(seed, symmetric):
-    """Return A, positive definite, b, the bounds, and the bounds with far ones for infinity."""
+    """Return A, positive definite, b, the bounds, and far bounds for infinity."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 5))
     root, turn = rng.standard_normal((n, n)), rng.standard_normal((n, n))
@@ -44,7 +44,10 @@ def drawn(seed, symmetric):
 
 
 def check(name, seeds, sparse):
-    """No exception or warning, no wrong answer that says CONVERGED, no INFEASIBLE."""
+    """Check that there is no exception, false CONVERGED or INFEASIBLE.
+
+    Warnings are errors too.
+    """
     method, converged = wl.METHODS[name], 0
     for seed in seeds:
         A, b, lower, upper, low, high = drawn(
@@ -97,7 +100,11 @@ def test_many(name):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("method", [wl.Lemke(), wl.FischerNewton()])
 def test_both_sides_far(method, size):
-    """1 = x, whatever stands far off; x at a far bound is found, or not, but never said not to exist."""
+    """Far bounds on both sides.
+
+    1 = x, whatever the far bounds are. A solution at a far bound may be missed, but never reported
+    not to exist.
+    """
     A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([-1.0, -1.0])
     result = wl.solve(wl.LCP(A, b, -size, size), method)
     assert result

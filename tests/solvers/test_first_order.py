@@ -1,4 +1,7 @@
-"""NNCG and accelerated projected gradients: against plain loops in NumPy, oracles, and iteration budgets."""
+"""NNCG and accelerated projected gradients.
+
+They are compared with plain loops in NumPy and oracles, within iteration budgets.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +17,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 
 
 def obstacle(n, seed):
-    """Poisson on n^2 cells with AIR around, and a random b: an LCP whose Gauss-Seidel iterations grow as n^2."""
+    """Return Poisson on n^2 cells with AIR around, and a random b.
+
+    The Gauss-Seidel iterations of this LCP grow as n^2.
+    """
     cells = np.ones((n + 2, n + 2), dtype=int)
     cells[[0, -1]] = cells[:, [0, -1]] = wl.AIR
     b = np.where(
@@ -24,7 +30,7 @@ def obstacle(n, seed):
 
 
 def nncg_by_its_algorithm(A, b, steps):
-    """[Book] algorithm 8, with the projection; x after each step."""
+    """Return x after each step of [Book] algorithm 8, with the projection."""
     x, p, before, out = np.zeros(len(b)), np.zeros(len(b)), 0.0, []
     for _ in range(steps):
         y = x.copy()
@@ -82,7 +88,10 @@ def test_they_need_far_fewer_sweeps_than_gauss_seidel(solver, device):
 
 
 def test_gradient_steps_are_the_proximal_iteration(device):
-    """The first step is prox(x - D^-1 (A x + b) / L); the momentum begins with the third."""
+    """Gradient steps as the proximal iteration.
+
+    The first step is prox(x - D^-1 (A x + b) / L); the momentum begins with the third.
+    """
     rng = np.random.default_rng(107)
     B = rng.standard_normal((6, 6))
     A, b = B @ B.T / 6 + np.eye(6), rng.standard_normal(6)
@@ -102,7 +111,11 @@ def test_gradient_steps_are_the_proximal_iteration(device):
 
 @pytest.mark.parametrize("n", [5, 40])
 def test_the_first_step_is_as_long_as_the_spectrum_allows(n, device):
-    """Without bounds it is -D^-1 b / L, and L need not be far above the largest eigenvalue of D^-1/2 A D^-1/2."""
+    """Length of the first step, by the spectrum.
+
+    Without bounds it is -D^-1 b / L, and L need not be far above the largest eigenvalue of D^-1/2 A
+    D^-1/2.
+    """
     rng = np.random.default_rng(113)
     B = rng.standard_normal((n, n))
     A, b = B @ B.T / n + 0.5 * np.eye(n), rng.standard_normal(n)
@@ -119,7 +132,11 @@ def test_the_first_step_is_as_long_as_the_spectrum_allows(n, device):
 
 @pytest.mark.parametrize("start", [1e-3, 100.0])
 def test_a_wrong_lipschitz_constant_is_corrected_or_only_slow(start, device):
-    """Too small a constant would diverge; it grows until the steps' curvature is covered. Too large a one is slow."""
+    """Wrong Lipschitz constant: corrected, or only slow.
+
+    Too small a constant would diverge; it grows until it covers the steps' curvature. Too large a
+    one is slow.
+    """
     rng = np.random.default_rng(109)
     B = rng.standard_normal((20, 20))
     A, b = B @ B.T / 20 + 0.5 * np.eye(20), rng.standard_normal(20)
@@ -138,7 +155,10 @@ def test_a_wrong_lipschitz_constant_is_corrected_or_only_slow(start, device):
 
 
 def test_gradient_method_solves_singular_semidefinite_boxes(device):
-    """Rank 6 of 20: solutions are not unique, their y is."""
+    """Singular semi-definite boxes of rank 6 of 20.
+
+    Solutions are not unique, their y is.
+    """
     rng = np.random.default_rng(113)
     B = rng.standard_normal((20, 6))
     A, b = B @ B.T, rng.standard_normal(20)

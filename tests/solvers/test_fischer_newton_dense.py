@@ -1,4 +1,4 @@
-"""Fischer-Newton on dense matrices: answers within their bounds, units, and contacts by the hundred."""
+"""Fischer-Newton on dense matrices: bounds, units, many contacts."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,11 @@ def reference(problem):
 
 @pytest.mark.parametrize("safeguard", [True, False])
 def test_answers_are_within_their_bounds(safeguard):
-    """The chain's own iterates are not: at the end of most of these contacts some of them are below 0 by up to 4e-6."""
+    """Answers within their bounds.
+
+    The fallbacks' own iterates are not: at the end of most of these contacts some are below 0 by up
+    to 4e-6.
+    """
     for seed in range(10):
         problem = contact(10, seed=seed)
         result = wl.solve(dense(problem), wl.FischerNewton(safeguard=safeguard))
@@ -48,7 +52,10 @@ def test_boxes_hold_their_answers():
 
 @pytest.mark.parametrize("scale", [2.0**-27, 2.0**27])
 def test_contacts_in_other_units(scale):
-    """Masses and seconds are the user's: the same steps but for the end, where rows without a diagonal entry are measured."""
+    """Contacts in other units of mass and time.
+
+    The same steps except at the end, where rows without a diagonal entry are measured.
+    """
     for seed in range(10):
         problem = contact(10, seed=seed)
         plain, scaled = (wl.solve(dense(problem, s), wl.FischerNewton()) for s in (1.0, scale))
@@ -61,7 +68,11 @@ def test_contacts_in_other_units(scale):
 @pytest.mark.parametrize("contacts", [20, 30])
 @pytest.mark.parametrize("scale", [1.0, 1e8, 1e-8])
 def test_a_hundred_contacts_of_120_and_180_variables(contacts, scale):
-    """Rows of a zero diagonal count in A's own units: the criterion is that of the solver's units, A of scale 1."""
+    """Hundred contacts of 120 and 180 variables.
+
+    Rows of a zero diagonal count in A's own units: the criterion is that of the solver's units, A
+    of scale 1.
+    """
     steps = []
     for seed in range(100):
         problem = contact(contacts, seed=seed)

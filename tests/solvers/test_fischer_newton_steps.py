@@ -1,4 +1,7 @@
-"""Fischer-Newton iterate by iterate against a plain loop: systems, kinks, searches, and how it ends where the merit has a minimum only."""
+"""Fischer-Newton, iterate by iterate against a plain loop.
+
+Systems, kinks, searches, and the end at a minimum of the merit that is no solution.
+"""
 
 import math
 
@@ -16,8 +19,8 @@ from warp_lcp.solvers.fischer_newton import FischerDenseWorkspace, FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 
 BOUNDS = [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25), (-np.inf, np.inf)]
-# a merit with a minimum that is no solution, between the bounds, and where it is: A has the
-# eigenvalue -1/4, d = 1
+# A merit with a minimum that is no solution, between the bounds, and its place: A has the
+# eigenvalue -1/4, d = 1.
 MINIMUM = (
     1.625 * np.eye(3) - 0.625,
     np.array([-0.5, -0.25, 0.0]),
@@ -26,7 +29,10 @@ MINIMUM = (
 
 
 def unlike_rows(seed, n=9):
-    """Rows of every kind, unsymmetric, with x at bounds, three of its rows with y = 0: whole numbers over 8, so that kinks are exact."""
+    """Return rows of every kind, unsymmetric, with x at bounds.
+
+    Three of the rows have y = 0. Entries are whole numbers over 8, so that kinks are exact.
+    """
     rng = np.random.default_rng(seed)
     A = rng.integers(-7, 8, (n, n)) / 8
     np.fill_diagonal(A, 1.0)
@@ -41,7 +47,10 @@ def unlike_rows(seed, n=9):
 
 
 def shifted_direction(plain, x, drops):
-    """(A + D) e = -f / q, D = d p / q, q at least 1e-6, without the rows that do not move."""
+    """Return e of (A + D) e = -f / q, D = d p / q, q at least 1e-6.
+
+    Without the rows that do not move.
+    """
     f, p, q, kinks = plain.rows(x)
     q, moves = np.maximum(q, LEAST_Q), ~kinks if drops else np.full(len(x), True)
     e = np.zeros(len(x))
@@ -52,7 +61,7 @@ def shifted_direction(plain, x, drops):
 
 
 def jacobian_direction(plain, x, drops):
-    """J e = -f, without the rows that do not move."""
+    """Return e of J e = -f, without the rows that do not move."""
     f, _, _, kinks = plain.rows(x)
     moves, e = ~kinks if drops else np.full(len(x), True), np.zeros(len(x))
     e[moves] = np.linalg.solve(plain.jacobian(x)[np.ix_(moves, moves)], -f[moves])
@@ -60,13 +69,16 @@ def jacobian_direction(plain, x, drops):
 
 
 def regularized_direction(plain, x, drops):
-    """-(J'J + 1e-6 min(1, |f|) I)^-1 J'f."""
+    """Return -(J'J + 1e-6 min(1, |f|) I)^-1 J'f."""
     f, J = plain.rows(x)[0], plain.jacobian(x)
     return -np.linalg.solve(J.T @ J + 1e-6 * min(1.0, np.linalg.norm(f)) * np.eye(len(x)), J.T @ f)
 
 
 def plain_newton(plain, x, steps, direction, *, drops=False, memory=1):
-    """[Book] algorithm 12: x after each step, and how long steps were; searched along the projected path if the memory is 1."""
+    """Return x after each step of [Book] algorithm 12, and the step lengths.
+
+    Searched along the projected path if the memory is 1.
+    """
     found, merits = [], []
     for _ in range(steps):
         e, f = direction(plain, x, drops), plain.rows(x)[0]
@@ -82,7 +94,7 @@ def plain_newton(plain, x, steps, direction, *, drops=False, memory=1):
 
 
 def steps_of(problem, method, x0, count, read=lambda work: work.x.numpy()):
-    """Iterates of a method from x0, which is not projected."""
+    """Return iterates of a method from x0, which is not projected."""
     work = method.init(problem)
     work.residual.start(work.x, keep=False)
     work.x.assign(problem.layout.load(x0, wp.float64))
@@ -107,7 +119,11 @@ def operators(A, device):
 @pytest.mark.parametrize("share", [1.0, 0.6])
 @pytest.mark.parametrize("safeguard", [False, True])
 def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, device):
-    """Systems are solved to rounding, so that iterates differ by that alone; the search shortens some steps."""
+    """Matrix-free steps against the algorithm.
+
+    Systems are solved to rounding, so that iterates differ by that alone; the search shortens some
+    steps.
+    """
     lengths = []
     for seed in (4205, 4207, 4209, 4213, 4218):
         A, b, lower, upper, x0 = unlike_rows(seed)
@@ -122,7 +138,7 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
         )
         for operator in operators(A, device):
             problem = wl.LCP(operator, b, lower, upper)
-            # the map's unit
+            # Unit of the map.
             np.testing.assert_allclose(method.init(problem).residual.diagonal.numpy(), plain.d)
             for x, (y, _) in zip(steps_of(problem, method, x0, 5), expected, strict=True):
                 np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-10)
@@ -132,7 +148,10 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
-    """d = 1 whatever A's diagonal is, on the host and matrix-free; those of the scaled map are others."""
+    """Unscaled steps against the algorithm.
+
+    d = 1 whatever A's diagonal is, on the host and matrix-free; those of the scaled map differ.
+    """
     method = FischerNewton(
         kink=kink,
         fischer_weight=share,
@@ -143,7 +162,7 @@ def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
     )
     for seed in (4205, 4207, 4213):
         A, b, lower, upper, x0 = unlike_rows(seed)
-        b, A = b - np.arange(9) / 2 * x0, A + np.diag(np.arange(9) / 2)  # y as before
+        b, A = b - np.arange(9) / 2 * x0, A + np.diag(np.arange(9) / 2)  # y unchanged
         plain = PlainMap("fischer" if share == 1 else "penalized", A, b, lower, upper, share=share)
         scaled = plain_newton(plain, x0, 4, shifted_direction, drops=kink == "zero")
         plain.d = np.ones(9)
@@ -162,7 +181,10 @@ def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
 
 
 def test_unscaled_gradients_are_those_of_the_map():
-    """The projected gradient is J'f: the direction of gradient descent, and 0 at a minimum."""
+    """Gradients of the unscaled map.
+
+    The projected gradient is J'f: the direction of gradient descent, and 0 at a minimum.
+    """
     A, b, lower, upper, x0 = unlike_rows(4207)
     A = A + np.diag(np.arange(9) / 2)
     plain = PlainMap("fischer", A, b, lower, upper)
@@ -190,7 +212,10 @@ def test_unscaled_maps_have_no_safeguards():
 
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
 def test_plain_steps_on_the_host_are_those_of_the_algorithm(kink):
-    """In units in which A is equilibrated, here 1: the diagonal is 1 and no entry larger."""
+    """Plain steps on the host against the algorithm.
+
+    In units in which A is equilibrated, here 1: the diagonal is 1 and no entry is larger.
+    """
     lengths = []
     for seed in (4216, 4218, 4220, 4222, 4229, 4230):
         A, b, lower, upper, x0, plain = unit_rows(seed, share=0.95)
@@ -207,7 +232,10 @@ def test_plain_steps_on_the_host_are_those_of_the_algorithm(kink):
 
 
 def test_safeguarded_steps_on_the_host_are_those_of_the_algorithm():
-    """The regularized stage: its iterates may leave the bounds, its search remembers eight merits."""
+    """Safeguarded steps on the host against the algorithm.
+
+    The regularized stage: its iterates may leave the bounds, its search uses the last eight merits.
+    """
     outside, lengths = 0, []
     for seed in (4216, 4218, 4220, 4222, 4229, 4230):
         A, b, lower, upper, x0, plain = unit_rows(seed, share=0.95)
@@ -226,7 +254,10 @@ def test_safeguarded_steps_on_the_host_are_those_of_the_algorithm():
 
 
 def smoothed_row(a, y, c, low, high, mu):
-    """f of psi_mu(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), and its derivatives by x / d and by y."""
+    """Return f of psi_mu(a, b), and its derivatives by x / d and by y.
+
+    The map is psi_mu(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu).
+    """
 
     def psi(a, b):
         rho = math.sqrt(a * a + b * b + 2 * mu)
@@ -244,7 +275,11 @@ def smoothed_row(a, y, c, low, high, mu):
 
 @pytest.mark.parametrize("stage", [0, 1])
 def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
-    """Newton for A x + b = y and f_mu(x, y) = 0 at once, halved until (|A x + b - y|, |f_mu|) falls; mu falls by .3, then by .5 from 10."""
+    """Steps of the homotopies against the smoothed map.
+
+    Newton for A x + b = y and f_mu(x, y) = 0 at once, halved until (|A x + b - y|, |f_mu|) falls;
+    mu falls by 0.3, then by 0.5 from 10.
+    """
     halved = 0
     for seed in (4211, 4216, 4221, 4223, 4224, 4233):
         A, b, lower, upper, x, _ = unit_rows(seed, share=0.95)
@@ -258,7 +293,7 @@ def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
         x = np.clip(10.0, lower, upper) if stage else x
         y, mu = np.where(low & ~high, np.maximum(A @ x + b, 1.0), A @ x + b), 1.0
         np.testing.assert_allclose(work._y, y)
-        # so far from A x + b that the gap decides, too, how long steps are
+        # So far from A x + b that the gap decides, too, about the length of steps.
         y = work._y = y - 4.0 * (seed % 2)
 
         def map_at(x, y, mu, low=low, high=high, lower=lower, upper=upper):
@@ -293,7 +328,10 @@ def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
 
 
 def test_gradient_steps_are_those_of_the_algorithm():
-    """[Book] algorithm 13: x = clip(x - t d^-2 J'f), t halved from Barzilai and Borwein's length until the merit falls."""
+    """Gradient steps against [Book] algorithm 13.
+
+    x = clip(x - t d^-2 J'f), t halved from Barzilai and Borwein's length until the merit falls.
+    """
     halved = 0
     for seed, form in (
         (4205, "fischer"),
@@ -323,7 +361,7 @@ def test_gradient_steps_are_those_of_the_algorithm():
 
 
 def unit_rows(seed, share, n=7):
-    """A problem that is in the host's units as it is, and its map; two rows at kinks."""
+    """Return a problem already in the host's units, and its map; two rows at kinks."""
     rng = np.random.default_rng(seed)
     A = rng.uniform(-0.99, 0.99, (n, n))
     np.fill_diagonal(A, 1.0)
@@ -349,7 +387,10 @@ def unit_rows(seed, share, n=7):
 @pytest.mark.parametrize("share", [1.0, 0.6])
 @pytest.mark.parametrize(("safeguard", "scaled"), [(False, True), (True, True), (False, False)])
 def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scaled):
-    """The passes over rows: from x = 0 on walls, half of them with y = 0."""
+    """Steps on a grid against the algorithm.
+
+    They are the passes over rows, from x = 0 on walls, half of them with y = 0.
+    """
     rng = np.random.default_rng(4221)
     cells = rng.choice(3, (4, 5, 4), p=[0.1, 0.8, 0.1])
     cells[0, 0, 0] = wl.AIR
@@ -386,7 +427,10 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scal
 
 
 def test_slope_is_the_derivative_of_the_merit_along_any_direction(device):
-    """Against central differences, and against J'f, which needs products with A'."""
+    """Slope as the derivative of the merit along any direction.
+
+    Against central differences, and against J'f, which needs products with A'.
+    """
     rng = np.random.default_rng(4231)
     A, b, lower, upper, _ = unlike_rows(4231)
     x, e = rng.standard_normal((2, 9))
@@ -409,9 +453,11 @@ def test_slope_is_the_derivative_of_the_merit_along_any_direction(device):
 
 
 def test_inexact_directions_are_searched_by_their_own_slope():
-    """Equations with A = [[s, 1], [-1, s]]: an iteration of GMRES finds e = -s / (1 + s^2) y, along which the merit falls by s^2 of itself,
-    less than an exact direction promises: a search that takes the slope for -f'f refuses every
-    step.
+    """Search of inexact directions by their own slope.
+
+    Equations with A = [[s, 1], [-1, s]]: an iteration of GMRES finds e = -s / (1 + s^2) y. Along it
+    the merit falls by s^2 of itself, less than an exact direction promises. A search with the slope
+    -f'f refuses every step.
     """
     s = 5e-3
     A = np.array([[s, 1.0], [-1.0, s]])
@@ -427,7 +473,11 @@ def test_inexact_directions_are_searched_by_their_own_slope():
 
 
 def test_directions_that_lead_up_are_not_searched():
-    """A direction turned round: its slope is above 0, which ends the step after one trial; 27 halvings would find no better."""
+    """Ascent directions: no search.
+
+    The slope of a reversed direction is above 0, which ends the step after one trial; 27 halvings
+    would find nothing better.
+    """
     A, b, lower, upper, x0 = unlike_rows(4241)
     problem = wl.LCP(wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu"), b, lower, upper)
     method = FischerNewton(safeguard=False, precision="double")
@@ -466,7 +516,11 @@ def test_a_minimum_of_the_merit_that_is_no_solution_is_called_one(kind):
 
 @pytest.mark.parametrize("kind", ["dense", "sparse", "products"])
 def test_a_bound_may_make_the_minimum(kind):
-    """y = -x - 1 with x >= 0: the merit would fall beyond x = 0 alone; plain iterates keep to the bounds."""
+    """Minimum at a bound.
+
+    y = -x - 1 with x >= 0: the merit would fall beyond x = 0 alone; plain iterates stay within the
+    bounds.
+    """
     problem = wl.LCP(of_kind(kind, np.array([[-1.0]])), np.array([-1.0]))
     assert (
         wl.solve(problem, FischerNewton(safeguard=False, fischer_weight=1.0)).status
@@ -486,7 +540,10 @@ def test_a_minimum_is_not_told_from_products_alone():
 
 
 def test_a_failed_search_elsewhere_is_no_minimum():
-    """Contacts where plain steps end: the Jacobian is singular, the gradient as large as f."""
+    """Failed search that is no minimum.
+
+    Contacts where plain steps end: the Jacobian is singular, the gradient as large as f.
+    """
     statuses = []
     for seed in (13, 15, 17, 23):
         p = contact(20, seed=seed)
@@ -501,7 +558,7 @@ def test_a_failed_search_elsewhere_is_no_minimum():
 
 
 def of_kind(kind, A):
-    """An operator with entries or with products alone."""
+    """Return an operator with entries or with products alone."""
     if kind == "dense":
         return wl.DenseOperator(A, device="cpu")
     if kind == "sparse":
@@ -512,6 +569,6 @@ def of_kind(kind, A):
 
 
 def test_the_plain_search_is_armijos():
-    """The reference itself."""
+    """Plain search by Armijo's rule: the reference itself."""
     assert armijo(lambda x: 0.5 * x * x, lambda t: 1 - t, 0.5, -1.0) == 1.0
     assert armijo(lambda x: math.inf, lambda t: t, 0.5, -1.0) == 0.0

@@ -137,7 +137,11 @@ def test_convergence_to_ten_digits():
 
 @pytest.mark.parametrize("bounds", ["none", "walls"])
 def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
-    """Fused legs, sums over slabs of planes and launches without a team change no iteration; the sums alone may round otherwise."""
+    """Equal iterates for every way to launch.
+
+    Fused legs, sums over slabs of planes and launches without a thread pool change no iteration;
+    only the sums may round differently.
+    """
     _, plain = solve(24, bounds, "multigrid")
     monkeypatch.setattr(StencilLevel, "fuses", False)
     _, unfused = solve(24, bounds, "multigrid")

@@ -1,4 +1,7 @@
-"""Lines of a grid as blocks: one line is solved at once, strong coefficients along lines cost nothing."""
+"""Grid lines as blocks.
+
+One line is solved at once, and strong coefficients along lines cost nothing.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +17,11 @@ SHAPES = {wl.GridLines.X: (1, 1, 30), wl.GridLines.Y: (1, 30, 1), wl.GridLines.Z
 @pytest.mark.parametrize("axis", list(wl.GridLines))
 @pytest.mark.parametrize("arrays", [False, True])
 def test_a_single_line_is_solved_by_one_sweep(axis, arrays, device):
-    """With AIR at an end and in the middle, a SOLID cell, and boxes; the weight of the wrong face shows in the first digits."""
+    """Single line: solved by one sweep.
+
+    With AIR at an end and in the middle, a SOLID cell, and boxes; a wrong face's weight shows in
+    the first digits.
+    """
     rng = np.random.default_rng(197)
     shape = SHAPES[axis]
     cells = np.ones(30, dtype=int)
@@ -48,7 +55,11 @@ def test_a_single_line_is_solved_by_one_sweep(axis, arrays, device):
 
 @pytest.mark.parametrize("axis", list(wl.GridLines))
 def test_strong_coefficients_along_lines_cost_nothing(axis, device):
-    """Cells 10 times flatter than wide: sweeps over lines across them converge as fast as for cubes, over cells not in 10 x the sweeps."""
+    """Strong coefficients along lines, without cost.
+
+    Cells 10 times flatter than wide: sweeps over lines across them converge as fast as for cubes,
+    over cells not in 10 times the sweeps.
+    """
     rng = np.random.default_rng(199)
     cells = np.ones((9, 10, 8), dtype=int)
     cells[-1] = wl.AIR

@@ -1,4 +1,4 @@
-"""The passes over a grid that Newton-type methods make on the CPU: each against the same thing written out with a dense matrix."""
+"""Grid passes of Newton-type methods on the CPU against dense matrices."""
 
 from types import SimpleNamespace
 
@@ -28,7 +28,7 @@ FACES = [{}, {"face_y": 3.0}, "arrays"]
 
 
 def scene(form, lower=0.0, upper=np.inf):
-    """A grid with AIR and SOLID, its dense matrix, and a problem on it."""
+    """Return a grid with AIR and SOLID, its dense matrix, and a problem on it."""
     rng = np.random.default_rng(411)
     cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=SHAPE, p=[0.15, 0.75, 0.1])
     faces = form
@@ -61,7 +61,11 @@ def inner(field):
 @pytest.mark.parametrize("form", FACES, ids=str)
 @pytest.mark.parametrize("shifted", [False, True])
 def test_conjugate_gradients_solve_the_masked_and_shifted_system(form, shifted):
-    """A row of A p taken before the plane above is made, or a step of the wrong sign, would leave a residual; so would a lost shift."""
+    """Conjugate gradients on the masked and shifted system.
+
+    A row of A p that is used before the plane above is complete, a step of the wrong sign, or a
+    lost shift would leave a residual.
+    """
     s = scene(form)
     free = s.fluid & (s.rng.random(s.fluid.size) < 0.8)
     shift = 10 ** s.rng.uniform(-2, 6, s.fluid.size) if shifted else np.zeros(s.fluid.size)
@@ -69,7 +73,7 @@ def test_conjugate_gradients_solve_the_masked_and_shifted_system(form, shifted):
     system = GridSystem(s.problem.A, wp.float64, bounded=False, shifted=shifted)
     assert system.fused
     system.restrict(stored(s, free, wp.uint8), stored(s, shift) if shifted else None)
-    for _ in range(2):  # again: nothing of the last solve may be left
+    for _ in range(2):  # again: no data of the last solve may remain
         system.r.assign(stored(s, b))
         iterations, norm = system.solve(1e-11, 100)
         e = inner(system.e)
@@ -98,7 +102,11 @@ def test_conjugate_gradients_stop_without_a_right_hand_side():
 @pytest.mark.parametrize("share", [1.0, 0.9])
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, share, real):
-    """Against the map's separate kernels, which other tests hold to finite differences, and the dense residual."""
+    """Fischer step: its move, its residual and its system.
+
+    Against the map's separate kernels, which other tests compare with finite differences, and the
+    dense residual.
+    """
     s = scene(
         form,
         lower=np.where(np.arange(np.prod(SHAPE)) % 3, 0.0, -np.inf).reshape(SHAPE),
@@ -137,7 +145,11 @@ def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, sha
 @pytest.mark.parametrize("form", FACES, ids=str)
 @pytest.mark.parametrize("upper", [np.inf, 2.0])
 def test_a_step_along_the_path_is_mehrotras(form, upper):
-    """Predictor, ratios, corrector and move from their formulas; a product with an infinite w must count for nothing."""
+    """Step along the central path by Mehrotra's rule.
+
+    Predictor, ratios, corrector and move from their formulas; a product with an infinite w must
+    count as 0.
+    """
     s = scene(
         form,
         lower=np.where(np.arange(np.prod(SHAPE)) % 3, 0.0, -np.inf).reshape(SHAPE),
@@ -226,7 +238,11 @@ def test_a_step_along_the_path_is_mehrotras(form, upper):
 @pytest.mark.parametrize("precision", ["mixed", "single"])
 @pytest.mark.parametrize("periodic", [(False,) * 3, (True, True, True)])
 def test_what_the_minimum_map_holds_goes_to_its_bound(precision, periodic):
-    """The right-hand side must be that of the moved unknowns, in neighboring rows and across a periodic side as well."""
+    """Active unknowns of the minimum map move to their bounds.
+
+    The right-hand side must be that of the moved unknowns, also in neighboring rows and across a
+    periodic side.
+    """
     rng = np.random.default_rng(97)
     cells = rng.choice([wl.AIR, wl.FLUID], size=SHAPE, p=[0.2, 0.8])
     A, b, fluid = (
@@ -280,7 +296,10 @@ CROSSOVER = wl.Fallback(InteriorPoint(), (wl.MinimumMapNewton(), after_four_step
     "method", [InteriorPoint(), CROSSOVER], ids=["interior-point", "crossover"]
 )
 def test_unknowns_without_neighbors_are_solved_too(method):
-    """The interior-point method moves them off their bounds, where the method that it hands over to must not leave them."""
+    """Unknowns without neighbors, solved too.
+
+    The interior-point method moves them off their bounds; the fallback must not leave them there.
+    """
     cells = np.full((9, 9, 9), wl.FLUID)
     cells[0], cells[4:, :, 4] = wl.AIR, wl.SOLID
     cells[5:8, 3:6, 3:6] = wl.SOLID
@@ -302,7 +321,11 @@ def test_unknowns_without_neighbors_are_solved_too(method):
     ids=str,
 )
 def test_a_bad_guess_is_left_by_shorter_steps_or_projected_cycles(method):
-    """From a random warm start Newton's first steps raise the residual; the solution is that of a cold start all the same."""
+    """Bad initial guess: shorter steps or projected cycles.
+
+    From a random warm start Newton's first steps raise the residual; the solution is that of a cold
+    start.
+    """
     s = scene({}, lower=-0.2, upper=0.3)
     tight = wl.StoppingCriteria(rtol=1e-9)
     cold = wl.solve(s.problem, method, stopping=tight)
@@ -318,7 +341,11 @@ def test_a_bad_guess_is_left_by_shorter_steps_or_projected_cycles(method):
 )
 @pytest.mark.parametrize("periodic", [False, True])
 def test_the_best_iterate_is_returned_however_the_solve_is_cut_short(precision, seeds, periodic):
-    """Moves onto bounds, rejected steps and projected cycles all change x in place; what is kept of it must have the least residual."""
+    """Best iterate, however the solve is cut short.
+
+    Moves onto bounds, rejected steps and projected cycles all change x in place; the stored iterate
+    must have the least residual.
+    """
     rng = np.random.default_rng(31)
     cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=SHAPE, p=[0.05, 0.75, 0.2])
     problem = wl.LCP(
@@ -330,7 +357,7 @@ def test_the_best_iterate_is_returned_however_the_solve_is_cut_short(precision, 
     check, risen = NaturalResidual(problem), 0
     for seed in range(seeds):
         start = np.random.default_rng(seed).standard_normal(SHAPE)
-        # the last ones at the floor of the precision, where residuals go up and down
+        # The last ones are at the floor of the precision, where residuals fluctuate.
         for most in (1, 2, 4, 15):
             method = wl.MinimumMapNewton(
                 precision=precision, memory=1 + seed % 4, backtracks=seed % 3
@@ -350,12 +377,15 @@ def test_the_best_iterate_is_returned_however_the_solve_is_cut_short(precision, 
 
 
 def test_the_step_of_a_projected_cycle_is_its_correction_alone():
-    """Such a correction keeps to the bounds; with a share of the last direction it would not."""
+    """Step of a projected cycle: its correction alone.
+
+    Such a correction stays within the bounds; with a share of the last direction it would not.
+    """
     scalars = wp.array(np.linspace(2.0, 5.0, SLOTS), dtype=wp.float64, device="cpu")
     before = scalars.numpy().copy()
     wp.launch(plan_whole_step_kernel, 1, [scalars, False], device="cpu")
     after = scalars.numpy()
     assert (after[int(BETA)], after[int(CARRY)]) == (0.0, 0.0)
-    # the correction's unit, which changes for the next one
+    # The correction's unit, which changes for the next one.
     assert after[int(STEP)] == before[int(SIZE)]
     assert after[int(SIZE)] == np.sqrt(before[int(NORM)])

@@ -1,4 +1,7 @@
-"""What once broke a solver, or might: closed domains, boxes on them, extreme scales, values that are not finite, strange starts."""
+"""Problems that once broke a solver, or might.
+
+Closed domains, boxes on them, extreme scales, values that are not finite, unusual starts.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ def method(request):
 
 
 def closed(shape, seed=83, **options):
-    """A box full of liquid without AIR and a compatible b."""
+    """Return a box full of liquid without AIR and a compatible b."""
     b = np.random.default_rng(seed).standard_normal(shape)
     return wl.GridPoisson(np.ones(shape, dtype=int), device="cpu", **options), b - b.mean()
 
@@ -148,7 +151,7 @@ def test_coarsening_does_not_depend_on_the_first_cells(method):
 
 
 def linear_fractions(a, b):
-    """Open part of an edge between two distances, linear between."""
+    """Return the open part of an edge between two distances, linear between."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(a * b < 0, np.maximum(a, b) / (np.abs(a) + np.abs(b)), a + b > 0).astype(
             float
@@ -156,7 +159,10 @@ def linear_fractions(a, b):
 
 
 def box_around_a_disc(n=20, dx=0.04):
-    """A box full of falling liquid around a disc on its floor, one cell under the disc AIR; walls separate."""
+    """Return a box full of falling liquid around a disc on its floor.
+
+    One cell under the disc is AIR; walls separate.
+    """
     y, x = np.meshgrid(np.arange(n + 1) * dx, np.arange(n + 1) * dx, indexing="ij")
     distance = np.hypot(x - 0.4, y - 0.16) - 0.16
     face_x, face_y = (
@@ -174,9 +180,12 @@ def box_around_a_disc(n=20, dx=0.04):
 
 
 def test_an_active_set_that_goes_round_in_a_circle():
-    """A box full of liquid around a disc, its only air behind a face that is open in part: guesses of the free set follow each other in
-    a circle of four, in which all unknowns let go at once and the system is all but singular.
-    Projected cycles lead out of it."""
+    """Active set that cycles.
+
+    A box full of liquid around a disc, its only air behind a partly open face. Guesses of the free
+    set cycle with period four. In the cycle all unknowns are released at once and the system is
+    almost singular. Projected cycles lead out of it.
+    """
     problem = box_around_a_disc()
     for cycles in (0, 1, 2):
         result = wl.solve(
@@ -184,7 +193,7 @@ def test_an_active_set_that_goes_round_in_a_circle():
             wl.ProjectedMultigrid(monotone_cycles=cycles),
             stopping=wl.StoppingCriteria(rtol=1e-8),
         )
-        # FLOOR: the sums of these faces are rounded in float32
+        # FLOOR: the sums of these faces are rounded in float32.
         assert result.relative_residual <= 1e-8, result.status
         assert result.iterations <= 25
     expected = wl.solve(problem, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-8))

@@ -1,4 +1,8 @@
-"""Baraff's pivoting: definite and semi-definite, boxes, equations, infeasible problems; O(n^2) a pivot."""
+"""Baraff's pivoting.
+
+Problems are definite and semi-definite, with boxes, equations, and without a solution. A pivot
+costs O(n^2).
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +27,7 @@ def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT, **options)
 
 
 def semidefinite(rng, n, zeros):
-    """A symmetric matrix with a share of zero eigenvalues."""
+    """Return a symmetric matrix with a share of zero eigenvalues."""
     B = rng.standard_normal((n, n - int(zeros * n)))
     A = B @ B.T
     return (A + A.T) / 2
@@ -71,7 +75,10 @@ def test_larger_problem_against_lemke():
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), zeros=st.floats(0.2, 0.9))
 def test_semidefinite_problem_is_solved_or_infeasible_as_a_linear_program_says(seed, zeros):
-    """A semi-definite LCP has a solution if and only if some x >= 0 has A x + b >= 0."""
+    """Semi-definite problem, solved or infeasible as by a linear program.
+
+    A semi-definite LCP has a solution if and only if some x >= 0 has A x + b >= 0.
+    """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 30))
     A, b = semidefinite(rng, n, zeros), rng.standard_normal(n) + rng.choice([0.0, 0.5])
@@ -81,7 +88,10 @@ def test_semidefinite_problem_is_solved_or_infeasible_as_a_linear_program_says(s
 
 
 def test_infeasible_problem():
-    """y = A x + b cannot become positive in the direction (1, -1), where A is 0 and b is not."""
+    """Infeasible problem.
+
+    y = A x + b cannot become positive in the direction (1, -1), where A is 0 and b is not.
+    """
     result = solve(np.ones((2, 2)), np.array([-1.0, -2.0]), lower=-np.inf)
     assert result.status is wl.SolveStatus.INFEASIBLE
     assert solve(np.zeros((1, 1)), np.array([-1.0])).status is wl.SolveStatus.INFEASIBLE
@@ -89,7 +99,7 @@ def test_infeasible_problem():
 
 
 def test_degenerate_problem_does_not_cycle():
-    """Every pivot ties with every other."""
+    """Degenerate problem without cycling: every pivot ties with every other."""
     A = np.ones((30, 30)) + np.eye(30)
     result = solve(A, -np.ones(30))
     assert result, result.status
@@ -107,7 +117,10 @@ def test_warm_start_needs_few_pivots():
 
 
 def test_a_pivot_is_a_step_where_asked_for():
-    """The history then has a line a pivot, and the limit is honored exactly."""
+    """Pivots as steps.
+
+    The history then has a line per pivot, and the limit is exact.
+    """
     rng = np.random.default_rng(733)
     A = semidefinite(rng, 40, 0.0) + 0.1 * np.eye(40)
     b = planted(A, rng)
@@ -159,7 +172,11 @@ def test_settings_and_sizes_are_checked(monkeypatch):
 
 
 def test_inverse_follows_changes_of_the_set():
-    """Bordering and deflation against NumPy, without a fresh inverse on a well-conditioned block."""
+    """Inverse after changes of the set.
+
+    Bordering and deflation are compared with NumPy, without a fresh inverse on a well-conditioned
+    block.
+    """
     rng = np.random.default_rng(743)
     A = semidefinite(rng, 30, 0.0) / 30 + np.eye(30)
     inverse, members = PrincipalInverse(A), set()
@@ -190,7 +207,10 @@ def test_inverse_of_a_singular_block_is_a_least_squares_solution():
 
 
 def test_fresh_inverses_stay_rare():
-    """One at the end: all other pivots update, O(n^2)."""
+    """Number of fresh inverses: one at the end.
+
+    All other pivots update, in O(n^2).
+    """
     rng = np.random.default_rng(751)
     A = semidefinite(rng, 120, 0.0) / 120 + 0.1 * np.eye(120)
     problem = wl.LCP(wl.DenseOperator(A, device="cpu"), rng.standard_normal(120))

@@ -1,4 +1,8 @@
-"""INFEASIBLE is a proof: drawn problems with a planted solution, with a planted proof that there is none, and singular Laplacians."""
+"""INFEASIBLE as a proof.
+
+Random problems with a planted solution, or with a planted proof that there is none, and singular
+Laplacians.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +26,10 @@ def units(rng, n):
 
 
 def planted_solution(seed):
-    """Return A, b, l, u with b = y - A x for a solution x, y; A is positive semi-definite, of low rank, and perhaps reducible."""
+    """Return A, b, l, u with b = y - A x for a solution x, y.
+
+    A is positive semi-definite, of low rank, and perhaps reducible.
+    """
     rng = np.random.default_rng([5, seed])
     n = int(rng.integers(1, 30))
     F, K = rng.standard_normal((n, int(rng.integers(0, n + 1)))), rng.standard_normal((n, n))
@@ -50,7 +57,10 @@ def planted_solution(seed):
 
 
 def planted_proof(seed):
-    """Return A, b, l, u without a solution: z, of signs that the bounds ask for, has b'z + max g'x < 0, g = A'z; None where z = 0."""
+    """Return A, b, l, u without a solution, by construction of a certificate z.
+
+    z has the signs that the bounds require, b'z + max g'x < 0 and g = A'z; None where z = 0.
+    """
     A, b, lower, upper = planted_solution(seed)
     rng, n = np.random.default_rng([6, seed]), len(b)
     below, above = np.isfinite(lower), np.isfinite(upper)
@@ -102,7 +112,7 @@ def check(seeds):
 
 
 def test_drawn_problems():
-    """No false proof, and nearly all proofs are found, in any units."""
+    """Random problems: no false proof, and nearly all proofs found, in any units."""
     check(range(60))
 
 
@@ -114,7 +124,7 @@ def test_more_drawn_problems():
 @pytest.mark.parametrize(
     ("A", "b", "lower", "upper", "none"),
     [
-        # y_1 = -1, whatever the large row says
+        # y_1 = -1, whatever the large row is.
         ([[0.0, 0.0], [0.0, 1.0]], [-1.0, 1e16], 0.0, np.inf, True),
         ([[0.0, 0.0], [0.0, 1.0]], [1.0, -1e16], 0.0, np.inf, False),
         (
@@ -136,7 +146,7 @@ def test_more_drawn_problems():
         ([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0], -np.inf, 0.0, True),
         ([[1.0, -1.0], [-1.0, 1.0]], [-1.0, -1.0], -np.inf, 0.0, False),
         ([[-1.0]], [-1.0], 0.0, np.inf, True),  # y = -x - 1
-        # y_1 = x_2 - 3 <= -1
+        # y_1 = x_2 - 3 <= -1.
         ([[0.0, 1.0], [0.0, 0.0]], [-3.0, 1.0], [0.0, 0.0], [np.inf, 2.0], True),
         ([[0.0, 1.0], [0.0, 0.0]], [-1.0, 1.0], [0.0, 0.0], [np.inf, 2.0], False),
     ],
@@ -166,7 +176,10 @@ def ring(n, face=None):
 
 
 def reynolds(n, eccentricity):
-    """Return A, b of a journal bearing's film: b sums to 0 but for rounding, and a full film plus a constant is a solution."""
+    """Return A, b of a journal bearing's film.
+
+    b sums to 0 up to rounding, and a full film plus a constant is a solution.
+    """
     h = 1 + eccentricity * np.cos(2 * np.pi * np.arange(n) / n)
     b = np.roll(h, -1) - np.roll(h, 1)
     return ring(n, ((h + np.roll(h, -1)) / 2) ** 3), b - b.mean()
@@ -197,14 +210,20 @@ def test_a_ring(method, lower, dense):
 
 
 def test_an_empty_row_stays():
-    """Any x_2 is a solution: the central path once led it to 1e23."""
+    """Empty row: x_2 stays.
+
+    Any x_2 is a solution; the central path once moved it to 1e23.
+    """
     A = scipy.sparse.csr_array(np.array([[2.0, 0.0, -1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 2.0]]))
     result = wl.solve(wl.LCP(A, np.array([-1.0, 0.0, 1.0])), wl.InteriorPoint())
     assert result and abs(result.x.numpy()[1]) <= 1.0
 
 
 def equations(seed, largest):
-    """A dense singular matrix, symmetric or not, in units or not, and a vector w with A'w = 0."""
+    """Return a dense singular matrix and a vector w with A'w = 0.
+
+    It is symmetric or not, scaled or not.
+    """
     rng = np.random.default_rng([seed, 409])
     n = int(rng.integers(largest // 2, largest))
     kind = rng.choice(["graph", "low rank", "directed graph"])
@@ -240,7 +259,11 @@ def check_equations(seed, largest):
 
 
 def test_dense_equations_are_proved_to_have_no_solution():
-    """By multipliers from the null space, in three steps: what takes longer comes to linear programs of up to 100 s at 770 unknowns."""
+    """Proof that dense equations have no solution, in three steps.
+
+    By multipliers from the null space; otherwise linear programs of up to 100 s at 770 unknowns
+    would follow.
+    """
     found = [check_equations(seed, 300) for seed in range(16)]
     assert all(good for good, _ in found), [good.status for good, _ in found]
     assert all(bad.status is wl.SolveStatus.INFEASIBLE for _, bad in found), [
@@ -250,7 +273,10 @@ def test_dense_equations_are_proved_to_have_no_solution():
 
 
 def drawn_dominant(seed):
-    """Return a matrix whose rows are dominant, most of them weakly, and whether each row leads to a strictly dominant one."""
+    """Return a matrix with dominant rows, most of them weakly.
+
+    And whether each row leads to a strictly dominant one.
+    """
     rng = np.random.default_rng([8, seed])
     n = int(rng.integers(1, 25))
     A = np.where(
@@ -269,7 +295,10 @@ def drawn_dominant(seed):
 
 
 def check_dominance(seeds):
-    """The decision equals a plain loop's; such matrices are P-matrices, by principal minors of drawn index sets."""
+    """Check the dominance test against a plain loop.
+
+    Such matrices are P-matrices, by principal minors of random index sets.
+    """
     yes = 0
     for seed in seeds:
         A, expected = drawn_dominant(seed)

@@ -1,4 +1,7 @@
-"""The interior-point method iterate by iterate against a plain loop: start, directions, centering, step lengths, by both rules."""
+"""Interior-point method, iterate by iterate against a plain loop.
+
+Start, directions, centering and step lengths are compared, by both rules.
+"""
 
 import math
 
@@ -15,14 +18,16 @@ EXACT = {"precision": "double", "eta": 1e-14, "predictor_eta": 1e-14, "monotone_
 
 
 class PlainPath:
-    """Newton's method for y = s - t, w s = v t = tau with w = x - l, v = u - x, row by row; rows with l = u do not move.
+    """Newton's method for y = s - t, w s = v t = tau with w = x - l, v = u - x.
+
+    Row by row; rows with l = u do not move.
 
     Args:
         A, b, lower, upper: the problem.
-        mehrotra: predictor and corrector, or the book's rule.
+        mehrotra: whether to use predictor and corrector, or the book's rule.
         horizon: N of the book's rule.
         backoff: share of the way to the boundary, at most.
-        start: multiple of the size of b from which w d and s begin.
+        start: initial w d and s, as a multiple of the size of b.
     """
 
     def __init__(
@@ -41,7 +46,7 @@ class PlainPath:
         least = start * max(min(np.linalg.norm(b), 1e6 * norm), norm) / math.sqrt(n)
         self.w, self.v, self.s, self.t = (np.zeros(n) for _ in range(4))
         for i in range(n):
-            # the nearer bound's distance is chosen, half of the span at most
+            # The nearer bound's distance is used, at most half of the span.
             if self.low[i] and self.high[i]:
                 half = (upper[i] - lower[i]) / 2
                 if self.x[i] - lower[i] <= upper[i] - self.x[i]:
@@ -65,13 +70,16 @@ class PlainPath:
 
     @property
     def mu(self):
-        """Mean of the products."""
+        """Return the mean of the products."""
         return (
             self.w[self.low] @ self.s[self.low] + self.v[self.high] @ self.t[self.high]
         ) / self.pairs
 
     def direction(self, tau, correction_w, correction_v):
-        """Newton's dx, ds and dt for w s = tau - correction_w and v t = tau - correction_v."""
+        """Return Newton's dx, ds and dt.
+
+        They solve w s = tau - correction_w and v t = tau - correction_v.
+        """
         n = len(self.b)
         right, D, ds, dt = -(self.A @ self.x + self.b), np.zeros(n), np.zeros(n), np.zeros(n)
         for i in range(n):
@@ -97,7 +105,7 @@ class PlainPath:
         return dx, ds, dt
 
     def longest(self, dx, ds, dt):
-        """How far all of w, v, s and t stay positive."""
+        """Return the largest step for which w, v, s and t stay positive."""
         pairs = [
             (self.w, dx, self.low),
             (self.s, ds, self.low),
@@ -115,7 +123,7 @@ class PlainPath:
         )
 
     def step(self):
-        """[Book] algorithm 9 with its rules, or Mehrotra's."""
+        """Take a step of [Book] algorithm 9 with its rules, or Mehrotra's."""
         self.k += 1
         none = np.zeros(len(self.b))
         if self.mehrotra:
@@ -138,7 +146,7 @@ class PlainPath:
 
 
 def boxed_rows(seed, n=11):
-    """An unsymmetric positive definite problem with every kind of row."""
+    """Return an unsymmetric positive definite problem with every kind of row."""
     rng = np.random.default_rng(seed)
     B, C = rng.standard_normal((2, n, n))
     lower, upper = np.array([ROWS[k % 5] for k in range(n)]).T
@@ -148,7 +156,7 @@ def boxed_rows(seed, n=11):
 
 
 def started(work, problem):
-    """The workspace at clip(0, l, u)."""
+    """Return the workspace at clip(0, l, u)."""
     work.residual.start(work.x, keep=False)
     work.residual.evaluate(work.x)
     work.start(warm=False, tolerance=0.0)
@@ -156,7 +164,7 @@ def started(work, problem):
 
 
 def compare(method, work, problem, plain, place, steps, tolerance):
-    """x, w, v, s, t and mu after each step."""
+    """Compare x, w, v, s, t and mu after each step."""
     for k in range(steps):
         if not work.residual.current:
             work.residual.evaluate(work.x)
@@ -188,7 +196,11 @@ def compare(method, work, problem, plain, place, steps, tolerance):
     ids=repr,
 )
 def test_steps_are_those_of_the_algorithm(kind, settings, device):
-    """Both rules; a start near the bounds, whose first steps are cut short; the book's horizon, after which `backoff` is the share."""
+    """Steps against the algorithm, by both rules.
+
+    With a start near the bounds, whose first steps are short, and the book's horizon, after which
+    `backoff` is the share.
+    """
     for seed in (4501, 4502):
         A, b, lower, upper = boxed_rows(seed)
         operator = (
@@ -212,7 +224,10 @@ def test_steps_are_those_of_the_algorithm(kind, settings, device):
 @pytest.mark.parametrize("mehrotra", [True, False])
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25)])
 def test_steps_on_a_grid_are_those_of_the_algorithm(bounds, mehrotra):
-    """The passes over rows that condense the next system where a step ends."""
+    """Steps on a grid against the algorithm.
+
+    The passes over rows condense the next system where a step ends.
+    """
     rng = np.random.default_rng(4511)
     cells = rng.choice(3, (4, 5, 4), p=[0.1, 0.8, 0.1])
     cells[0, 0, 0] = wl.AIR
@@ -228,7 +243,10 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(bounds, mehrotra):
 
 
 def test_the_predictor_decides_the_centering():
-    """sigma = (what the predictor leaves / mu)^3: nothing is left where it goes all the way, all of it where it may not move."""
+    """Centering by the predictor: sigma = (mu after the predictor / mu)^3.
+
+    It is 0 if the predictor takes the full step, and 1 if it may not move.
+    """
     A, b, lower, upper = boxed_rows(4521)
     problem, method = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), InteriorPoint()
     work = started(InteriorPointWorkspace(problem, method), problem)

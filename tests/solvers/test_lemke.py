@@ -1,4 +1,4 @@
-"""Lemke's method: any matrix, contacts with friction, boxes by reformulation, rays."""
+"""Lemke's method: any matrix, frictional contacts, boxes by reformulation, rays."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,10 @@ def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT):
 
 
 def contacts(count, rng, friction=0.5):
-    """Stewart-Trinkle LCP of random bodies that touch in random points: blocks of normal, four tangents and the sliding speed beta."""
+    """Return the Stewart-Trinkle LCP of random bodies with random contacts.
+
+    Its blocks are the normal, four tangents and the sliding speed beta.
+    """
     bodies = max(2, count // 3)
     masses = rng.uniform(0.5, 2.0, bodies)
     inverse = np.concatenate(
@@ -86,7 +89,7 @@ def test_against_the_tableau():
     rng = np.random.default_rng(811)
     for _ in range(10):
         B, C = rng.standard_normal((2, 40, 40))
-        # positive definite, far from symmetric
+        # Positive definite, far from symmetric.
         A, b = B @ B.T / 40 + 0.1 * np.eye(40) + C - C.T, rng.standard_normal(40)
         np.testing.assert_allclose(solve(A, b).x.numpy(), lemke(A, b), atol=1e-9)
 
@@ -105,7 +108,10 @@ def test_boxes_equations_and_fixed_values(seed, n):
 
 
 def test_equations_with_a_singular_block_are_split():
-    """x_0 and x_1 are free and their block is 0: a saddle point that only its third row determines."""
+    """Equations with a singular block: split.
+
+    x_0 and x_1 are free and their block is 0: a saddle point that only its third row determines.
+    """
     A = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -2.0], [1.0, 2.0, 1.0]])
     b, lower = np.array([1.0, 2.0, -4.0]), np.array([-np.inf, -np.inf, 0.0])
     result = solve(A, b, lower)
@@ -123,7 +129,11 @@ def test_degenerate_problem_does_not_cycle():
 
 
 def test_lexicographic_rule_passes_an_example_with_ties():
-    """All ratios tie at the start and after it; a rule that takes any of them may come back to a basis it has had."""
+    """Lexicographic rule on an example with ties.
+
+    All ratios tie at the start and after it; a rule that takes any of them may return to an earlier
+    basis.
+    """
     A = np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 2.0], [2.0, 0.0, 1.0]])
     seen, basis = set(), Basis(A, -np.ones(3), np.ones(3))
     while (outcome := basis.pivot()) is None:
@@ -139,7 +149,7 @@ def test_lexicographic_rule_passes_an_example_with_ties():
     [
         (np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, -2.0]), 0.0),
         (np.ones((2, 2)), np.array([-1.0, -2.0]), -np.inf),
-        (-np.eye(3), -np.ones(3), 0.0),  # not semi-definite: the linear program tells
+        (-np.eye(3), -np.ones(3), 0.0),  # not semi-definite: the linear program decides
         (np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([-1.0, 1.0]), 0.0),
     ],
 )
@@ -153,7 +163,10 @@ def test_a_confirmed_ray_is_infeasible(A, b, lower):
 
 
 def test_a_ray_is_not_called_infeasible_where_a_solution_exists():
-    """Indefinite matrices with a planted solution: the path may end in rays, which then prove nothing."""
+    """Ray without INFEASIBLE where a solution exists.
+
+    Indefinite matrices with a planted solution: the path may end in rays, which then prove nothing.
+    """
     rng = np.random.default_rng(821)
     statuses = []
     for _ in range(60):
@@ -186,7 +199,7 @@ def test_limit_counts_single_pivots_where_asked_for():
     assert short.status is wl.SolveStatus.MAX_ITERATIONS
     assert short.iterations == 4
     x = short.x.numpy()
-    assert x.any()  # where it stands: complementary but for the covering variable
+    assert x.any()  # complementary except for the covering variable
     np.testing.assert_allclose(np.minimum(x, A @ x + b - (A @ x + b).min()), 0.0, atol=1e-12)
 
 
@@ -206,7 +219,11 @@ def test_large_problems_are_refused(monkeypatch):
 @pytest.mark.parametrize("size", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("load", [1e-8, 1e8])
 def test_units_do_not_matter(method, size, load):
-    """Rows and columns from 1e-3 to 1e3, A and b in any units: no certificate of infeasibility may depend on them."""
+    """Units without influence.
+
+    Rows and columns from 1e-3 to 1e3, A and b in any units: no certificate of infeasibility may
+    depend on them.
+    """
     if method is QuadraticProgram:
         pytest.importorskip("piqp")
     rng = np.random.default_rng(827)
@@ -222,7 +239,10 @@ def test_units_do_not_matter(method, size, load):
 
 
 def flipped(seed):
-    """-M of a definite matrix plus a skew one, in a box: a solution is sure to exist, and Lemke's usual covering vectors end in rays."""
+    """Return -M of a definite matrix plus a skew one, in a box.
+
+    A solution exists, and Lemke's usual covering vectors end in rays.
+    """
     rng = np.random.default_rng([seed, 222])
     n = int(np.exp(rng.uniform(np.log(2), np.log(24))))
     B, S = rng.standard_normal((n, n)), rng.standard_normal((n, n))
@@ -237,7 +257,10 @@ def flipped(seed):
 
 
 def test_finite_bounds_end_every_path_in_a_solution():
-    """A fifth of these ended STAGNATED, on rays of four covering vectors."""
+    """Paths with finite bounds: each ends in a solution.
+
+    A fifth of these ended STAGNATED, on rays of four covering vectors.
+    """
     for seed in range(40):
         A, b, lower, upper = flipped(seed)
         result = solve(A, b, lower, upper)

@@ -1,4 +1,7 @@
-"""Bimatrix games: the equilibrium by its definition, best answers to each other; games that are none keep Lemke's own start."""
+"""Bimatrix games: equilibria by definition, as best responses.
+
+Problems that are no games keep Lemke's own start.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +26,10 @@ def game(seed, *, integer):
 
 
 def problem(E, F):
-    """Return the LCP of costs E, F: E y >= 1, F'x >= 1, complementary to x, y >= 0."""
+    """Return the LCP of costs E, F.
+
+    E y >= 1 and F'x >= 1 are complementary to x, y >= 0.
+    """
     A = np.zeros((sum(E.shape),) * 2)
     A[: len(E), len(E) :], A[len(E) :, : len(E)] = E, F.T
     return A, -np.ones(len(A))
@@ -32,7 +38,11 @@ def problem(E, F):
 @pytest.mark.parametrize("integer", [False, True])
 @pytest.mark.parametrize("seed", range(20))
 def test_equilibria_are_best_answers_to_each_other(seed, integer):
-    """No strategy that a player uses costs more than another; integers make degenerate games, with ties at each pivot."""
+    """Equilibria as best responses to each other.
+
+    No strategy that a player uses costs more than another; integers make degenerate games, with
+    ties at each pivot.
+    """
     E, F = game(seed, integer=integer)
     A, b = problem(E, F)
     for method in (wl.Lemke(), None):
@@ -46,7 +56,10 @@ def test_equilibria_are_best_answers_to_each_other(seed, integer):
 
 
 def test_order_and_units_do_not_matter():
-    """Permuted and scaled by rows and columns, a game stays one."""
+    """Order and units without influence.
+
+    Permuted and scaled by rows and columns, a game stays a game.
+    """
     E, F = game(3, integer=False)
     A, b = problem(E, F)
     rng = np.random.default_rng(9)

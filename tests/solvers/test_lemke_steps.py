@@ -1,4 +1,7 @@
-"""Lemke's method pivot by pivot against a tableau of fractions, where ties are exact: the lexicographic rule, z0 first, the first row."""
+"""Lemke's method, pivot by pivot against a tableau of fractions with exact ties.
+
+The rules are the lexicographic one, z0 first, and the first row.
+"""
 
 from fractions import Fraction
 
@@ -10,11 +13,11 @@ from warp_lcp.solvers.lemke import BandedBasis, Basis
 
 
 class PlainTableau:
-    """[Book] appendix C: w - M z - d z0 = q in whole numbers; variables are w: 0 ... m-1, z: m ... 2m-1, z0: 2m.
+    """Tableau of w - M z - d z0 = q in whole numbers, [Book] appendix C.
 
-    The row that leaves has the lexicographically least (q, e_1, ..., e_m)-part over the entering
-    column, but z0 leaves whenever its ratio is least; z0 enters in the row whose (q_i, e_i) / d_i
-    is lexicographically least.
+    Variables are w: 0 ... m-1, z: m ... 2m-1, z0: 2m. The row that leaves has the lexicographically
+    least (q, e_1, ..., e_m)-part over the entering column, but z0 leaves whenever its ratio is
+    least. z0 enters in the row whose (q_i, e_i) / d_i is lexicographically least.
     """
 
     def __init__(self, M, q, d):
@@ -28,11 +31,14 @@ class PlainTableau:
         self.ties = 0
 
     def key(self, i, pivot):
-        """The q-part and the inverse's row over the pivot; lists are compared lexicographically."""
+        """Return the q-part and the inverse's row over the pivot.
+
+        Lists are compared lexicographically.
+        """
         return [self.table[i][-1] / pivot, *(v / pivot for v in self.table[i][: self.m])]
 
     def pivot(self):
-        """True when z0 has left, False on a ray, None to go on."""
+        """Pivot; return True when z0 has left, False on a ray, None to continue."""
         e = self.entering
         if e != 2 * self.m:
             rows = [i for i in range(self.m) if self.table[i][e] > 0]
@@ -58,14 +64,14 @@ class PlainTableau:
         return None
 
     def z(self):
-        """Values of z."""
+        """Return the values of z."""
         values = np.zeros(2 * self.m + 1)
         values[self.variables] = [float(row[-1]) for row in self.table]
         return values[self.m : 2 * self.m]
 
 
 def degenerate(seed, m, band=None, largest=2):
-    """Small whole numbers, many of b equal or 0: most ratios tie."""
+    """Return small whole numbers, many of b equal or 0: most ratios tie."""
     rng = np.random.default_rng(seed)
     M = rng.integers(-largest // 2, largest + 1, (m, m))
     M = M if band is None else np.triu(np.tril(M, band), -band)
@@ -78,7 +84,11 @@ def degenerate(seed, m, band=None, largest=2):
 
 @pytest.mark.parametrize(("band", "largest"), [(None, 2), (None, 7), (1, 2)])
 def test_pivots_are_those_of_the_lexicographic_rule(band, largest):
-    """The same variables after every pivot, to the end or the ray; by a dense inverse and by banded factors."""
+    """Pivots by the lexicographic rule.
+
+    The same variables after every pivot, to the end or the ray, by a dense inverse and by banded
+    factors.
+    """
     ties, ends, pivots = 0, [], 0
     for seed in range(4901, 4961):
         M, q, d = degenerate(seed, 7, band, largest)
@@ -113,7 +123,11 @@ def test_pivots_are_those_of_the_lexicographic_rule(band, largest):
 
 
 def test_z0_leaves_as_soon_as_it_may():
-    """Three rows tie, of which z0's is not the lexicographically least: it leaves all the same, and the path has ended."""
+    """z0 leaves as early as possible.
+
+    Three rows tie, of which z0's is not the lexicographically least: it leaves nevertheless, and
+    the path has ended.
+    """
     seen = 0
     for seed in range(4971, 5031):
         M, q, d = degenerate(seed, 4)

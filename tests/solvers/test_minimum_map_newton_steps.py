@@ -1,4 +1,7 @@
-"""Newton's method on the minimum map: iterates against a plain loop, index sets at ties, and the method without any other's help."""
+"""Newton's method on the minimum map, iterates against a plain loop.
+
+Index sets at ties are compared, and the method runs without any fallback.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +21,10 @@ PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
 
 
 def index_sets(d, x, y, lower, upper):
-    """Below where d (x - l) < y, above where d (x - u) > y, row by row; ties are free."""
+    """Return index sets: below if d (x - l) < y, above if d (x - u) > y.
+
+    Row by row; ties are free.
+    """
     below, above = np.zeros(len(x), dtype=bool), np.zeros(len(x), dtype=bool)
     for i in range(len(x)):
         below[i] = d[i] * (x[i] - lower[i]) < y[i]
@@ -27,7 +33,7 @@ def index_sets(d, x, y, lower, upper):
 
 
 def norm(d, x, y, lower, upper):
-    """Norm of the minimum map max(min(y, d (x - l)), d (x - u))."""
+    """Return the norm of the minimum map max(min(y, d (x - l)), d (x - u))."""
     return np.linalg.norm(
         [
             max(min(v, e * (a - low)), e * (a - high))
@@ -37,11 +43,13 @@ def norm(d, x, y, lower, upper):
 
 
 def plain_newton(A, b, lower, upper, x, steps, *, memory, backtracks=6):
-    """[Book] algorithm 10 with eq. 2.139: held unknowns go onto their bounds, A_FF e = -y_F, and x = clip(x + t e) by Armijo's rule.
+    """Return iterates of [Book] algorithm 10 with eq. 2.139.
+
+    Active unknowns move onto their bounds, A_FF e = -y_F, and x = clip(x + t e) by Armijo's rule.
 
     Returns:
-        For each step x after it, how many are held, and t; t = 0 where the search fails, which
-        leaves x on its bounds.
+        For each step: x after it, the number of active unknowns, and t. t = 0 if the search
+        fails, which leaves x on its bounds.
     """
     d, norms, found = np.diag(A), [], []
     for _ in range(steps):
@@ -65,7 +73,10 @@ def plain_newton(A, b, lower, upper, x, steps, *, memory, backtracks=6):
 
 
 def with_ties(seed, n=10):
-    """Every kind of row, whole numbers over 8, d = 1; three rows with x - y / d exactly at a bound, from without, within and at it."""
+    """Return rows of every kind in whole numbers over 8, d = 1.
+
+    Three rows have x - y / d exactly at a bound, with x outside, inside and at it.
+    """
     rng = np.random.default_rng(seed)
     A = rng.integers(-7, 8, (n, n)) / 8
     np.fill_diagonal(A, 1.0)
@@ -78,7 +89,7 @@ def with_ties(seed, n=10):
 
 
 def steps_of(problem, method, x0, count):
-    """Iterates of a method from x0 and what its steps say."""
+    """Return iterates of a method from x0 and the reports of its steps."""
     work = method.init(problem)
     work.residual.start(work.x, keep=False)
     work.x.assign(problem.layout.load(x0, wp.float64))
@@ -98,7 +109,11 @@ def steps_of(problem, method, x0, count):
 @pytest.mark.parametrize("safeguard", [True, False])
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_steps_are_those_of_the_algorithm(kind, safeguard, device):
-    """Ties are free: held, they would go onto their bounds, by a step that leaves y = 0 elsewhere alone."""
+    """Steps against the algorithm.
+
+    Ties are free: if active, they would move onto their bounds by a step that sets y = 0 elsewhere
+    alone.
+    """
     lengths = []
     for seed in SEEDS:
         A, b, lower, upper, x0 = with_ties(seed)
@@ -126,7 +141,10 @@ def test_steps_are_those_of_the_algorithm(kind, safeguard, device):
 
 @pytest.mark.parametrize("direct", [True, False])
 def test_ties_are_free(direct):
-    """x - y / d at a bound: the unknown takes part in the solve, however it came there."""
+    """Free ties: x - y / d at a bound.
+
+    The unknown takes part in the solve, however it got there.
+    """
     A, b, lower, upper, x0 = with_ties(4401)
     below, above = index_sets(np.ones(10), x0, A @ x0 + b, lower, upper)
     assert not (below | above)[:3].any()
@@ -142,7 +160,11 @@ def test_ties_are_free(direct):
 
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-1.0, 1.0), (-np.inf, 0.0)])
 def test_index_sets_on_a_grid(bounds):
-    """Whole numbers, so that ties are exact: which cells are free, which are marked to go onto which bound, and where rows are flagged."""
+    """Index sets on a grid.
+
+    Whole numbers, so that ties are exact: which cells are free, which are marked for which bound,
+    and which rows are flagged.
+    """
     rng = np.random.default_rng(4421)
     cells = rng.choice(3, (5, 6, 7), p=[0.15, 0.7, 0.15])
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
@@ -159,7 +181,7 @@ def test_index_sets_on_a_grid(bounds):
     work = MinimumMapNewton(precision="double").init(problem)
     residual = work.residual
     residual.start(work.x, keep=False)
-    residual.start(work.x, keep=True)  # a guess is classified
+    residual.start(work.x, keep=True)  # an initial guess is classified
     work.x.assign(problem.layout.load(field.reshape(cells.shape), wp.float64))
     residual.evaluate(work.x)
     below, above = index_sets(d, x, y, lower, upper)
@@ -179,7 +201,10 @@ def test_index_sets_on_a_grid(bounds):
 
 
 def test_newton_alone_fails_on_contacts_and_says_so():
-    """[Book] fig. C.2b: non-descent after a few steps. Whatever happens, no step is another method's."""
+    """Newton alone on contacts: it fails and reports so.
+
+    In [Book] fig. C.2b it ends with non-descent after a few steps. No step is another method's.
+    """
     outcomes = []
     for seed in range(8):
         p = contact(20, seed=seed)
@@ -196,7 +221,11 @@ def test_newton_alone_fails_on_contacts_and_says_so():
 
 
 def test_newton_alone_may_go_round_in_no_circle():
-    """On the matrix of period three whole steps cycle; searched they cannot, and end where no share of one leads down."""
+    """Newton alone without cycling.
+
+    On the matrix of period three whole steps cycle; searched ones cannot, and end where no share of
+    a step descends.
+    """
     result = wl.solve(
         wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)),
         MinimumMapNewton(safeguard=False),
@@ -207,7 +236,11 @@ def test_newton_alone_may_go_round_in_no_circle():
 
 @pytest.mark.parametrize("form", ["grid", "sparse"])
 def test_newton_alone_on_an_obstacle(form):
-    """It solves what it suits, by its own steps: no projected cycle, no coarse problem, on a grid and on a large matrix."""
+    """Newton alone on an obstacle.
+
+    It solves suitable problems by its own steps: no projected cycle, no coarse problem, on a grid
+    and on a large matrix.
+    """
     p = ball_obstacle(49, device="cpu")
     problem = p.lcp() if form == "grid" else p.sparse().lcp(device="cpu")
     result = wl.solve(problem, MinimumMapNewton(safeguard=False), stopping=TIGHT)

@@ -1,4 +1,4 @@
-"""MPRGP on grids, dense and sparse matrices against oracles; what it refuses; what its steps are."""
+"""MPRGP on grids, dense and sparse matrices: oracles, refusals, steps."""
 
 import numpy as np
 import pytest
@@ -121,7 +121,7 @@ def test_without_bounds_it_is_conjugate_gradients():
         wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower=-np.inf), MPRGP(), stopping=TIGHT
     )
     assert result, result.status
-    assert result.iterations <= 14  # conjugate gradients end after n steps, but for rounding
+    assert result.iterations <= 14  # conjugate gradients end after n steps, up to rounding
     np.testing.assert_allclose(result.x.numpy(), np.linalg.solve(A, -b), atol=1e-7)
 
 
@@ -148,7 +148,7 @@ def test_closed_domain_with_a_null_space():
         wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower=-np.inf), MPRGP()).status
         is wl.SolveStatus.INFEASIBLE
     )
-    # bounds make it solvable: sum of b > 0
+    # Bounds make it solvable: sum of b > 0.
     held = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b), MPRGP(), stopping=TIGHT)
     assert held, held.status
 
@@ -205,7 +205,7 @@ def test_refuses_what_it_cannot_minimize():
         MPRGP(gamma=0.0)
     with pytest.raises(ValueError, match="patience"):
         MPRGP(patience=0)
-    indefinite = np.array([[1.0, -3.0], [-3.0, 1.0]])  # the energy falls without end along (1, 1)
+    indefinite = np.array([[1.0, -3.0], [-3.0, 1.0]])  # the energy is unbounded below along (1, 1)
     result = wl.solve(
         wl.LCP(wl.DenseOperator(indefinite, device="cpu"), np.array([-1.0, -1.0])), MPRGP()
     )

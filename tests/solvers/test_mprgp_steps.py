@@ -1,4 +1,7 @@
-"""MPRGP iterate by iterate against a plain loop: proportioning, conjugate gradients on the free set, projected steps that are halved."""
+"""MPRGP, iterate by iterate against a plain loop.
+
+Proportioning, conjugate gradients on the free set, projected steps that are halved.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from warp_lcp.solvers.mprgp import MPRGP
 
 
 class PlainMPRGP:
-    """Preconditioned by the diagonal D.
+    """MPRGP preconditioned by the diagonal D.
 
     The residual r = max(min(y, d (x - l)), d (x - u)) has a free part phi, on unknowns off their
     bounds, and a chopped part beta, on those at one. If |beta|^2 > gamma^2 phi'y, a step along
@@ -37,7 +40,7 @@ class PlainMPRGP:
         return 0.5 * x @ self.A @ x + self.b @ x
 
     def move(self, along, length, kind):
-        """Projected step; whether the set has changed, or a trial's had."""
+        """Take a projected step; return whether the set has changed, also in a trial."""
         before, changed = self.energy(self.x), False
         while True:
             x = np.clip(self.x + length * along, self.lower, self.upper)
@@ -71,9 +74,10 @@ class PlainMPRGP:
 
 
 def problems():
-    """Ill-conditioned, correlated rows, where projections make the energy rise; narrow boxes clip the chopped gradient.
+    """Yield ill-conditioned problems.
 
-    In the last five, boxes of many widths, it is released unknowns whose projection does.
+    Rows are correlated, so that projections make the energy rise; narrow boxes clip the chopped
+    gradient. In the last five, boxes of many widths, the projection of released unknowns does.
     """
     sides = (-1.0, 0.5), (0.0, np.inf), (-np.inf, 0.0), (0.0, 1.0), (0.0, 0.1), (-0.1, 0.0)
     for seed, bounds in enumerate(sides, 4601):
@@ -101,7 +105,7 @@ def problems():
 
 
 def started(problem, method, x0):
-    """A workspace at x0."""
+    """Return a workspace at x0."""
     work = method.init(problem)
     work.residual.start(work.x, keep=False)
     work.x.assign(problem.layout.load(x0, wp.float64))
@@ -121,7 +125,7 @@ def test_steps_are_those_of_the_algorithm(gamma, device):
         )
         work, plain = started(problem, method, x0), PlainMPRGP(A, b, lower, upper, x0, gamma)
         for k in range(10):
-            if work.residual.norm < 1e-9:  # what decides there is rounding
+            if work.residual.norm < 1e-9:  # rounding decides there
                 break
             step = method.step(problem, work, work.x)
             work.residual.evaluate(work.x)
@@ -139,7 +143,7 @@ def test_steps_are_those_of_the_algorithm(gamma, device):
 
 
 def grid(seed, lower, upper=np.inf):
-    """A grid problem, its matrix, and where its unknowns are stored."""
+    """Return a grid problem, its matrix, and the places of its unknowns."""
     rng = np.random.default_rng(seed)
     cells = rng.choice(3, (6, 7, 5), p=[0.1, 0.8, 0.1])
     cells[0, 0, 0] = wl.AIR
@@ -158,7 +162,11 @@ def grid(seed, lower, upper=np.inf):
 
 
 def test_directions_on_a_grid_are_conjugate_and_steps_as_long_as_the_energy_falls():
-    """Preconditioned by a multigrid cycle, so that a plain loop has no z: what makes them conjugate gradients is checked instead."""
+    """Conjugate directions on a grid, and step lengths of the least energy.
+
+    Preconditioned by a multigrid cycle, so that a plain loop has no z: the defining properties of
+    conjugate gradients are checked instead.
+    """
     problem, A, b, place, shape = grid(4611, -np.inf)
     method = MPRGP(precision="double")
     work = started(problem, method, np.zeros(shape))
@@ -176,7 +184,11 @@ def test_directions_on_a_grid_are_conjugate_and_steps_as_long_as_the_energy_fall
 
 
 def test_proportioning_on_a_grid_goes_down_the_chopped_gradient():
-    """From x = 0 = l: unknowns with y < 0 are released, along -y / d to the least energy; the next right-hand side is -y there."""
+    """Proportioning on a grid along the chopped gradient.
+
+    From x = 0 = l: unknowns with y < 0 are released, along -y / d to the least energy; the next
+    right-hand side is -y there.
+    """
     problem, A, b, place, shape = grid(4613, 0.0)
     work = started(problem, MPRGP(precision="double", monotone_cycles=0), np.zeros(shape))
     d, size = np.diag(A), work.residual.size
@@ -195,7 +207,11 @@ def test_proportioning_on_a_grid_goes_down_the_chopped_gradient():
 
 
 def test_a_narrow_box_shortens_the_chopped_gradient_not_the_way_to_the_least_energy():
-    """|beta_i| is at most d times the width; the step along -beta / d, which minimizes the energy, ends beyond the box and is projected."""
+    """Narrow box: it shortens the chopped gradient, not the step length.
+
+    |beta_i| is at most d times the width; the step along -beta / d, which minimizes the energy,
+    ends beyond the box and is projected.
+    """
     width = 0.25
     problem, A, b, place, shape = grid(4617, 0.0, width)
     work = started(problem, MPRGP(precision="double", monotone_cycles=0), np.zeros(shape))
@@ -209,7 +225,11 @@ def test_a_narrow_box_shortens_the_chopped_gradient_not_the_way_to_the_least_ene
 
 @pytest.mark.parametrize(("gamma", "releases"), [(1.4, True), (1.6, False)])
 def test_gamma_is_the_ratio_of_the_parts(gamma, releases):
-    """|beta| = 3 and phi'y = 1 * 4, as the bound is nearer than y asks for: gamma = 1.5 is where proportioning ends, on a grid too."""
+    """Ratio gamma of the parts.
+
+    |beta| = 3 and phi'y = 1 * 4, since the bound is nearer than the step of y: gamma = 1.5 is where
+    proportioning ends, on a grid too.
+    """
     dense = wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), np.array([3.0, -3.0]), 0.0, 100.0)
     cells = np.array([[wl.AIR, wl.FLUID, wl.AIR, wl.FLUID, wl.AIR]])
     b = np.array([[0.0, 3.0, 0.0, -3.0, 0.0]])  # the diagonal is 2
@@ -227,7 +247,11 @@ def test_gamma_is_the_ratio_of_the_parts(gamma, releases):
 
 
 def test_products_of_the_conjugate_direction():
-    """beta, curvature and gain of z + beta p from the products of z and p, which need not be orthogonal to the gradient."""
+    """Products of the conjugate direction.
+
+    beta, curvature and gain of z + beta p from the products of z and p, which need not be
+    orthogonal to the gradient.
+    """
     rng = np.random.default_rng(4621)
     B, z, p, g = rng.standard_normal((5, 5)), *rng.standard_normal((3, 5))
     A = B @ B.T
@@ -235,7 +259,7 @@ def test_products_of_the_conjugate_direction():
     q = z + beta * p
     assert q @ A @ p == pytest.approx(0.0, abs=1e-12)
     assert (curvature, gain) == pytest.approx((q @ A @ q, g @ q))
-    z = p + 1e-3 * z  # nearly the last direction: what is left of it is rounding
+    z = p + 1e-3 * z  # nearly the last direction: the remainder is rounding error
     assert conjugate.func(z @ A @ z, z @ A @ p, g @ z, g @ p, p @ A @ p, 1e-3) == pytest.approx(
         (0.0, z @ A @ z, g @ z)
     )

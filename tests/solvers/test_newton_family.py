@@ -1,4 +1,7 @@
-"""Interior point, Fischer-Newton, gradient descent and the minimum map's safeguard: what each promises beyond the table of all methods."""
+"""Interior point, Fischer-Newton, gradient descent, minimum map's safeguard.
+
+They have guarantees beyond the table of all methods.
+"""
 
 import numpy as np
 import pytest
@@ -28,7 +31,7 @@ def dense(A, b, lower=0.0, upper=np.inf):
 
 
 def random_boxed(rng, n=6):
-    """An unsymmetric positive definite problem with every kind of row."""
+    """Return an unsymmetric positive definite problem with every kind of row."""
     B, C = rng.standard_normal((2, n, n))
     lower, upper = -rng.random(n), rng.random(n)
     lower[0], upper[1], (lower[2], upper[2]) = -np.inf, np.inf, (0.3, 0.3)
@@ -37,7 +40,10 @@ def random_boxed(rng, n=6):
 
 
 def is_near(progress):
-    """Crossover: the active set is known where the residual has fallen to a hundredth."""
+    """Return whether the residual has fallen to a hundredth.
+
+    The active set is then known: the crossover.
+    """
     return progress.norms[-1] <= 1e-2 * progress.norms[0]
 
 
@@ -56,7 +62,10 @@ METHODS = [
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: repr(m)[:90])
 def test_boxed_mixed_and_held_rows(method):
-    """Exhaustive search is the oracle; exchanged bounds or a wrong sign of y in one row would move the solution."""
+    """Boxed, mixed and held rows, with exhaustive search as the oracle.
+
+    Exchanged bounds or a wrong sign of y in one row would move the solution.
+    """
     rng = np.random.default_rng(2203)
     for _ in range(5):
         A, b, lower, upper = random_boxed(rng)
@@ -81,7 +90,10 @@ def test_equations_alone_are_a_linear_solve(method):
 
 @pytest.mark.parametrize("kink", KINKS)
 def test_one_unknown(kink):
-    """Directions of norm 1 and units of 1: guards that compare with another number than 0 would see them."""
+    """Problem of one unknown.
+
+    Directions of norm 1 and units of 1: guards that compare with another number than 0 would show.
+    """
     for a, b, expected in ((1.0, -3.0, 3.0), (1.0, 2.0, 0.0), (4.0, -2.0, 0.5)):
         result = wl.solve(
             dense(np.array([[a]]), np.array([b])), FischerNewton(kink=kink), stopping=TIGHT
@@ -160,7 +172,10 @@ def test_unsymmetric_sparse_matrix(method):
 
 @pytest.mark.parametrize("map_", list(MapForm))
 def test_gradient_of_the_merit(map_):
-    """Against central differences at a point off the kinks: any wrong sign in p or q shows."""
+    """Gradient of the merit.
+
+    Against central differences at a point off the kinks: any wrong sign in p or q shows.
+    """
     rng = np.random.default_rng(2237)
     A, b, lower, upper = random_boxed(rng)
     problem = dense(A, b, lower, upper)
@@ -218,7 +233,10 @@ def test_gradient_descent_on_a_grid(map_):
 
 
 def test_statuses_of_gradient_descent():
-    """Each of the book's tests is reached on purpose; the last problem has y < 0 for all x >= 0."""
+    """Statuses of gradient descent.
+
+    Each of the book's tests is reached on purpose; the last problem has y < 0 for all x >= 0.
+    """
     rng = np.random.default_rng(2251)
     B = rng.standard_normal((30, 30))
     A, b = B @ B.T + 1e-3 * np.eye(30), rng.standard_normal(30)
@@ -251,7 +269,11 @@ def test_statuses_of_gradient_descent():
 
 @pytest.mark.parametrize("contacts", [20, 30])
 def test_safeguarded_fischer_solves_frictional_contacts(contacts):
-    """All of 15 here (200 of 200 were measured); a linear complementarity oracle of our own is not needed: the residual is recomputed."""
+    """Safeguarded Fischer-Newton on frictional contacts.
+
+    All of 15 here (200 of 200 were measured). No other oracle is needed: the residual is
+    recomputed.
+    """
     steps = []
     for seed in range(15):
         problem = contact(contacts, seed=seed)
@@ -292,7 +314,11 @@ def test_semidefinite_matrices(zeros):
 
 
 def test_minimum_map_newton_leaves_the_cycle_of_period_three():
-    """From 200 random starts, half of them with random sets at the bound; plain Newton-min cycles from most of them."""
+    """Minimum-map Newton on the cycle of period three.
+
+    From 200 random starts, half of them with random sets at the bound; plain Newton-min cycles from
+    most of them.
+    """
     problem, rng = dense(PERIOD_THREE, -np.ones(3)), np.random.default_rng(3)
     solver = wl.MinimumMapNewton()
     work = solver.init(problem)
@@ -308,7 +334,11 @@ def test_minimum_map_newton_leaves_the_cycle_of_period_three():
 
 
 def test_levenberg_marquardt_steps_lower_the_residual_from_anywhere():
-    """What follows where no share of Newton's step does: a descent direction, on P-matrices all the way to a solution."""
+    """Levenberg-Marquardt steps, which lower the residual from anywhere.
+
+    They follow where no share of Newton's step descends: a descent direction, on P-matrices all the
+    way to a solution.
+    """
     rng = np.random.default_rng(229)
     for n in (3, 8, 20):
         B, S = rng.standard_normal((2, n, n))
@@ -351,7 +381,11 @@ def test_crossover_hands_over_to_the_active_set():
 
 
 def test_units_of_x_do_not_matter():
-    """Columns scaled by c and bounds by 1 / c: the same steps, for residuals and maps carry d (x - l)."""
+    """Units of x without influence.
+
+    Columns scaled by c and bounds by 1 / c: the same steps, since residuals and maps have d (x -
+    l).
+    """
     rng = np.random.default_rng(2269)
     B = rng.standard_normal((20, 20))
     A, b = B @ B.T / 20 + np.eye(20), rng.standard_normal(20)
@@ -366,7 +400,7 @@ def test_nonmonotone_search_remembers():
     search = NonmonotoneSearch(memory=2)
     search.remember(9.0)
     search.remember(1.0)
-    # above the last merit, below the largest of two
+    # Above the last merit, below the largest of two.
     assert search.search(lambda t: 5.0, -1e-3) == (1.0, 5.0)
     search.remember(5.0)
     assert search.search(lambda t: 6.0, -1e-3)[0] == 0.0
@@ -390,7 +424,11 @@ def test_settings_out_of_range(make, name):
 
 
 def test_interior_points_end_at_their_floor():
-    """Beyond it their systems overflow, and the last iterate is no number: that is the floor, not a fault of the data."""
+    """Interior points at their floor.
+
+    Beyond it their systems overflow, and the last iterate is NaN: that is the floor, not a fault of
+    the data.
+    """
     b = np.random.default_rng(3).standard_normal((12, 12))
     A = wl.GridPoisson(np.ones((12, 12), dtype=int), shift=1.0, device="cpu")
     ends = []
@@ -401,4 +439,4 @@ def test_interior_points_end_at_their_floor():
         assert result.status is wl.SolveStatus.FLOOR
         assert result.relative_residual <= (1e-6 if precision == "single" else 1e-14)
         ends.append(np.isnan(result.history[-1].residual))
-    assert any(ends)  # or this says nothing
+    assert any(ends)  # otherwise this tests nothing

@@ -1,4 +1,7 @@
-"""The penalty method: steps against a plain loop, answers against oracles, the error that springs leave and what becomes of it."""
+"""Penalty method: steps against a plain loop, answers against oracles.
+
+The error of the springs is tested too.
+"""
 
 import numpy as np
 import pytest
@@ -10,15 +13,17 @@ from oracle import assemble, boxed, lemke
 from warp_lcp.gallery import splash
 from warp_lcp.gallery.obstacle import ball_obstacle
 
-RHO = 1e6  # x of the plain loop, whose springs move by y / (rho d), is met to its square
+RHO = 1e6  # x of the plain loop, whose springs move by y / (rho d), is exact to its square
 KINDS = ("dense", "sparse", "grid", "products")
 
 
 def plain_penalty(A, b, lower, upper, x, steps, rho):
-    """z+ = (A + rho D_V)^-1 (-b + rho D_V g) with V the unknowns that z has beyond a bound g; V from x - y / (rho d) at first.
+    """Return z+ = (A + rho D_V)^-1 (-b + rho D_V g).
+
+    V is the unknowns where z is beyond a bound g; at first by x - y / (rho d).
 
     Returns:
-        For each step clip(z+, l, u), z+, and how many unknowns are beyond a bound.
+        For each step: clip(z+, l, u), z+, and the number of unknowns beyond a bound.
     """
     d, found = np.diag(A), []
     z = x - (A @ x + b) / (rho * d)
@@ -32,13 +37,13 @@ def plain_penalty(A, b, lower, upper, x, steps, rho):
 
 
 def boxes(n, rng):
-    """Bounds of all kinds: one-sided, two-sided, infinite, equal."""
+    """Return bounds of all kinds: one-sided, two-sided, infinite, equal."""
     rows = [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25), (-np.inf, np.inf), (0.75, 0.75)]
     return np.array([rows[k] for k in rng.integers(0, 5, n)]).T
 
 
 def on_grid(shape, rng):
-    """Cells with AIR and SOLID ones, the matrix between unknowns, and which those are."""
+    """Return cells with AIR and SOLID ones, the matrix, and its unknowns."""
     cells = np.ones(shape, dtype=int)
     cells.ravel()[rng.choice(cells.size, 3, replace=False)] = [wl.AIR, wl.AIR, wl.SOLID]
     inside = cells.ravel() == wl.FLUID
@@ -46,7 +51,10 @@ def on_grid(shape, rng):
 
 
 def as_problem(kind, rng, device):
-    """A problem of a kind with A, b and bounds between its unknowns; `products`: an operator that can only be applied."""
+    """Return a problem of a kind with A, b and bounds between its unknowns.
+
+    `products`: an operator that can only be applied.
+    """
     if kind == "grid":
         cells, A, inside = on_grid((3, 4, 5), rng)
     else:
@@ -78,7 +86,11 @@ def as_problem(kind, rng, device):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_steps_are_those_of_the_method(kind, device):
-    """From the same start each iterate is the plain loop's, with the same count of springs, though V is held by signs and not by z."""
+    """Steps against the method.
+
+    From the same start each iterate is the plain loop's, with the same count of springs, though V
+    is stored as signs and not as z.
+    """
     rng, compared = np.random.default_rng(7103), 0
     for _ in range(4):
         problem, A, b, lower, upper, inside = as_problem(kind, rng, device)
@@ -100,7 +112,10 @@ def test_steps_are_those_of_the_method(kind, device):
 
 
 def test_bounds_that_are_equal_and_infinite_ones(device):
-    """Both sides of every kind of row, against the oracle that tries all sets."""
+    """Equal and infinite bounds.
+
+    Both sides of every kind of row are compared with the oracle by enumeration.
+    """
     rng = np.random.default_rng(7127)
     for _ in range(6):
         B = rng.standard_normal((5, 5))
@@ -116,7 +131,11 @@ def test_bounds_that_are_equal_and_infinite_ones(device):
 
 
 def test_the_error_is_that_of_the_docstring(device):
-    """While rho stays, the natural residual that springs leave is |A D^-1 y_V| / rho, as far as V is right: it falls as 1 / rho."""
+    """Error as in the docstring.
+
+    While rho is constant, the natural residual of the springs is |A D^-1 y_V| / rho, if V is right:
+    it falls as 1 / rho.
+    """
     rng = np.random.default_rng(7151)
     _, A, _ = on_grid((8, 9), rng)
     b = rng.uniform(-1.0, 1.0, len(A))
@@ -130,14 +149,18 @@ def test_the_error_is_that_of_the_docstring(device):
     for rho in (1e3, 1e4, 1e5):
         work = wl.Penalty(rho=rho).init(problem)
         result = wl.solve(problem, wl.Penalty(rho=rho), stopping=stopping, workspace=work)
-        assert work.rho == rho  # without a tolerance there is nothing to stiffen springs for
+        assert work.rho == rho  # without a tolerance the springs need not be stiffer
         assert result.residual == pytest.approx(np.linalg.norm((A @ pushed)[free]) / rho, rel=0.02)
         assert np.abs(result.x.numpy() - exact).max() < 10 / rho
 
 
 @pytest.mark.parametrize("shape", [(40, 40), (14, 15, 16)])
 def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
-    """Springs stiffen as far as the tolerance asks, in a step or two, in 2-D and 3-D; x is the engine's, and obeys its bounds exactly."""
+    """Tight tolerances on grids from a soft start.
+
+    Springs become as stiff as the tolerance requires, in a step or two, in 2-D and 3-D; x is that
+    of ProjectedMultigrid and satisfies its bounds exactly.
+    """
     rng = np.random.default_rng(7177)
     cells = np.where(rng.random(shape) < 0.02, wl.AIR, wl.FLUID)
     b, lower = rng.uniform(-1.0, 1.0, shape) - 0.05, rng.uniform(-0.3, 0.1, shape)
@@ -151,7 +174,7 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
     result = wl.solve(problem, method, stopping=stopping, workspace=work)
     x, fluid = result.x.numpy(), cells == wl.FLUID
     assert result, result.status
-    assert result.iterations <= 10  # springs that stiffen tenfold a step take more
+    assert result.iterations <= 10  # springs that stiffen tenfold per step need more
     assert 1e6 < work.rho < 1e12
     np.testing.assert_allclose(x[fluid], reference.x.numpy()[fluid], atol=1e-7)
     assert (x >= lower)[fluid].all()
@@ -159,7 +182,11 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
 
 
 def test_iterations_do_not_grow_with_the_grid():
-    """Warm from projected cycles, at most two steps more from 65^2 to 257^2 on the ball, and from 16^3 to 48^3 on the splash."""
+    """Iterations that do not grow with the grid.
+
+    Warm from projected cycles, it needs at most two steps more from 65^2 to 257^2 on the ball, and
+    from 16^3 to 48^3 on the splash.
+    """
     counts = [
         wl.solve(ball_obstacle(n).lcp(device="cpu"), wl.Penalty()).iterations for n in (65, 257)
     ]
@@ -171,7 +198,11 @@ def test_iterations_do_not_grow_with_the_grid():
 
 
 def test_a_set_that_cycles_ends_without_success(device):
-    """A P-matrix that is no M-matrix, on which Newton's sets have period three: no false success, and the best iterate comes back."""
+    """Cycling set: no success.
+
+    On a P-matrix that is no M-matrix, Newton's sets have period three: no false success, and the
+    best iterate is returned.
+    """
     A = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
     result = wl.solve(
         wl.LCP(wl.DenseOperator(A, device=device), np.full(3, -1.0)),
@@ -185,7 +216,10 @@ def test_a_set_that_cycles_ends_without_success(device):
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_tank_without_a_surface(closed, device):
-    """Components that equations leave singular: with bounds on part of a closed box, and none at all."""
+    """Tank without a surface.
+
+    Components that equations leave singular: with bounds on part of a closed box, and none at all.
+    """
     cells, rng = np.ones((6, 7), dtype=int), np.random.default_rng(7193)
     b = rng.uniform(-1.0, 1.0, cells.shape)
     b -= b.mean() - (0.1 if closed else 0.0)

@@ -1,4 +1,7 @@
-"""A preconditioner that a problem brings: fewer iterations, the same solutions, and no success that is none."""
+"""User-defined preconditioner: fewer iterations, equal solutions.
+
+There is no false success.
+"""
 
 import numpy as np
 import pyamg
@@ -112,14 +115,17 @@ WRONG = {
 )
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_is_no_preconditioner_makes_no_success(kind, operator):
-    """It may cost iterations, or the solution; what is called converged is it."""
+    """Invalid preconditioner: no false success.
+
+    It may cost iterations, or the solution; a converged result is the solution.
+    """
     found = solve(operator, WRONG[kind]())
     assert np.isfinite(found.x.numpy()).all()
     if found:
         np.testing.assert_allclose(found.x.numpy(), EXACT, atol=1e-5)
     else:
         assert found.relative_residual > 1e-9
-    assert bool(found) or kind != "negative"  # GMRES does with that
+    assert bool(found) or kind != "negative"  # GMRES works with that
 
 
 def test_recommendations_take_it():

@@ -1,4 +1,7 @@
-"""The primal-dual active set method: planted problems, the cycle of period three, boxes, what follows a cycle."""
+"""Primal-dual active-set method.
+
+Planted problems, the cycle of period three, boxes, and the fallback after a cycle.
+"""
 
 import itertools
 
@@ -87,7 +90,7 @@ def test_contacts_are_solved_or_reported():
             own <= 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, np.zeros(len(p.b)))
         )
         solved += bool(result)
-    assert solved >= 1  # their matrices are no P-matrices: nothing is promised
+    assert solved >= 1  # their matrices are no P-matrices: there is no guarantee
 
 
 def test_splash_takes_as_few_steps_as_newton():
@@ -111,7 +114,11 @@ def test_settings_are_checked():
 
 
 def whole_steps(A, b, lower, upper):
-    """Plain steps in NumPy until a set comes again; return whether that is the last one, and how often only sides have changed."""
+    """Return whether plain steps in NumPy converge, by the repetition of a set.
+
+    The repeated set is the last one, or the steps cycle. Also return the number of changes of sides
+    alone.
+    """
     x, d, seen = np.clip(np.zeros(len(b)), lower, upper), np.diag(A), []
     while True:
         target = x - (A @ x + b) / d
@@ -127,7 +134,11 @@ def whole_steps(A, b, lower, upper):
 
 
 def test_an_unknown_that_turns_to_its_other_bound_makes_another_set():
-    """Steps go on where the free unknowns are those of before, but not all at the same bounds; pivots are for sets that come again."""
+    """Unknown that moves to its other bound: another set.
+
+    Steps continue where the free unknowns are the same, but not all at the same bounds; pivots are
+    for repeated sets.
+    """
     rng, turned = np.random.default_rng(5), 0
     for _ in range(120):
         B, S = rng.standard_normal((2, 6, 6))

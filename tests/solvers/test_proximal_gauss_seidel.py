@@ -1,4 +1,7 @@
-"""Contacts in the circular cone: sweeps against a plain loop, solutions against Coulomb's law written out and against conic programs."""
+"""Contacts with the circular cone.
+
+Sweeps are compared with a plain loop, solutions with Coulomb's law and conic programs.
+"""
 
 from itertools import pairwise
 
@@ -22,7 +25,10 @@ def solved(problem, tolerance=1e-9, method=None, **more):
 
 
 def plain(problem, sweeps, accelerate):
-    """The iterates after each sweep, by a loop over contacts on the dense matrix; those that move along p are not told."""
+    """Return the iterates after each sweep, by a loop over contacts.
+
+    On the dense matrix; iterates that move along p are left out.
+    """
     k, dim = problem.b.shape
     J = problem.jacobian.toarray()
     B = J @ J.T + np.diag(problem.yields.ravel())
@@ -64,13 +70,16 @@ def test_sweeps_are_those_of_a_plain_loop(family, accelerate, check_every, devic
 
 
 def coulomb(problem, r, atol):
-    """Coulomb's law, contact by contact; what is left over is within atol of the largest impulse and velocity."""
+    """Check Coulomb's law, contact by contact.
+
+    The residual must be within atol of the largest impulse and velocity.
+    """
     u, force, speed = problem.velocities(r), atol * np.abs(r).max(), atol * np.abs(problem.b).max()
     slip, held = np.linalg.norm(u[:, 1:], axis=1), np.linalg.norm(r[:, 1:], axis=1)
     assert r[:, 0].min() >= 0 and u[:, 0].min() >= -speed
     assert (np.minimum(r[:, 0] / force, u[:, 0] / speed) <= 1).all()  # either is 0
     assert (held <= problem.friction * r[:, 0] + force).all()
-    slides = slip > 1e-3 * np.abs(problem.b).max()  # whose direction is known
+    slides = slip > 1e-3 * np.abs(problem.b).max()  # their direction is known
     opposite = -(problem.friction * r[:, 0] / np.where(slides, slip, 1.0))[:, None] * u[:, 1:]
     np.testing.assert_allclose(r[slides, 1:], opposite[slides], atol=1e-3 * np.abs(r).max())
     return slides, r[:, 0] > force
@@ -78,7 +87,7 @@ def coulomb(problem, r, atol):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_solutions_are_coulombs_law(family, device):
-    """Of contacts that stick, slide and part."""
+    """Solutions by Coulomb's law, of contacts that stick, slide and separate."""
     seen = np.zeros(3, dtype=int)
     for seed, mu in enumerate((0.1, 0.5, 1.2)):
         problem = drawn(family, seed, friction=mu, ratio=10.0, device=device)
@@ -94,7 +103,10 @@ def test_solutions_are_coulombs_law(family, device):
 
 
 def cone_program(problem, lift):
-    """The impulses of least energy r'B r / 2 + (b + (lift, 0))'r in the cones, by Clarabel."""
+    """Return the impulses of a conic program, by Clarabel.
+
+    They have the least energy r'B r / 2 + (b + (lift, 0))'r in the cones.
+    """
     k, dim = problem.b.shape
     J = problem.jacobian
     b = problem.b.copy()
@@ -120,7 +132,11 @@ def cone_program(problem, lift):
 
 @pytest.mark.parametrize(("family", "seed"), [("stack", 2), ("any", 3)])
 def test_velocities_are_those_of_the_cone_program_with_the_slip_that_they_have(family, seed):
-    """De Saxce: with mu |u_t| added to u_n the law is the optimum of a conic program [Acary et al. 2011], whose velocities are unique."""
+    """Velocities of the cone program with their slip (De Saxce).
+
+    With mu |u_t| added to u_n the law is the optimum of a conic program [Acary et al. 2011], whose
+    velocities are unique.
+    """
     problem = drawn(family, seed, friction=0.4, ratio=3.0)
     result = solved(problem, 1e-10)
     u = problem.velocities(result.x.numpy())
@@ -128,7 +144,7 @@ def test_velocities_are_those_of_the_cone_program_with_the_slip_that_they_have(f
     assert result and slip.max() > 1e-3 * np.abs(problem.b).max()
     again = problem.velocities(cone_program(problem, problem.friction * slip))
     np.testing.assert_allclose(again, u, atol=1e-5 * np.abs(problem.b).max())
-    # the associated law lifts what slips
+    # The associated law lifts sliding contacts.
     other = problem.velocities(cone_program(problem, 0.0 * slip))
     assert np.abs(other - u).max() > 0.1 * problem.friction[0] * slip.max()
 
@@ -151,7 +167,7 @@ def test_r_factors_shrink_where_sweeps_go_round_in_circles():
 
 
 def test_bits_are_those_of_one_thread():
-    """A box of 550 contacts, of which a color has more than a piece."""
+    """Bits of one thread: a box of 550 contacts, of which a color has several pieces."""
     problem, before, found = (
         drawn("spheres", 11, friction=0.5, ratio=2.0, side=8),
         wl.get_threads(),
@@ -192,7 +208,7 @@ def test_contacts_of_a_color_share_no_body():
 
 
 def honest(family, seed):
-    """What a result says is so; returns whether it was solved."""
+    """Check the reports of a result; return whether it was solved."""
     problem = drawn(family, seed)
     result = solved(problem, 1e-6, max_iterations=800)
     r = result.x.numpy()
@@ -257,7 +273,7 @@ def test_a_warm_start_and_a_workspace_that_serves_again():
         wl.StoppingCriteria(rtol=0.0, atol=1e-8 * problem.reference),
     )
     first = wl.solve(problem, method, stopping=stopping, workspace=work).x.numpy().copy()
-    # it goes on from where it is
+    # It continues from the present iterate.
     assert wl.solve(problem, method, stopping=stopping, workspace=work).iterations == 0
     again = wl.solve(problem, method, stopping=stopping, workspace=work, x0=np.zeros_like(first))
     assert again.x.numpy().tobytes() == first.tobytes()
@@ -292,10 +308,14 @@ def test_wrong_contacts_are_named(change, message):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_redundant_contacts_of_a_pressed_packing_do_not_stall(seed):
-    """Rows that depend on each other leave impulses that no body feels; contacts that yield make these unique, and sweeps crawl."""
+    """Redundant contacts of a pressed packing.
+
+    Dependent rows leave impulses without effect on any body. Contacts that yield make these unique,
+    and sweeps converge slowly.
+    """
     p, tolerance, most = drawn("spheres", seed, friction=0.3, ratio=1.0), 1e-8, 800
     press = np.zeros((p.bodies, 6))
-    press[-4:, 1] = -1.0  # onto the layer on top
+    press[-4:, 1] = -1.0  # onto the top layer
     b = p.b + (p.jacobian @ press.ravel()).reshape(p.b.shape)
     assert np.linalg.matrix_rank(p.jacobian.toarray()) < p.b.size
     problem = ContactProblem(p.first, p.second, p.one, p.other, b, p.friction, p.bodies)

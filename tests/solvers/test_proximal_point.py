@@ -1,4 +1,7 @@
-"""Problems whose free blocks are singular: by the proximal-point method, and by the chains of active-set methods."""
+"""Problems with singular free blocks.
+
+They are solved by the proximal-point method, and by the fallbacks of active-set methods.
+"""
 
 import numpy as np
 import pytest
@@ -25,12 +28,15 @@ def problem(A, b, kind, lower=0.0, upper=np.inf):
 
 
 def solved(p, method, **more):
-    """By a method and those that take over."""
+    """Solve by a method and its fallbacks."""
     return wl.solve(p, wl.default_chain(method, p), **more)
 
 
 def program(rng, m, n):
-    """The optimality conditions of min c'x, G x >= h, x >= 0 with a solution: skew, so that every diagonal entry is 0."""
+    """Return the optimality conditions of min c'x, G x >= h, x >= 0.
+
+    They have a solution and are skew, so that every diagonal entry is 0.
+    """
     G, x, z = (
         rng.standard_normal((m, n)),
         rng.random(n) * (rng.random(n) < 0.5),
@@ -45,7 +51,10 @@ def program(rng, m, n):
 @pytest.mark.parametrize("method", ALL, ids=ALL_NAMES)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_a_quarter_turn(kind, method):
-    """y = (x_2 - 1, 1 - x_1): free blocks of one unknown are 0, and active-set methods alone stay at x = 0."""
+    """Quarter turn, y = (x_2 - 1, 1 - x_1).
+
+    Free blocks of one unknown are 0, and active-set methods alone stay at x = 0.
+    """
     result = solved(
         problem(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9)
     )
@@ -58,7 +67,7 @@ def test_a_quarter_turn(kind, method):
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
 def test_no_solution_is_proved(b, kind, method):
-    """y_2 = -x_1 - 1 < 0 whatever x >= 0 is."""
+    """Proof of no solution: y_2 = -x_1 - 1 < 0 for every x >= 0."""
     assert solved(problem(TURN, np.array(b), kind), method).status is wl.SolveStatus.INFEASIBLE
 
 
@@ -72,14 +81,17 @@ def test_linear_programs(kind, method):
         assert result, result.status
         x, c, h = result.x.numpy(), b[:9], -b[9:]
         assert x.min() >= -1e-6
-        # strong duality, which no other pair of feasible points has
+        # Strong duality, which no other pair of feasible points has.
         assert c @ x[:9] == pytest.approx(h @ x[9:], abs=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
 @pytest.mark.parametrize("zeros", [0.5, 0.8])
 def test_semidefinite_matrices_are_solved(zeros, method):
-    """With 80 % zero eigenvalues 1 of 20 once was, by either method."""
+    """Semi-definite matrices.
+
+    With 80 % zero eigenvalues only 1 of 20 was solved before, by either method.
+    """
     for seed in range(10):
         p = semidefinite(100, zeros=zeros, seed=seed)
         result = solved(problem(p.A, p.b, "dense"), method)
@@ -87,7 +99,7 @@ def test_semidefinite_matrices_are_solved(zeros, method):
         assert result.residual == pytest.approx(
             natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()), rel=1e-6, abs=1e-14
         )
-        # y is unique
+        # y is unique.
         np.testing.assert_allclose(p.A @ (result.x.numpy() - p.solution), 0.0, atol=1e-4)
 
 
@@ -120,7 +132,10 @@ def test_operators_that_cannot_be_assembled_are_refused():
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_method_alone_against_lemke(kind):
-    """Semi-definite matrices of half the rank: y is unique, and x is where y = 0."""
+    """Proximal-point method alone, against Lemke.
+
+    Semi-definite matrices of half the rank: y is unique, and x is where y = 0.
+    """
     for seed in range(3):
         p = semidefinite(40, zeros=0.5, seed=seed)
         result = wl.solve(
@@ -137,7 +152,11 @@ def test_the_method_alone_against_lemke(kind):
 
 
 def test_a_workspace_begins_anew():
-    """After a solve that ended in the proximal-point iteration the next one, with another b, takes none."""
+    """Reset of a workspace.
+
+    After a solve that ended in the proximal-point iteration the next one, with another b, does
+    without it.
+    """
     b = wp.array([-1.0, 1.0], dtype=wp.float64, device="cpu")
     p = wl.LCP(wl.DenseOperator(TURN + 0.5 * np.diag([0.0, 1.0]), device="cpu"), b)
     for first in METHODS:
@@ -155,7 +174,11 @@ def test_a_workspace_begins_anew():
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_solution_nearest_to_the_start_is_found(kind):
-    """A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2 stays 8."""
+    """Solution nearest to the start.
+
+    A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2
+    stays 8.
+    """
     p = problem(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([-1.0, 1.0]), kind)
     result = wl.solve(
         p, wl.ProximalPoint(), x0=np.array([5.0, 3.0]), stopping=wl.StoppingCriteria(rtol=1e-9)

@@ -1,4 +1,4 @@
-"""PIQP behind the interface: symmetric problems, what it refuses, unbounded objectives."""
+"""PIQP behind the interface: symmetric problems, refusals, unbounded objectives."""
 
 import importlib.util
 
@@ -41,7 +41,11 @@ def test_boxes_and_equations(sparse):
 
 
 def test_sparse_problem_larger_than_the_dense_limit(monkeypatch):
-    """A chain of 6000 unknowns under a load, above an obstacle; SciPy's bounded quasi-Newton method finds the same."""
+    """Sparse problem larger than the dense limit.
+
+    A chain of 6000 unknowns under a load, above an obstacle; SciPy's bounded quasi-Newton method
+    finds the same.
+    """
     n = 6000
     A = scipy.sparse.diags_array([-1.0, 2.05, -1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
     b = np.sin(np.linspace(0, 40, n))

@@ -1,4 +1,7 @@
-"""What a device does of a solve without its host is what the host would have had it do, on the CPU and, emulated, on CUDA."""
+"""Device-resident iterations: equal to those led by the host.
+
+They run on the CPU and, emulated, as on CUDA.
+"""
 
 import sys
 import weakref
@@ -22,9 +25,10 @@ SOLVER = wl.ProjectedMultigrid()
 
 
 def random_problem(rng: np.random.Generator, bodies: int = 0) -> tuple[wl.LCP, wp.array[Any]]:
-    """Return a problem in place, as simulators have them, of any shape, cells, bounds and size, and its right-hand side.
+    """Return a random problem in place and its right-hand side.
 
-    With bodies A has a term U W U' more, of three columns each, light or heavy.
+    In place, as simulators have them, of any shape, cells, bounds and size. With bodies A has a
+    further term U W U', of three columns each, light or heavy.
     """
     shape = tuple(int(n) for n in rng.integers(3, 24, rng.integers(2, 4)))
     cells = rng.choice([FLUID, FLUID, FLUID, AIR, SOLID], shape)
@@ -48,7 +52,10 @@ def random_problem(rng: np.random.Generator, bodies: int = 0) -> tuple[wl.LCP, w
 
 
 def random_weights(rng: np.random.Generator, bodies: int) -> np.ndarray:
-    """Return W of bodies, each with a symmetric block that may be singular: held by a wall."""
+    """Return W of bodies, each with a symmetric block.
+
+    The block may be singular: a body held by a wall.
+    """
     W = np.zeros((3 * bodies, 3 * bodies))
     for block in range(0, 3 * bodies, 3):
         root = rng.standard_normal((3, int(rng.integers(1, 4))))
@@ -57,7 +64,7 @@ def random_weights(rng: np.random.Generator, bodies: int) -> np.ndarray:
 
 
 def change(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator) -> None:
-    """Give a problem another right-hand side: rough or smooth, large or small, sometimes nothing."""
+    """Set another right-hand side: rough or smooth, large or small, sometimes 0."""
     inside = problem.unknown.numpy() == 1
     values = (
         rng.standard_normal(b.size)
@@ -74,7 +81,11 @@ def change(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator) -> None:
 def test_solves_are_those_of_the_host(
     seed: int, precision: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same iterates, histories and ends, bit for bit, of solves one after another that begin where the last one ended."""
+    """Solves equal to those of the host.
+
+    The same iterates, histories and ends, bit for bit, of consecutive solves that begin where the
+    last one ended.
+    """
     rng = np.random.default_rng(4000 + seed)
     problem, b = random_problem(rng)
     solver = wl.ProjectedMultigrid(precision=precision)
@@ -107,7 +118,10 @@ def test_solves_are_those_of_the_host(
 def solved_in_turn(
     problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator, works: tuple[Any, ...], bodies: int
 ) -> None:
-    """Solve problems with bodies one after another from both workspaces; compare bits, and the energy with that of A x found apart."""
+    """Solve problems with bodies one after another from both workspaces.
+
+    Compare bits, and the energy with that of an independent A x.
+    """
     guess, A, stored = problem.layout.zeros(wp.float64), problem.A, problem.layout.stored_shape
     for _ in range(4):
         change(problem, b, rng)
@@ -142,7 +156,10 @@ def solved_in_turn(
 def test_solves_with_bodies_are_those_of_the_host(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As above with a term of low rank: the host follows the free set, the device takes the steps between."""
+    """Solves with bodies equal to those of the host.
+
+    With a low-rank term the host follows the free set, and the device takes the steps between.
+    """
     rng = np.random.default_rng(4600 + seed)
     bodies = int(rng.integers(1, 4))
     problem, b = random_problem(rng, bodies)
@@ -213,7 +230,7 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     assert c.numpy().tolist() == [7, 7, 7]
     assert meter["readbacks"] == 1
     a.array.fill_(2.0)
-    assert a.numpy().tolist() == [1.5, 1.5]  # nobody has said so
+    assert a.numpy().tolist() == [1.5, 1.5]  # not announced
     a.changed()
     assert a.numpy().tolist() == [2.0, 2.0]
     end = board._end
@@ -224,12 +241,12 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     circle.append(circle)
     held = weakref.ref(circle[0])
     del circle
-    # more than there is room for: a second board has the rest
+    # More than one board has room for: a second board has the rest.
     many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]
     assert held() is None  # garbage was collected first
     assert many[-1]._board is many[-2]._board is not board
-    assert Reading(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a board is by default
-    for value in (3.0, 4.0):  # what is read is what is there, however often
+    assert Reading(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a default board
+    for value in (3.0, 4.0):  # every read returns the current value
         many[-1].array.fill_(value)
         many[-1].changed()
         assert (many[-1].numpy() == value).all()
@@ -237,7 +254,10 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
 
 @pytest.fixture
 def both(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return what makes a problem in place, one workspace that the host leads, and one that the device does."""
+    """Return functions for problems in place and two workspaces.
+
+    One is led by the host, one by the device.
+    """
 
     def make(seed: int) -> tuple[wl.LCP, Any, Any]:
         rng = np.random.default_rng(seed)
@@ -252,7 +272,10 @@ def both(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def outcomes(problem: wl.LCP, works: tuple[Any, ...], **options: Any) -> list[Any]:
-    """Return histories, ends and iterates of a solve from each workspace, by the records that a callback was given too."""
+    """Return histories, ends and iterates of a solve from each workspace.
+
+    The records given to a callback are compared too.
+    """
     found = []
     for work in works:
         seen: list[Any] = []
@@ -302,7 +325,7 @@ def test_threads_take_the_steps_of_the_host(
             )
             assert one == other
             wp.copy(guess, alone.x)
-            guess = wp.clone(guess)  # elsewhere
+            guess = wp.clone(guess)  # another array
     finally:
         wl.set_threads(before)
 
@@ -354,7 +377,10 @@ def test_what_is_not_finite_is_found_by_both(wrong: float, both: Any) -> None:
 
 
 def liquid_below_air(least: float) -> tuple[wl.LCP, wp.array[Any]]:
-    """Return a problem of cells with air above, with one lower bound, and its right-hand side."""
+    """Return a problem of cells with air above and one lower bound.
+
+    Its right-hand side is returned too.
+    """
     cells = np.full((14, 20), FLUID)
     cells[-1] = AIR
     A = wl.GridPoisson(cells, device="cpu")
@@ -366,7 +392,10 @@ def liquid_below_air(least: float) -> tuple[wl.LCP, wp.array[Any]]:
 @emulated
 @pytest.mark.parametrize("least", [-np.inf, 0.0])
 def test_a_solve_waits_once(least: float) -> None:
-    """A GPU takes all steps that nothing is to be decided about, with bounds or without, before the host looks."""
+    """Number of waits of a solve: one.
+
+    A GPU takes all steps without a decision, with bounds or without, before the host looks.
+    """
     from benchmarks.emulated_cuda import meter
 
     problem, b = liquid_below_air(least)
@@ -388,7 +417,10 @@ def test_a_solve_waits_once(least: float) -> None:
 
 @emulated
 def test_nothing_is_solved_where_no_unknown_counts() -> None:
-    """Criteria by the mean over no unknowns: the iterate is left alone."""
+    """Problem without relevant unknowns: unchanged iterate.
+
+    The criteria are by the mean over no unknowns.
+    """
     problem, b = liquid_below_air(-np.inf)
     work, guess = SOLVER.init(problem), problem.layout.zeros(wp.float64)
     b.assign(-1.0 * (problem.unknown.numpy() == 1))

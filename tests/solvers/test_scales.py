@@ -1,4 +1,4 @@
-"""Units are the user's: a method takes the same path when A, x or both are given in others."""
+"""Units of A and x: a method takes the same path in any units."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from warp_lcp.problem.protocol import families
 
 N = 20
 GRID = np.array([[0] * 5] + [[1] * 5] * 3)
-# of A and of x
+# Factors of A and of x.
 SCALES = [(1e8, 1.0), (1e-8, 1.0), (1.0, 1e8), (1.0, 1e-8), (1e-8, 1e-8), (1e8, 1e8)]
 CASES = [
     pytest.param(name, family, id=f"{name}-{family}")
@@ -52,7 +52,10 @@ def test_iterations_do_not_depend_on_units(name, family, device):
 @pytest.mark.parametrize("precision", ["mixed", "single"])
 @pytest.mark.parametrize(("name", "family"), CASES)
 def test_a_power_of_two_in_x_changes_no_step(name, family, precision, device):
-    """Rounding has no say in it: what differs is a number that should have had x's unit."""
+    """Power of two in x: no changed step.
+
+    Rounding is not affected: a difference shows a number without x's unit.
+    """
     if name == "quadratic-program":
         pytest.importorskip("piqp")
     cls, stopping = wl.METHODS[name], wl.StoppingCriteria(rtol=1e-4, max_iterations=50)
@@ -69,7 +72,10 @@ def test_a_power_of_two_in_x_changes_no_step(name, family, precision, device):
 
 
 def test_enumeration_of_rows_in_different_units(device):
-    """S A S with S from 1e-8 to 1e8: pivots differ by 1e32, and all count."""
+    """Enumeration of rows in different units.
+
+    S A S with S from 1e-8 to 1e8: pivots differ by 1e32, and all count.
+    """
     rng = np.random.default_rng(77)
     B, S = rng.standard_normal((4, 4)), np.array([1e-8, 1.0, 1e8, 1.0])
     A, b = B @ B.T / 4 + np.eye(4), np.array([-1.0, 0.4, -2.0, 0.1])
@@ -87,7 +93,11 @@ def test_enumeration_of_rows_in_different_units(device):
 @pytest.mark.parametrize("dtype", [wp.float64, wp.float32])
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_batches_of_rows_in_different_units(n, dtype, device):
-    """D A D with D powers of 2 from 2^-13 to 2^13 is the same problem bit for bit: each row's and column's unit is taken out again."""
+    """Batches of rows in different units.
+
+    D A D with D powers of 2 from 2^-13 to 2^13 is the same problem bit for bit: the unit of each
+    row and column is removed.
+    """
     rng = np.random.default_rng(79)
     m = 200
     B = rng.standard_normal((m, n, n))
@@ -111,7 +121,10 @@ def test_batches_of_rows_in_different_units(n, dtype, device):
 
 
 def test_fischer_newton_of_rows_in_different_units(device):
-    """S A S and S b: plain entries of J'J would differ by 1e24, and nu would drown the small ones."""
+    """Fischer-Newton on rows in different units.
+
+    S A S and S b: plain entries of J'J would differ by 1e24, and nu would dominate the small ones.
+    """
     rng = np.random.default_rng(83)
     B, S = rng.standard_normal((N, N)), 2.0 ** rng.integers(-20, 21, N)
     A, b = B @ B.T / N + np.eye(N), rng.standard_normal(N)

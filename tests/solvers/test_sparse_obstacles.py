@@ -1,4 +1,7 @@
-"""Obstacle problems as sparse matrices: steps do not grow with the mesh, and the energy is progress. Residuals are SciPy's."""
+"""Obstacle problems as sparse matrices.
+
+Steps do not grow with the mesh, and the energy measures progress. Residuals are SciPy's.
+"""
 
 import numpy as np
 import pytest
@@ -25,12 +28,12 @@ def nodes(n):
 
 
 def border(x, y):
-    """Distance to the border of the unit square."""
+    """Return the distance to the border of the unit square."""
     return np.minimum(np.minimum(x, 1 - x), np.minimum(y, 1 - y))
 
 
 def torsion(n, load=5.0, wind=0.0):
-    """An elastic-plastic bar, or upwind convection through it: A, b, l, u."""
+    """Return an elastic-plastic bar, or upwind convection through it: A, b, l, u."""
     A = laplacian(n) + wind / (n + 1) * scipy.sparse.diags_array(
         [-1.0, 1.0], offsets=[-1, 0], shape=(n * n, n * n)
     )
@@ -39,7 +42,7 @@ def torsion(n, load=5.0, wind=0.0):
 
 
 def torsion_on_triangles(n, load=8.0):
-    """Linear elements on a Delaunay mesh of n random points."""
+    """Return linear elements on a Delaunay mesh of n random points."""
     points = np.random.default_rng(6203).random((n, 2))
     line = np.linspace(0, 1, int(np.sqrt(n)))
     edge = np.concatenate(
@@ -68,7 +71,7 @@ def torsion_on_triangles(n, load=8.0):
 
 
 def between_corners(n):
-    """A membrane pressed up and down between a pyramid and its copy above."""
+    """Return a membrane between a pyramid and its copy above, pressed both ways."""
     x, y = nodes(n)
     low = 0.3 - 1.5 * np.maximum(np.abs(x - 0.45), np.abs(y - 0.6))
     return (
@@ -80,7 +83,7 @@ def between_corners(n):
 
 
 def plate(n, *, clamped):
-    """A square plate pushed up against a plane."""
+    """Return a square plate pushed up against a plane."""
     L, x = laplacian(n), np.arange(n * n)
     A = L @ L
     if clamped:
@@ -90,7 +93,10 @@ def plate(n, *, clamped):
 
 
 def elastic_block(n):
-    """Plane strain, bilinear elements: a block held at its top is pulled down onto a parabola, which bounds some displacements."""
+    """Return an elastic block held at its top and pulled down onto a parabola.
+
+    The elements are bilinear, in plane strain. The parabola bounds some displacements.
+    """
     lame, shear, g = 0.6, 0.4, 1 / np.sqrt(3)
     C = np.diag([2 * shear, 2 * shear, shear]) + lame * np.pad(np.ones((2, 2)), ((0, 1), (0, 1)))
     K = np.zeros((8, 8))
@@ -121,10 +127,10 @@ def natural(A, b, lower, upper, x):
 
 
 def solved(data, method=None, *, x0=None, device="cpu", chain=False, **stopping):
-    """Solve by a method, or its default chain, check the residual by SciPy, return the result."""
+    """Solve by a method or the default, and check the residual by SciPy."""
     A, b, lower, upper = data
     problem = wl.LCP(wl.SparseOperator(A, device=device), b, lower, upper)
-    # some of the matrices are a grid's, and would be solved as such
+    # Some of the matrices are those of a grid, and would be solved as such.
     method = method or wl.MinimumMapNewton()
     method = wl.default_chain(method, problem) if chain else method
     result = wl.solve(problem, method, x0=x0, stopping=wl.StoppingCriteria(**stopping))
@@ -146,7 +152,11 @@ FAMILY = {
 
 @pytest.mark.parametrize("name", FAMILY)
 def test_steps_do_not_grow_with_the_mesh(name, device):
-    """The boundary of the plastic zone crept by a row a step: 26 steps at 120^2, STAGNATED at 250^2 and 1000^2."""
+    """Steps that do not grow with the mesh.
+
+    The boundary of the plastic zone moved by a row per step: 26 steps at 120^2, STAGNATED at 250^2
+    and 1000^2.
+    """
     assert solved(FAMILY[name], device=device).iterations <= 20
 
 
@@ -194,7 +204,7 @@ WEAK = {
 
 
 def rigid_motions(n):
-    """Of the nodes of `elastic_block(n)`: two translations and a rotation."""
+    """Return two translations and a rotation of the nodes of `elastic_block(n)`."""
     y, x = np.divmod(np.arange(n * (n + 1)), n + 1)
     B = np.zeros((2 * len(x), 3))
     B[0::2, 0] = B[1::2, 1] = 1
@@ -204,7 +214,11 @@ def rigid_motions(n):
 
 @pytest.mark.parametrize("numbered", ["by rows", "at random"])
 def test_rigid_motions_make_contact_as_cheap_as_a_linear_solve(numbered):
-    """Without them 110 iterations at 50^2 nodes, 569 at 223^2 and 1,474 at 500^2; with them 19 and 28."""
+    """Rigid motions as near null space: contact at the cost of a linear solve.
+
+    Without them it needs 110 iterations at 50^2 nodes, 569 at 223^2 and 1,474 at 500^2; with them
+    19 and 28.
+    """
     n = 190 if numbered == "at random" else 50
     A, b, lower, upper = elastic_block(n)
     B, nodes = rigid_motions(n), np.arange(n * (n + 1))
@@ -226,7 +240,11 @@ def test_rigid_motions_make_contact_as_cheap_as_a_linear_solve(numbered):
 
 @pytest.mark.parametrize("name", WEAK)
 def test_weak_preconditioners_cost_one_linear_solve(name, device):
-    """Newton's steps take 1,232, 1,406 and 658 iterations, most of them in steps that its safeguard undoes: MPRGP takes over."""
+    """Weak preconditioners: the cost of one linear solve.
+
+    Newton's steps take 1,232, 1,406 and 658 iterations, most of them in steps that its safeguard
+    reverts: MPRGP takes over.
+    """
     data, linear = WEAK[name]
     result = solved(data, chain=True, device=device)
     assert result.method == "mprgp"
@@ -235,7 +253,11 @@ def test_weak_preconditioners_cost_one_linear_solve(name, device):
 
 
 def test_the_energy_is_the_progress_of_mprgp():
-    """The residual of a plate is above its start for dozens of steps, while the energy falls in each; patience ended them after 30."""
+    """Energy as the progress of MPRGP.
+
+    The residual of a plate is above its start for dozens of steps, while the energy falls in each;
+    patience ended them after 30.
+    """
     result = solved(plate(60, clamped=True), wl.MPRGP(), max_iterations=1000)
     assert result.iterations <= 130
     assert max(r.residual for r in result.history[31:60]) > result.history[0].residual
@@ -252,7 +274,11 @@ def test_patience_ends_mprgp_where_rounding_does():
 
 
 def test_an_energy_without_a_minimum_goes_back_to_newton():
-    """Symmetric, positive on the diagonal, indefinite: conjugate gradients run away, and the answer must say what it is."""
+    """Energy without a minimum: back to Newton.
+
+    Symmetric, positive on the diagonal, indefinite: conjugate gradients diverge, and the status
+    must say so.
+    """
     n = 1200
     A = (plate(35, clamped=True)[0][:n, :n] - 0.5 * scipy.sparse.eye_array(n)).tocsr()
     b = np.random.default_rng(907).standard_normal(n)

@@ -1,4 +1,4 @@
-"""Staggering: partitions of one problem into blocks, each with its own method."""
+"""Staggering: partitions of a problem into blocks, each with its own method."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,11 @@ def test_blocks_with_a_method_each(count, device):
 
 
 def test_grid_blocks_are_grids(device):
-    """Left and right halves of a box with a solid: each is solved by grid multigrid with the other's cells as boundary values."""
+    """Grid blocks as grids.
+
+    Left and right halves of a box with a solid: grid multigrid solves each with the other's cells
+    as boundary values.
+    """
     cells = np.ones((6, 8, 8), dtype=int)
     cells[-1], cells[2, 3:5, 3:5] = wl.AIR, wl.SOLID
     faces = np.random.default_rng(181).uniform(0.5, 1.0, (6, 8, 9))
@@ -77,7 +81,11 @@ def test_operators_that_change_in_place_are_taken_again(device):
 
 @pytest.mark.parametrize("pull", [0.4, 5.0])
 def test_normal_force_and_friction_meet_at_their_common_solution(pull, device):
-    """By hand, y = A (n, t) + b and |t| <= 0.4 n: sticking, t_1 = (pull - n / 2) / 3 with 2 n + t_1 / 2 = 1; sliding, n = 1 / 2.2."""
+    """Common solution of normal force and friction.
+
+    By hand, y = A (n, t) + b and |t| <= 0.4 n: sticking, t_1 = (pull - n / 2) / 3 with 2 n + t_1 /
+    2 = 1; sliding, n = 1 / 2.2.
+    """
     A = np.array([[2.0, 0.5, 0.0], [0.5, 3.0, 0.0], [0.0, 0.0, 3.0]])
     low, high = wl.AffineBounds.friction([-1, 0, 0], 0.4)
     problem = wl.LCP(wl.DenseOperator(A, device=device), np.array([-1.0, -pull, 0.0]), low, high)

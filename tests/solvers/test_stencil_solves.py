@@ -1,4 +1,7 @@
-"""Solves on compact stencils: iterations that do not grow, answers that are those of the matrix, matrices that are stencils."""
+"""Solves on compact stencils.
+
+Iterations that do not grow, answers of the matrix, matrices that are stencils.
+"""
 
 import itertools
 
@@ -16,7 +19,10 @@ NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 
 
 
 def rotated(degrees, share=0.01):
-    """Bilinear elements of -div(K grad), K = 1 along a direction and `share` across."""
+    """Return bilinear elements of -div(K grad).
+
+    K is 1 along a direction and `share` across.
+    """
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     xx, yy, xy = c * c + share * s * s, s * s + share * c * c, (1 - share) * c * s
     along = np.array([[-1, 2, -1], [-4, 8, -4], [-1, 2, -1]]) / 6
@@ -24,7 +30,10 @@ def rotated(degrees, share=0.01):
 
 
 def convection(n, peclet, wind):
-    """Upwind differences of -Laplace u / peclet + v . grad u on the unit square."""
+    """Return upwind differences of -Laplace u / peclet + v . grad u.
+
+    The domain is the unit square.
+    """
     h = 1 / (n + 1)
     Y, X = np.meshgrid(*(h * np.arange(1, n + 1),) * 2, indexing="ij")
     vx, vy = wind(X, Y)
@@ -76,7 +85,7 @@ def test_obstacles_cost_about_what_linear_solves_do(family):
     n = 128
     A = operator(family, n)
     Y, X = np.meshgrid(*(np.arange(1, n + 1) / (n + 1),) * 2, indexing="ij")
-    x = 0.3 * np.sin(3 * np.pi * X) * np.cos(2 * np.pi * Y)  # solves without the obstacle
+    x = 0.3 * np.sin(3 * np.pi * X) * np.cos(2 * np.pi * Y)  # the solution without the obstacle
     b = -A.apply(wp.array(x, dtype=wp.float64, device="cpu")).numpy()
     result = wl.solve(wl.LCP(A, b, -np.inf, 0.1))
     assert result
@@ -85,7 +94,11 @@ def test_obstacles_cost_about_what_linear_solves_do(family):
 
 
 def drawn(seed):
-    """A problem on random cells: numbers or arrays, symmetric, directed or anisotropic, full or star-shaped, in 2-D or 3-D."""
+    """Return a problem on random cells.
+
+    Its coefficients are numbers or arrays, symmetric, directed or anisotropic, full or star-shaped,
+    in 2-D or 3-D.
+    """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 4))
     shape = tuple(int(v) for v in (rng.integers(5, 40, 2) if n == 2 else rng.integers(3, 11, 3)))
@@ -122,7 +135,7 @@ def drawn(seed):
     return wl.LCP(A, rng.standard_normal(shape), lower, upper), lower, upper
 
 
-# each seed's stencil has kernels of its own: 20 s of compilation from an empty cache
+# The stencil of each seed has kernels of its own: 20 s of compilation from an empty cache.
 @pytest.mark.parametrize(
     "seed",  # quick: anisotropic, directed and not symmetric, and in 3-D
     [
@@ -170,7 +183,11 @@ def test_methods_say_what_they_cannot():
 
 
 def test_coarse_matrices_are_products_of_the_transfers():
-    """R A P e, by handing down what A makes of a correction, for a stencil that is not symmetric and has holes."""
+    """Coarse matrices as products of the transfers.
+
+    The product is R A P e, by restricting A's product with a correction, for an unsymmetric stencil
+    with holes.
+    """
     cells = np.where(np.random.default_rng(9).random((21, 30)) < 0.1, wl.AIR, wl.FLUID)
     a = {o: -(1.0 + o[0] + 0.3 * o[1]) for o in itertools.product((-1, 0, 1), repeat=2) if any(o)}
     A = wl.Stencil(

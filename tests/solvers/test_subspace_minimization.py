@@ -1,4 +1,7 @@
-"""PGS-SM: one step where sweeps find the free set, few steps where they do not, no harm from a wrong set."""
+"""Subspace minimization, PGS-SM.
+
+One step where sweeps find the free set, few steps otherwise, and no harm from a wrong set.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +26,11 @@ def planted(A, rng, share=0.3):
 
 
 def test_one_solve_on_the_right_set_is_the_solution(device):
-    """Well-conditioned and strictly complementary: five sweeps find the set, the block's solve x to rounding."""
+    """One solve on the right set: the solution.
+
+    Well-conditioned and strictly complementary: five sweeps find the set, and the block's solve
+    gives x to rounding.
+    """
     rng = np.random.default_rng(127)
     B = rng.standard_normal((60, 60))
     A = B @ B.T / 240 + np.eye(60)
@@ -60,7 +67,10 @@ def test_grid_and_sparse_agree_in_few_steps(precision, device):
 
 
 def test_unsymmetric_p_matrices(device):
-    """No energy there: the residual alone says whether a correction is taken."""
+    """Unsymmetric P-matrices.
+
+    There is no energy: the residual alone decides whether a correction is accepted.
+    """
     rng = np.random.default_rng(137)
     for _ in range(10):
         A = rng.uniform(-1, 1, (20, 20)) / 8 + 2 * np.eye(20)
@@ -73,7 +83,11 @@ def test_unsymmetric_p_matrices(device):
 
 
 def test_energy_never_rises_with_backtracking(device):
-    """Ill-conditioned, correlated boxes, where full steps on a wrong set jump: with backtracking the energy falls from step to step."""
+    """Energy with backtracking, which never rises.
+
+    Ill-conditioned, correlated boxes, where full steps on a wrong set jump: with backtracking the
+    energy falls from step to step.
+    """
     rng = np.random.default_rng(139)
     rose_without = 0
     for _ in range(20):
@@ -92,7 +106,7 @@ def test_energy_never_rises_with_backtracking(device):
             wl.solve(problem, solver, stopping=TIGHT, workspace=work, callback=note)
             rises = np.diff(energies) > 1e-10 * np.abs(energies[-1])
             if backtracks >= 0:
-                assert rises.sum() <= 1  # a correction may be taken because the residual fell
+                assert rises.sum() <= 1  # a correction may be accepted because the residual fell
             else:
                 rose_without += rises.sum()
     assert rose_without > 0
@@ -112,7 +126,10 @@ def test_wrong_settings_are_named():
 
 
 def test_change_is_the_largest(device):
-    """The reduction behind the contraction test, across chunks: the largest change, not the last or the sum."""
+    """Largest change, the reduction of the contraction test.
+
+    Across chunks: the largest change, not the last or the sum.
+    """
     n = 20_000
     x, old = np.zeros(n), np.zeros(n)
     x[[3, 9000, 19_999]] = 1.0, -7.0, 2.0
@@ -123,7 +140,7 @@ def test_change_is_the_largest(device):
     np.testing.assert_array_equal(arrays[1].numpy(), x)
 
 
-# layers, ratio of masses, seed and time step [s]; the first two are not solved by a first attempt
+# Layers, ratio of masses, seed and time step [s]; a first attempt does not solve the first two.
 HEAVY = [
     (4, 30238.725095795973, 5496, 0.011044782786754172),
     (4, 8140593.914543829, 4905, 0.0015361144023177268),
@@ -135,7 +152,11 @@ HEAVY = [
 def test_heavy_boxes_on_light_ones_are_solved_by_default_as_dense_matrices_too(
     layers, ratio, seed, dt
 ):
-    """Exact steps are too long by the ratio of masses: dense matrices ended STAGNATED, with residuals to .5 after a minute."""
+    """Heavy boxes on light ones as dense matrices: solved by default.
+
+    Exact steps are too long by the ratio of masses: dense matrices ended STAGNATED, with residuals
+    to 0.5 after a minute.
+    """
     given = BoxedModel().problem(heavy_on_light(layers, ratio=ratio, seed=seed).assemble(dt).system)
     A, b = given.A.toarray(), np.asarray(given.b)
     result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, given.lower, given.upper))

@@ -1,4 +1,7 @@
-"""PGS-SM iterate by iterate against a plain loop: sweeps, index sets, solves on the free set, projected corrections and their halving."""
+"""PGS-SM, iterate by iterate against a plain loop.
+
+Sweeps, index sets, solves on the free set, projected corrections and their halving.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ FRICTION = 0.4
 
 
 class PlainSubspace:
-    """[Book] algorithm 7 with eq. 2.92-2.97, plus the halving of corrections.
+    """Plain loop of [Book] algorithm 7 with eq. 2.92-2.97 and halved corrections.
 
     `bounds(x)` returns both sides at x: with friction those of a tangential force depend on its
     normal force.
@@ -34,7 +37,10 @@ class PlainSubspace:
         )
 
     def corrected(self, e):
-        """x + e within the bounds at x; where bounds then move, what is at one goes with it, and the rest is projected again."""
+        """Return x + e within the bounds at x.
+
+        Where bounds then move, the unknowns at one move with it, and the rest is projected again.
+        """
         lower, upper = self.bounds(self.x)
         x = np.where(e != 0, np.clip(self.x + e, lower, upper), self.x)
         if not self.affine:
@@ -119,7 +125,11 @@ BOXES = [(0.0, np.inf), (-1.0, 1.0), (-np.inf, 0.5), (-np.inf, np.inf)]
 )
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_steps_are_those_of_the_algorithm(kind, settings, symmetric, device):
-    """Correlated rows, where full corrections jump; without symmetry there is no energy, and the residual alone judges."""
+    """Steps against the algorithm.
+
+    Correlated rows, where full corrections jump; without symmetry there is no energy, and the
+    residual alone decides.
+    """
     plains = []
     for seed in range(4701, 4709):
         rng = np.random.default_rng(seed)
@@ -146,7 +156,11 @@ def test_steps_are_those_of_the_algorithm(kind, settings, symmetric, device):
 
 @pytest.mark.parametrize("backtracks", [-1, 4])
 def test_friction_is_at_its_limit_before_and_after_a_correction(backtracks, device):
-    """Contacts of a normal force and two tangential ones, |t| <= mu n: limits are constants of a solve, and follow the normal force."""
+    """Friction at its limit before and after a correction.
+
+    Contacts of a normal force and two tangential ones, |t| <= mu n: limits are constants of a
+    solve, and follow the normal force.
+    """
     slid = 0
     for seed in range(4721, 4727):
         rng = np.random.default_rng(seed)

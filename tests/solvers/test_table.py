@@ -1,4 +1,7 @@
-"""Every registered method on every family of operators it supports, in each precision, against oracles: new methods are picked up."""
+"""Every registered method on all of its operators and precisions.
+
+Against oracles; new methods are included automatically.
+"""
 
 import dataclasses
 
@@ -17,7 +20,7 @@ FAMILIES = ("dense", "sparse", "grid")
 BOUNDS = ("lcp", "box", "mixed")
 RTOL = {"mixed": 1e-8, "double": 1e-8, "single": 1e-4}
 CRITERIA = {"max_iterations": 20_000, "patience": 2000}
-MANY = 30  # unknowns, for methods that take as many
+MANY = 30  # number of unknowns, for methods that take as many
 
 
 def precisions(cls):
@@ -41,7 +44,10 @@ def cases():
 
 
 def operator(family, tiny, rng, device):
-    """An operator, its dense matrix between the unknowns, and which entries of a field are unknowns; independent of the library."""
+    """Return an operator, its dense matrix, and which field entries are unknowns.
+
+    It is independent of the library.
+    """
     if family == "grid":
         cells = np.ones((1, 4) if tiny else (6, 7), dtype=int)
         cells[0, 0] = wl.AIR
@@ -67,7 +73,10 @@ def operator(family, tiny, rng, device):
 
 
 def planted(A, bounds, rng):
-    """b and bounds with a known, strictly complementary solution: y > 0 at l, y < 0 at u, 0 in between."""
+    """Return b and bounds with a known, strictly complementary solution.
+
+    There y > 0 at l, y < 0 at u, and y = 0 in between.
+    """
     n = len(A)
     lower, upper = np.zeros(n), np.full(n, np.inf)
     if bounds != "lcp":
@@ -109,7 +118,7 @@ def test_method(name, family, bounds, precision, device):
         if bounds == "lcp"
         else x
     )
-    np.testing.assert_allclose(oracle, x, atol=1e-8)  # the plant and the oracle agree
+    np.testing.assert_allclose(oracle, x, atol=1e-8)  # the planted solution and the oracle agree
     solver = (
         cls(precision=precision)
         if "precision" in {f.name for f in dataclasses.fields(cls)}
@@ -122,7 +131,7 @@ def test_method(name, family, bounds, precision, device):
     reference = natural_residual(matrix, b, lower, upper, np.clip(np.zeros(len(b)), lower, upper))
     own = natural_residual(matrix, b, lower, upper, got)
     assert result, f"{result.status.name} at {result.relative_residual:.1e}"
-    assert own <= RTOL[precision] * reference * (1 + 1e-6)  # what the result says is so
+    assert own <= RTOL[precision] * reference * (1 + 1e-6)  # the report of the result is right
     assert own == pytest.approx(result.residual, rel=1e-3, abs=1e-11 * reference)
     np.testing.assert_allclose(got, x, atol=1e3 * RTOL[precision])
     assert len(result.history) == result.iterations + 1
@@ -132,7 +141,10 @@ def test_method(name, family, bounds, precision, device):
     "name", [name for name, cls in METHODS.items() if "dense" in families(cls)]
 )
 def test_unsymmetric_matrix(name, device):
-    """Strictly diagonally dominant: whatever takes an unsymmetric A solves it; the others refuse it before they start."""
+    """Unsymmetric matrix, strictly diagonally dominant.
+
+    Methods for unsymmetric matrices solve it; the others refuse it before they start.
+    """
     cls = METHODS[name]
     rng = np.random.default_rng(1033)
     n = min(getattr(cls, "most_unknowns", MANY), MANY)

@@ -1,4 +1,7 @@
-"""`wl.solve` without a method on stencils that are not symmetric, whose coefficients vary by decades, or that are singular."""
+"""Default method on unsymmetric stencils.
+
+Their coefficients vary by decades, or they are singular.
+"""
 
 import numpy as np
 import pytest
@@ -39,7 +42,10 @@ def test_more_dominant_m_matrices_converge(seed):
 
 @pytest.mark.parametrize("seed", [3, 4, 5, 7])
 def test_coefficients_over_decades_take_as_few_steps_as_a_sparse_matrix(seed):
-    """Cycles over lines stall on these, and GMRES with the matrix's own multigrid does not."""
+    """Coefficients over decades: as few steps as a sparse matrix.
+
+    Cycles over lines stall on these, and GMRES with the matrix's own multigrid does not.
+    """
     rng, shape = np.random.default_rng(seed), (60, 70)
     offsets = [(j, i) for j in (-1, 0, 1) for i in (-1, 0, 1) if (j, i) != (0, 0)]
     given = {o: -(10 ** rng.uniform(-3, 0, shape)) for o in offsets}
@@ -50,7 +56,7 @@ def test_coefficients_over_decades_take_as_few_steps_as_a_sparse_matrix(seed):
     assert result.iterations <= 5
 
 
-# the sum of b, weighted by the left null vector, over each component; bounds; how a solve ends
+# The sum of b, weighted by the left null vector, over each component; bounds; the end of a solve.
 CASES = {
     "compatible": (0.0, -np.inf, np.inf, "CONVERGED"),
     "not compatible": (0.3, -np.inf, np.inf, "INFEASIBLE"),
@@ -68,7 +74,7 @@ def check_singular(seed, kind):
     W = np.zeros((matrix.shape[0], count))
     for c in range(count):
         places = np.flatnonzero(number == c)
-        # of irreducible M-matrices: w > 0
+        # Of irreducible M-matrices: w > 0.
         W[places, c] = abs(np.linalg.svd(matrix[places][:, places].toarray())[0][:, -1])
     assert abs(W.T @ matrix).max() < 1e-12
     b = np.random.default_rng([seed, 22]).standard_normal(matrix.shape[0])
@@ -109,7 +115,11 @@ def test_a_periodic_stencil_without_a_solution_ends_at_once():
 
 
 def test_components_are_those_of_the_coefficients():
-    """Two boxes that touch at a corner, one of them held: coupled by nine points, not by five, nor where coefficients are 0."""
+    """Components by the coefficients.
+
+    Two boxes that touch at a corner, one of them held: coupled by nine points, not by five, nor
+    where coefficients are 0.
+    """
     cells = np.full((6, 6), wl.SOLID)
     cells[:3, :3] = cells[3:, 3:] = wl.FLUID
     cells[0, 0] = wl.AIR

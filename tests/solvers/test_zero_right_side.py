@@ -1,4 +1,4 @@
-"""b = 0 and bounds that are not: the size of a problem is then in its bounds alone."""
+"""Problems with b = 0 and nonzero bounds: the bounds alone set their size."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,11 @@ STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=2000, patience=2000)
 
 
 def problems(most):
-    """Yield A, symmetric positive definite or with a skew part, and bounds of any sign: boxes, sides alone, fixed unknowns, equations."""
+    """Yield A, and bounds of any sign.
+
+    A is symmetric positive definite or has a skew part. Bounds: boxes, one-sided, fixed unknowns,
+    equations.
+    """
     rng = np.random.default_rng(2718)
     for trial in range(12):
         n = int(rng.integers(2, most + 1))
@@ -74,7 +78,10 @@ def test_on_matrices(name, family):
 )
 @pytest.mark.parametrize("lower", [0.3, -0.3])
 def test_on_a_membrane_that_an_obstacle_lifts(name, lower):
-    """4 x 5 cells with x = 0 around, x >= lower in the middle; the oracle solves in x - l."""
+    """Membrane lifted by an obstacle.
+
+    4 x 5 cells with x = 0 around, x >= lower in the middle; the oracle solves in x - l.
+    """
     if name == "quadratic-program":
         pytest.importorskip("piqp")
     cells, bound = np.zeros((6, 7), dtype=int), np.full((6, 7), -np.inf)

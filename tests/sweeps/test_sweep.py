@@ -1,4 +1,8 @@
-"""Sweeps: their orders against a plain loop, rows without a positive diagonal case by case, contraction, relaxation factors."""
+"""Sweeps against a plain loop.
+
+The tests cover orders, rows without a positive diagonal case by case, contraction, and relaxation
+factors.
+"""
 
 import numpy as np
 import pytest
@@ -37,7 +41,7 @@ def operators(A, device):
 
 
 def swept(A, b, x, order, omega):
-    """Projected SOR by its definition."""
+    """Return projected SOR by its definition."""
     for i in order:
         x[i] = max(0.0, x[i] - omega * (A[i] @ x + b[i]) / A[i, i])
     return x
@@ -71,7 +75,11 @@ ORDERS = {
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_one_sweep_is_the_loop_of_its_definition(name, device):
-    """A row visited too early or twice changes x in the first digits. Block sweeps project the relaxed value, as scalar ones do."""
+    """One sweep against the loop of its definition.
+
+    A row visited too early or twice changes x in the first digits. Block sweeps project the relaxed
+    value, as scalar ones do.
+    """
     rng = np.random.default_rng(77)
     A, b, x = spd(9, 5), rng.standard_normal(9), rng.random(9)
     solver, order = ORDERS[name]
@@ -119,7 +127,11 @@ def test_multicolor_is_red_black_on_a_poisson_matrix(device):
 @pytest.mark.parametrize("name", SCALAR)
 @pytest.mark.parametrize(("b", "expected"), [(2.0, -1.0), (-2.0, 3.0), (0.0, None)])
 def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, device):
-    """A_00 = 0: y_0 = b_0 whatever x_0 is, so that only its sign decides; y_0 = 0 leaves every x_0 a solution."""
+    """Zero diagonal: x at the bound of y's sign.
+
+    A_00 = 0: y_0 = b_0 whatever x_0 is, so that only its sign decides; for y_0 = 0 every x_0 is a
+    solution.
+    """
     A = np.diag([0.0, 2.0])
     for operator in operators(A, device):
         result = wl.solve(
@@ -134,13 +146,17 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
 
 @pytest.mark.parametrize("name", SCALAR)
 def test_negative_diagonal_goes_to_the_bound_of_lesser_energy(name, device):
-    """Of -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6: the upright parabola's rule stays inside."""
+    """Negative diagonal: x at the bound of lower energy.
+
+    For -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6; the rule
+    of the upright parabola stays inside.
+    """
     for operator in operators(np.array([[-1.0]]), device):
         result = wl.solve(
             wl.LCP(operator, np.array([0.2]), -1.0, 2.0), SCALAR[name], stopping=TIGHT
         )
         assert result, result.status
-        # y = 0 at 0.2: a block takes what solves it
+        # y = 0 at 0.2: a block takes this solution.
         assert result.x.numpy()[0] == pytest.approx(0.2 if name == "blocks" else 2.0)
     one_sided = wl.solve(
         wl.LCP(wl.DenseOperator(np.array([[-1.0]]), device=device), np.array([0.5])),
@@ -152,12 +168,16 @@ def test_negative_diagonal_goes_to_the_bound_of_lesser_energy(name, device):
 
 
 def test_zero_diagonal_without_a_bound_waits_and_says_so(device):
-    """The multiplier of x_0 <= 1 has a zero diagonal: a sweep cannot move it, a block of both rows solves it: x = (1, 2)."""
+    """Zero diagonal without a bound: it waits and reports so.
+
+    The multiplier of x_0 <= 1 has a zero diagonal: a sweep cannot move it, a block of both rows
+    solves it: x = (1, 2).
+    """
     A, b = np.array([[2.0, 1.0], [-1.0, 0.0]]), np.array([-4.0, 1.0])
     problem = wl.LCP(wl.DenseOperator(A, device=device), b)
     swept_only = wl.solve(problem, wl.ProjectedSOR(omega=1.0), stopping=TIGHT)
     assert swept_only.status is wl.SolveStatus.NON_DESCENT
-    assert swept_only.residual == pytest.approx(1.0)  # y_1 = 1 - x_0 = -1 is not met
+    assert swept_only.residual == pytest.approx(1.0)  # y_1 = 1 - x_0 = -1 violates the condition
     block = wl.solve(problem, BlockedGaussSeidel(blocks=2), stopping=TIGHT)
     assert block
     np.testing.assert_allclose(block.x.numpy(), [1.0, 2.0], atol=1e-12)
@@ -180,7 +200,11 @@ def test_rows_that_no_sweep_can_solve_are_refused(name):
 
 
 def test_random_boxes_with_zero_diagonals_never_converge_falsely(device):
-    """Symmetric indefinite matrices with zeros on the diagonal: what is called a solution is one of those that enumeration finds."""
+    """Random boxes with zero diagonals: no false convergence.
+
+    Symmetric indefinite matrices with zeros on the diagonal: a reported solution is one of those by
+    enumeration.
+    """
     rng, solved = np.random.default_rng(89), 0
     for _ in range(40):
         B = rng.standard_normal((4, 4))
@@ -199,22 +223,29 @@ def test_random_boxes_with_zero_diagonals_never_converge_falsely(device):
 
 
 def test_divergence_is_told_by_contraction(device):
-    """Jacobi's method on ones + 0.1 I has spectral radius 8 / 1.1; damping by the estimated lambda_max makes it converge."""
+    """Divergence, detected by contraction.
+
+    Jacobi's method on ones + 0.1 I has spectral radius 8 / 1.1; damping by the estimated lambda_max
+    makes it converge.
+    """
     n = 9
     A = np.ones((n, n)) + 0.1 * np.eye(n)
     problem = wl.LCP(wl.DenseOperator(A, device=device), -A @ np.linspace(1, 2, n), -np.inf)
     result = wl.solve(problem, ProjectedJacobi(omega=1.0), stopping=TIGHT)
     assert result.status is wl.SolveStatus.DIVERGED
-    # long before the residual has grown by the 1e8 of the stopping criteria
+    # Long before the residual has grown by the 1e8 of the stopping criteria.
     assert result.iterations <= 12
-    assert result.residual <= result.history[0].residual  # the best iterate comes back
+    assert result.residual <= result.history[0].residual  # the best iterate is returned
     damped = wl.solve(problem, ProjectedJacobi(), stopping=TIGHT)
     assert damped
     np.testing.assert_allclose(damped.x.numpy(), np.linspace(1, 2, n), atol=1e-6)
 
 
 def test_contraction_factor_is_the_rate(device):
-    """Two equations with off-diagonal a: Gauss-Seidel contracts by a^2, Jacobi by a, a sweep."""
+    """Contraction factor: the rate.
+
+    Two equations with off-diagonal a: Gauss-Seidel contracts by a^2, Jacobi by a, per sweep.
+    """
     A = np.array([[1.0, 0.6], [0.6, 1.0]])
     problem = wl.LCP(wl.DenseOperator(A, device=device), np.array([-1.0, -2.0]), -np.inf)
     for solver, rate in ((wl.ProjectedSOR(omega=1.0), 0.36), (ProjectedJacobi(omega=1.0), 0.6)):
@@ -224,7 +255,11 @@ def test_contraction_factor_is_the_rate(device):
 
 
 def test_projection_can_hide_divergence(device):
-    """In a box iterates of a diverging method jump between bounds: the solve stagnates, and says so."""
+    """Divergence hidden by projection.
+
+    In a box, iterates of a diverging method jump between bounds: the solve stagnates, and reports
+    so.
+    """
     A = np.ones((9, 9)) + 0.1 * np.eye(9)
     x = np.linspace(0.1, 0.9, 9)
     result = wl.solve(
@@ -234,7 +269,11 @@ def test_projection_can_hide_divergence(device):
 
 
 def test_advised_omega_saves_most_sweeps(device):
-    """Young's formula on a square of n^2 cells with AIR around: 2 / (1 + sin(pi / (n + 1))); sweeps fall from O(n^2) to O(n)."""
+    """Advised omega, which saves most sweeps.
+
+    Young's formula on a square of n^2 cells with AIR around: 2 / (1 + sin(pi / (n + 1))); sweeps
+    fall from O(n^2) to O(n).
+    """
     n = 24
     cells = np.ones((n + 2, n + 2), dtype=int)
     cells[[0, -1]] = cells[:, [0, -1]] = wl.AIR
@@ -251,7 +290,10 @@ def test_advised_omega_saves_most_sweeps(device):
 
 
 def test_grids_are_swept_by_the_advised_omega(device):
-    """Without a word: as by its number, in a third of the sweeps of 1.4 or fewer; elsewhere omega is 1.4."""
+    """Default omega on grids: the advised one.
+
+    As with its number, in a third of the sweeps of 1.4 or fewer; elsewhere omega is 1.4.
+    """
     problem = gallery.splash(20).named("walls", device=device).lcp(device=device)
     found, advised, book = (
         wl.solve(problem, wl.ProjectedSOR(omega=w), stopping=LOOSE)
@@ -271,7 +313,10 @@ def test_grids_are_swept_by_the_advised_omega(device):
 
 @pytest.mark.parametrize("shape", [(20, 20), (5, 60), (9, 10, 11)])
 def test_singular_grids_are_not_swept_by_two(shape):
-    """lambda_min = 0 of a closed box says nothing of how its other modes fall."""
+    """Singular grids: omega is not 2.
+
+    lambda_min = 0 of a closed box has no relation to the decay of its other modes.
+    """
     b = np.random.default_rng(17).standard_normal(shape)
     problem = wl.LCP(wl.GridPoisson(np.ones(shape, dtype=int), device="cpu"), b - b.mean(), -np.inf)
     found, book = (wl.solve(problem, wl.ProjectedSOR(omega=w), stopping=LOOSE) for w in (None, 1.4))
@@ -280,7 +325,10 @@ def test_singular_grids_are_not_swept_by_two(shape):
 
 
 def test_omega_is_that_of_the_grid_as_it_is():
-    """A workspace that is used again looks at its operator when that has changed."""
+    """Omega of the current grid.
+
+    A reused workspace examines its operator after it has changed.
+    """
     few = np.full((1, 1, 42), wl.AIR)
     few[0, 0, 1:4] = wl.FLUID
     A = wl.GridPoisson(few, device="cpu")

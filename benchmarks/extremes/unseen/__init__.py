@@ -1,7 +1,8 @@
-"""Random problems of many kinds, by kind and seed: what no method was tuned on. `problem(kind, seed)` is the same for ever.
+"""Random problems by kind and seed, on which no method was tuned.
 
-Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance,
-a run draws from 20,000 on.
+`problem(kind, seed)` always returns the same problem. Seeds 0 to 9,999 are for tests and
+development. Seeds 10,000 to 19,999 are kept unseen for acceptance. A run draws seeds from 20,000
+on.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids, matrices
 from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed
 
-RESERVED = range(10_000, 20_000)  # seeds for acceptance
+RESERVED = range(10_000, 20_000)  # seeds reserved for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
 
 Make = Callable[[Draw], Problem]
@@ -29,28 +30,28 @@ GRIDS, SURE_MATRICES, HARD_MATRICES = (
 )
 KINDS = {**GRIDS, **SURE_MATRICES, **HARD_MATRICES}
 ALLOWANCE = {"lognormal": 1.5}
-WARM_EVERY = 3  # of how many seeds one is solved once more with b changed by 1 %
+WARM_EVERY = 3  # every third seed is solved again with b changed by 1 %
 
 
 def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     """Return the problem of a kind and a seed.
 
     Args:
-        kind: of `KINDS`.
-        seed: >= 0.
-        small: of a size that every method can take; another problem than the large one.
+        kind: a name of `KINDS`.
+        seed: a number >= 0.
+        small: return a problem small enough for every method; it differs from the large one.
 
     Raises:
         ValueError: there is no such kind.
     """
     if kind not in KINDS:
         raise ValueError(f"kind = {kind}: must be one of {', '.join(KINDS)}")
-    made = KINDS[kind](Draw(kind, seed, small=small))
-    if not isinstance(made, GridProblem):
-        return Unseen(made)
-    made = solvable(made)
+    drawn = KINDS[kind](Draw(kind, seed, small=small))
+    if not isinstance(drawn, GridProblem):
+        return Unseen(drawn)
+    drawn = solvable(drawn)
     return Unseen(
-        made,
-        changed(made, seed) if seed % WARM_EVERY == 0 and not small else None,
+        drawn,
+        changed(drawn, seed) if seed % WARM_EVERY == 0 and not small else None,
         ALLOWANCE.get(kind, 1.0),
     )

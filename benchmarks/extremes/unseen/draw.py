@@ -1,4 +1,4 @@
-"""What random problems are drawn from, and what makes sure that each has a solution."""
+"""Random choices for problems, and random problems that have a solution."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
-SIDES = {2: (30, 300), 3: (12, 48)}  # cells, by dimensions
-SMALL_SIDES = {2: (3, 14), 3: (2, 6)}  # where every method takes part
-# share of grids with more cells along a side, and how many times as many at most
+SIDES = {2: (30, 300), 3: (12, 48)}  # cells along a side, by dimensions
+SMALL_SIDES = {2: (3, 14), 3: (2, 6)}  # sizes that every method can solve
+# Share of grids with longer sides, and the largest factor of a side.
 LARGER, LONGER = 0.03, {2: 2.0, 3: 1.4}
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """What a kind and a seed come to."""
+    """Problem of a kind and a seed, with an optional changed problem."""
 
-    problem: Problem  # what is to be solved
-    # one that differs a little, to be solved from the solution of `problem`; None for none
+    problem: Problem  # the problem to solve
+    # Slightly changed problem, to be solved from the solution of `problem`; None if there is none.
     then: GridProblem | None = None
-    allowance: float = 1.0  # factor of the iterations that it may take
+    allowance: float = 1.0  # factor of the allowed iterations
 
 
 class Draw:
-    """Random numbers of a kind and a seed, and what is often drawn.
+    """Random generator of a kind and a seed, with common choices.
 
     Args:
-        kind: of problem.
-        seed: of it.
-        small: draw sizes that every method can take.
+        kind: kind of the problem.
+        seed: seed of the problem.
+        small: draw sizes small enough for every method.
     """
 
     def __init__(self, kind: str, seed: int, *, small: bool = False) -> None:
@@ -49,15 +49,15 @@ class Draw:
         return bool(self.rng.random() < p)
 
     def between(self, low: float, high: float) -> float:
-        """Return a number, uniform."""
+        """Return a uniform number."""
         return float(self.rng.uniform(low, high))
 
     def decades(self, low: float, high: float) -> float:
-        """Return a number, log-uniform."""
+        """Return a log-uniform number."""
         return math.exp(self.between(math.log(low), math.log(high)))
 
     def whole(self, low: int, high: int) -> int:
-        """Return an integer of low to high, log-uniform; small problems stay below 16."""
+        """Return a log-uniform integer of low to high; small problems stay below 16."""
         top = min(high, max(low, 15)) if self.small else high
         return min(top, int(self.decades(low, top + 1)))
 
@@ -66,13 +66,16 @@ class Draw:
         return choices[int(self.rng.integers(len(choices)))]
 
     def side(self, dimensions: int = 2) -> int:
-        """Return cells along a side, log-uniform."""
+        """Return a log-uniform number of cells along a side."""
         low, high = (SMALL_SIDES if self.small else SIDES)[dimensions]
         longer = LONGER[dimensions] if self.chance(LARGER) and not self.small else 1.0
         return int(self.decades(low, high * longer + 1))
 
     def shape(self, dimensions: int = 2, *, square: float = 0.3) -> tuple[int, ...]:
-        """Return the shape of a grid whose sides differ at most 4-fold; with probability `square` not at all."""
+        """Return the shape of a grid whose sides differ at most 4-fold.
+
+        With probability `square` all sides are equal.
+        """
         side = self.side(dimensions)
         if self.chance(square):
             return (side,) * dimensions
@@ -106,12 +109,15 @@ class Draw:
 
 
 def framed(inside: np.ndarray) -> np.ndarray:
-    """Return cells FLUID where `inside`, AIR elsewhere and all around: x = 0 on the border of a domain."""
+    """Return FLUID where `inside`, and AIR elsewhere and around.
+
+    So x = 0 on the border of the domain.
+    """
     return np.pad(np.where(inside, FLUID, AIR), 1)
 
 
 def changed(problem: GridProblem, seed: int, share: float = 0.01) -> GridProblem:
-    """Return the problem with b changed by a share of its norm, smoothly."""
+    """Return the problem with b changed smoothly by a share of its norm."""
     draw = Draw("changed", seed)
     b = np.broadcast_to(problem.b, problem.cells.shape).astype(np.float64)
     field = draw.smooth(b.shape, 5) * (problem.cells == FLUID)

@@ -1,4 +1,4 @@
-"""Kinds of grids: domains of all shapes, contact with obstacles, bounds of all kinds, and coefficients."""
+"""Random grids: domains, contact with obstacles, bounds and coefficients."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw, fr
 
 
 def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return x >= 0 everywhere, on some cells, in one layer, or with a lid."""
+    """Return x >= 0 everywhere, on some cells, in one layer, or with an upper bound."""
     kind = draw.of("all", "all", "some", "layer", "box")
     if kind == "all":
         return {}
@@ -27,14 +27,17 @@ def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
 
 
 def loaded(draw: Draw, cells: np.ndarray, **more: Any) -> GridProblem:
-    """Return any right-hand side and some bounds on these cells."""
+    """Return a problem with a random right-hand side and bounds on these cells."""
     return GridProblem(
         cells=cells, b=draw.load(cells.shape), **more, **some_bounds(draw, cells.shape)
     )
 
 
 def strip(draw: Draw) -> GridProblem:
-    """Return a long strip, 1 to 40 cells wide, with AIR at one end or both, perhaps with a lid."""
+    """Return a long strip, 1 to 40 cells wide, with AIR at one end or both.
+
+    Some strips have an upper bound.
+    """
     length = draw.whole(50, 5000)
     wide = (draw.whole(1, 40),) if draw.chance(0.8) else (draw.whole(1, 6), draw.whole(1, 6))
     cells = np.full((*wide, length), FLUID)
@@ -58,7 +61,7 @@ def vent(draw: Draw) -> GridProblem:
 
 
 def voxels(draw: Draw) -> GridProblem:
-    """Return random blobs of AIR and SOLID in liquid, in two dimensions or three."""
+    """Return random blobs of AIR and SOLID in liquid, in 2-D or 3-D."""
     shape = draw.shape(draw.of(2, 3))
     width = draw.decades(1, 8)
     air, solid = draw.smooth(shape, width), draw.smooth(shape, width)
@@ -70,7 +73,10 @@ def voxels(draw: Draw) -> GridProblem:
 
 
 def liquid(draw: Draw) -> GridProblem:
-    """Return a body of liquid with a rough surface in a box, b the divergence of noise and of a fall, p >= 0 at walls or everywhere."""
+    """Return a body of liquid with a rough surface in a box.
+
+    b is the divergence of noise and of a fall; p >= 0 at walls or everywhere.
+    """
     dimensions = draw.of(2, 3)
     shape = draw.shape(dimensions)
     surface = shape[0] * (
@@ -90,7 +96,7 @@ def liquid(draw: Draw) -> GridProblem:
 
 
 def periodic(draw: Draw) -> GridProblem:
-    """Return a box without walls along some axes, held by a bound on one cell or on two."""
+    """Return a box that is periodic along some axes, held by bounds on 1 or 2 cells."""
     dimensions = draw.of(2, 2, 3)
     shape = draw.shape(dimensions)
     wraps = (True, True, draw.chance(0.5)) if draw.chance(0.7) else (True, False, False)
@@ -121,7 +127,10 @@ def handful(draw: Draw) -> GridProblem:
 
 
 def section(draw: Draw, n: int) -> np.ndarray:
-    """Return a cross-section: a square, a rectangle, an ellipse, an L, a triangle or a square with a hole."""
+    """Return a cross-section of a bar.
+
+    It is a square, a rectangle, an ellipse, an L, a triangle or a square with a hole.
+    """
     kind = draw.of("square", "square", "rectangle", "ellipse", "L", "triangle", "hole")
     X, Y = np.meshgrid(*(np.linspace(0, 1, n),) * 2)
     if kind == "rectangle":
@@ -139,7 +148,10 @@ def section(draw: Draw, n: int) -> np.ndarray:
 
 
 def torsion(draw: Draw) -> GridProblem:
-    """Return elastic-plastic torsion: |x| at most the distance to the border, for a load of 2 to 30."""
+    """Return elastic-plastic torsion: |x| at most the distance to the border.
+
+    The load is 2 to 30.
+    """
     n = max(4, draw.side())
     cells = framed(section(draw, n))
     distance = scipy.ndimage.distance_transform_edt(cells == FLUID) / (n + 1)
@@ -167,7 +179,10 @@ def rough(draw: Draw) -> GridProblem:
 
 
 def dam(draw: Draw) -> GridProblem:
-    """Return seepage through a dam of any width and water levels, by Baiocchi's variable."""
+    """Return seepage through a dam, by Baiocchi's variable.
+
+    Width and water levels are random.
+    """
     nx = max(5, draw.side())
     ny = max(5, int(nx * draw.between(0.6, 2)))
     width, high = draw.between(8, 32), draw.between(16, 32)
@@ -183,7 +198,10 @@ def dam(draw: Draw) -> GridProblem:
 
 
 def bearing(draw: Draw) -> GridProblem:
-    """Return a journal bearing's film with cavitation: Reynolds' equation, coefficients h^3 around the shaft, pressure >= 0."""
+    """Return a journal bearing's film with cavitation: Reynolds' equation.
+
+    Coefficients are h^3 around the shaft; the pressure is >= 0.
+    """
     nx, ny = max(6, draw.side()), max(4, draw.side() // 2)
     eccentric, angle = draw.between(0.2, 0.95), 2 * np.pi / nx
     height = 1 + eccentric * np.cos(angle * np.arange(nx + 1))
@@ -201,7 +219,10 @@ def bearing(draw: Draw) -> GridProblem:
 
 
 def rows(draw: Draw) -> GridProblem:
-    """Return rows of all kinds side by side: equations, one bound, two bounds, fixed values; shares at random."""
+    """Return rows of all kinds side by side, with random shares.
+
+    The kinds are equations, one bound, two bounds and fixed values.
+    """
     shape = draw.shape(draw.of(2, 3))
     cells = framed(np.ones(shape))
     kind = draw.rng.choice(5, cells.shape, p=draw.rng.dirichlet(np.ones(5)))
@@ -215,7 +236,10 @@ def rows(draw: Draw) -> GridProblem:
 
 
 def degenerate(draw: Draw) -> GridProblem:
-    """Return b of a chosen solution: x = l and y = 0 together on a share of the cells, smooth or of noise."""
+    """Return b of a chosen degenerate solution.
+
+    On a share of the cells x = l and y = 0 together; the solution is smooth or noise.
+    """
     shape = draw.shape(draw.of(2, 3))
     cells = framed(np.ones(shape))
     inside = cells == FLUID
@@ -231,7 +255,10 @@ def degenerate(draw: Draw) -> GridProblem:
 
 
 def lognormal(draw: Draw) -> GridProblem:
-    """Return coefficients exp(sigma N), sigma 1 to 3, of white noise or noise with a length, AIR all around."""
+    """Return coefficients exp(sigma N), sigma 1 to 3, AIR around.
+
+    N is white noise or noise with a correlation length.
+    """
     shape = draw.shape(draw.of(2, 2, 3))
     cells, sigma, length = (
         framed(np.ones(shape)),
@@ -253,7 +280,10 @@ def lognormal(draw: Draw) -> GridProblem:
 
 
 def cut_cells(draw: Draw) -> GridProblem:
-    """Return liquid around a round solid that cuts faces, below a surface that is 1/theta away."""
+    """Return liquid around a round solid with cut faces, below a ghost-fluid surface.
+
+    The coefficients of faces at the surface are 1/theta.
+    """
     shape = draw.shape()
     Y, X = np.indices([n + 1 for n in shape], dtype=np.float64)
     solid = np.full(Y.shape, np.inf)
@@ -283,7 +313,10 @@ def cut_cells(draw: Draw) -> GridProblem:
 
 
 def shifted(draw: Draw) -> GridProblem:
-    """Return a step of diffusion in time: a shift of 10^-5 to 100, on all cells or some, with or without AIR."""
+    """Return a time step of diffusion: a shift of 10^-5 to 100.
+
+    The shift is on all cells or some, with or without AIR.
+    """
     shape = draw.shape(draw.of(2, 3))
     cells = np.full(shape, FLUID)
     cells[: draw.chance(0.3)] = AIR

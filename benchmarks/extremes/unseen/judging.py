@@ -1,4 +1,8 @@
-"""What the default method makes of unseen problems, cold, warm and against their equations; and every method of small ones."""
+"""The default method on unseen problems, and every method on small ones.
+
+The default method solves cold and warm. Its iterations are compared with those of the equations
+without bounds.
+"""
 
 from __future__ import annotations
 
@@ -30,17 +34,18 @@ from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.problem.protocol import families
 
 FAMILY, METHODS_FAMILY = FAMILIES = ("unseen", "unseen, every method")
-# more than the default, so that the count is known
+# More iterations than the default, so that the count is known.
 CRITERIA: dict[str, Any] = {"rtol": 1e-6, "max_iterations": 400}
-OFTEN = (2.0, 6)  # iterations are at most 2 e + 6, e those of the equations,
-OFTEN_SHARE = 0.95  # on this share of the grids,
-ALWAYS = (3.0, 6)  # and never more than 3 e + 6
-WITHOUT_EQUATIONS = 100  # iterations where they have no solution: what a user gets by default
-# iterations on the finest grid that a warm start may take beyond a cold one's c, on OFTEN_SHARE of
-# the grids, and never more than 2 c + 6; steps are no measure: a cold start that has gone on by
-# Newton's method on the grid's matrix takes fewer and longer ones
+OFTEN = (2.0, 6)  # at most 2 e + 6 iterations, where e is the count for the equations
+OFTEN_SHARE = 0.95  # share of the grids on which that must hold
+ALWAYS = (3.0, 6)  # at most 3 e + 6 iterations on all grids
+WITHOUT_EQUATIONS = 100  # iterations where the equations have no solution: the default limit
+# Largest excess of a warm start's iterations on the finest grid over a cold start's c, on
+# OFTEN_SHARE of the grids; it is never more than 2 c + 6. Steps are no measure: a cold start that
+# continues with Newton's method on the grid's matrix takes fewer and longer ones.
 WARM_MORE = 1
-NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")  # of a small problem that has a solution
+# Statuses that no method may return for a solvable small problem.
+NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
 GRIDS_A_KIND, MATRICES_A_KIND = 18, 10
 
@@ -50,7 +55,7 @@ Solve = Callable[..., wl.SolveResult]
 def solved(
     problem: Problem, solve: Solve, device: str, **more: Any
 ) -> tuple[wl.SolveResult, Attempt]:
-    """Solve by the default method; return the result and what an independent residual says of it."""
+    """Solve by the default method; return the result and its independent check."""
     begun = time.perf_counter()
     result = solve(
         problem.lcp(device, wp.float64), None, stopping=wl.StoppingCriteria(**CRITERIA), **more
@@ -61,17 +66,17 @@ def solved(
 
 @dataclass(frozen=True)
 class Drawn(Case):
-    """A random problem; its name is kind and seed, by which it can be made again."""
+    """Random problem, reproducible from its kind and seed."""
 
-    kind: str  # of problem
-    seed: int  # of it
+    kind: str  # kind of the problem
+    seed: int  # seed of the problem
     _: KW_ONLY
     precisions: tuple[str, ...] = ("mixed",)
-    solve: Solve = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
+    solve: Solve = wl.solve  # replaces `wl.solve` in tests of the checks
 
 
 class UnseenCase(Drawn):
-    """A random problem given to the default method."""
+    """Random problem for the default method."""
 
     def __init__(self, kind: str, seed: int, solve: Solve = wl.solve) -> None:
         expected = GAVE_UP if kind in unseen.HARD_MATRICES else SOLVED
@@ -80,7 +85,7 @@ class UnseenCase(Drawn):
         )
 
     def tried(self, precision: str, device: str) -> Attempt:
-        """Solve, cold and warm, and the equations."""
+        """Solve cold and warm, and solve the equations without bounds."""
         drawn = unseen.problem(self.kind, self.seed)
         result, attempt = solved(drawn.problem, self.solve, device)
         attempt.facts = {
@@ -119,28 +124,36 @@ class UnseenCase(Drawn):
     def _warm(
         self, then: GridProblem, before: wl.SolveResult, attempt: Attempt, device: str
     ) -> None:
-        taken = {}
+        iterations = {}
         for how, guess in (("cold", {}), ("warm", {"x0": before.x})):
             result, found = solved(then, self.solve, device, **guess)
-            taken[how] = result.linear_iterations
+            iterations[how] = result.linear_iterations
             attempt.faults += [
                 f"changed, {how}: {fault}"
                 for fault in [*found.faults, *([] if result else [result.status.name])]
             ]
-        attempt.facts |= taken
-        if taken["warm"] > limit(taken["cold"], OFTEN, 1.0):
-            attempt.faults.append(f"{taken['warm']} iterations warm, {taken['cold']} cold")
+        attempt.facts |= iterations
+        if iterations["warm"] > limit(iterations["cold"], OFTEN, 1.0):
+            attempt.faults.append(
+                f"{iterations['warm']} iterations warm, {iterations['cold']} cold"
+            )
 
 
 def limit(equations: int | None, of: tuple[float, int], allowance: float) -> float:
-    """Return how many iterations are allowed for those of the equations; None where these have no solution."""
+    """Return the iterations allowed, given those of the equations.
+
+    `equations` is None where these have no solution.
+    """
     return (
         float(WITHOUT_EQUATIONS) if equations is None else allowance * (of[0] * equations + of[1])
     )
 
 
 class EveryMethodCase(Drawn):
-    """A small random problem given to every method that takes it: none may call something a solution that is none, or fail otherwise."""
+    """Small random problem for every applicable method.
+
+    No method may report convergence for a wrong answer, or fail otherwise.
+    """
 
     def __init__(self, kind: str, seed: int) -> None:
         super().__init__(
@@ -154,7 +167,7 @@ class EveryMethodCase(Drawn):
 
     def tried(self, precision: str, device: str) -> Attempt:
         """Try all methods."""
-        problem, begun = (
+        problem, start_time = (
             unseen.problem(self.kind, self.seed, small=True).problem,
             time.perf_counter(),
         )
@@ -169,13 +182,13 @@ class EveryMethodCase(Drawn):
             "ends": ends,
             "converged": sum(end == "CONVERGED" for end in ends.values()),
         }
-        return Attempt("done", None, time.perf_counter() - begun, faults=faults, facts=facts)
+        return Attempt("done", None, time.perf_counter() - start_time, faults=faults, facts=facts)
 
 
 def by_method(
     name: str, problem: Problem, device: str, solve: Solve = wl.solve
 ) -> tuple[str, list[str]]:
-    """Return how a method ends on a small problem that has a solution, and what is wrong with that."""
+    """Return a method's end status on a solvable small problem, and its faults."""
     method, unknowns = wl.METHODS[name], len(problem.exact().b)
     operator = (
         "grid"
@@ -202,7 +215,10 @@ def by_method(
 def cases(
     first: int, grids: int = GRIDS_A_KIND, matrices: int = MATRICES_A_KIND
 ) -> Iterator[Drawn]:
-    """Yield problems of all kinds, seeds from `first` on; of each kind the first is given to every method too, small."""
+    """Yield problems of all kinds, with seeds from `first` on.
+
+    The first of each kind also goes to every method, in a small size.
+    """
     for kind in unseen.KINDS:
         for seed in range(first, first + (grids if kind in unseen.GRIDS else matrices)):
             yield UnseenCase(kind, seed)
@@ -211,7 +227,7 @@ def cases(
 
 
 def summary(verdicts: Sequence[Verdict], first: int) -> tuple[Table, list[str]]:
-    """Return a row a kind, and what is wrong with all together."""
+    """Return a row for each kind, and the faults of all cases together."""
     own = [v for v in verdicts if v.case.family == FAMILY]
     rows = [
         _row(kind, [v for v in own if isinstance(v.case, Drawn) and v.case.kind == kind])

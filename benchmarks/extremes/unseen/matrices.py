@@ -1,4 +1,7 @@
-"""Kinds of matrices: plates, elastic contact, irregular meshes, options, linear programs, skew matrices with small diagonals."""
+"""Random matrices: plates, elastic contact, meshes, options, linear programs.
+
+There are also skew matrices with small diagonals.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from warp_lcp.benchmarks.extremes.unseen import grids
 from warp_lcp.benchmarks.extremes.unseen.draw import Draw
 
 GRIDS = (grids.torsion, grids.dam, grids.voxels, grids.shifted)
-SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # none, and the range of those that are tiny
+SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # zero, and the range of tiny diagonals
 
 
 def grid_matrix(draw: Draw) -> MatrixProblem:
@@ -23,14 +26,21 @@ def grid_matrix(draw: Draw) -> MatrixProblem:
 
 
 def assembled(of_elements: np.ndarray, at: np.ndarray, n: int) -> scipy.sparse.csr_array:
-    """Return the sum of elements' matrices, shape (m, k, k), with rows and columns `at`, shape (m, k)."""
+    """Return the sum of element matrices, shape (m, k, k).
+
+    Their rows and columns are `at`, shape (m, k).
+    """
     k = at.shape[1]
     rows, columns = np.repeat(at, k, axis=1).ravel(), np.tile(at, k).ravel()
     return scipy.sparse.coo_array((of_elements.ravel(), (rows, columns)), shape=(n, n)).tocsr()
 
 
 def stiffness(poisson: float) -> np.ndarray:
-    """Return the stiffness of a bilinear unit square in plane strain, E = 1; nodes (0,0), (1,0), (0,1), (1,1), x before y."""
+    """Return the stiffness matrix of a bilinear unit square in plane strain, E = 1.
+
+    The nodes are (0,0), (1,0), (0,1), (1,1), x before y. K is the integral of B' D B by 2 x 2 Gauss
+    points of weight 1/4. B maps displacements to the strains (xx, yy, xy), D strains to stresses.
+    """
     D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / (
         (1 + poisson) * (1 - 2 * poisson)
     )
@@ -47,7 +57,12 @@ def stiffness(poisson: float) -> np.ndarray:
 
 
 def elastic(draw: Draw) -> MatrixProblem:
-    """Return a block of elastic squares held at its top and pressed on a foundation: gaps bound the bottom's displacements."""
+    """Return an elastic block pressed on a foundation.
+
+    It consists of bilinear squares, held at its top and pressed down there by a given displacement,
+    which enters b together with a vertical load. Gaps bound the vertical displacements of its
+    bottom from below.
+    """
     nx, ny = draw.whole(6, 80), draw.whole(4, 50)
     node = np.arange((nx + 1) * (ny + 1)).reshape(ny + 1, nx + 1)
     corners = np.stack(
@@ -75,7 +90,11 @@ def elastic(draw: Draw) -> MatrixProblem:
 
 
 def triangles(draw: Draw) -> MatrixProblem:
-    """Return a membrane over an obstacle on an irregular mesh of linear triangles."""
+    """Return a membrane over an obstacle on an irregular mesh of linear triangles.
+
+    K_ij = e_i . e_j / (4 area) with the edges e_i opposite to the corners. The load is lumped: a
+    third of a triangle's area for each corner. Slivers are left out.
+    """
     n = draw.whole(12, 12000)
     points = np.vstack(
         [draw.rng.random((n, 2)) ** draw.of(1.0, 2.0), [[0, 0], [0, 1], [1, 0], [1, 1]]]
@@ -100,12 +119,17 @@ def triangles(draw: Draw) -> MatrixProblem:
 
 
 def option(draw: Draw) -> MatrixProblem:
-    """Return an implicit step of an American put, tridiagonal and unsymmetric, early exercise as its lower bound."""
+    """Return an implicit step of an American put, tridiagonal and unsymmetric.
+
+    It is Euler's implicit step dt of V_t = sigma^2 s^2 / 2 V_ss + rate s V_s - rate V, t the time
+    to expiry, at the prices s = 3 strike i / n, from the payoff. V = strike at s = 0. Early
+    exercise, the payoff, is the lower bound.
+    """
     n, rate, sigma = draw.whole(20, 3000), draw.between(0.01, 0.1), draw.between(0.1, 0.6)
     dt, strike, i = draw.decades(1e-4, 1.0), 100.0, np.arange(1, n)
     s = 3 * strike * i / n
     down, up = 0.5 * dt * (sigma**2 * i**2 - rate * i), 0.5 * dt * (sigma**2 * i**2 + rate * i)
-    wind = down < 0  # there differences against the wind keep it an M-matrix
+    wind = down < 0  # upwind differences there keep it an M-matrix
     down, up = (
         np.where(wind, 0.5 * dt * sigma**2 * i**2, down),
         np.where(wind, up + 0.5 * dt * rate * i, up),
@@ -120,7 +144,10 @@ def option(draw: Draw) -> MatrixProblem:
 
 
 def held(draw: Draw, matrix: Any) -> MatrixProblem:
-    """Return the problem of a matrix whose solution is chosen: entries of x > 0 where y = 0 and the other way round."""
+    """Return the problem of a matrix with a chosen solution.
+
+    Entries have x > 0 and y = 0, or the other way round.
+    """
     n = matrix.shape[0]
     free = draw.rng.random(n) < draw.between(0.2, 0.8)
     x = np.where(free, draw.rng.uniform(0.1, 1.0, n), 0.0) * draw.decades(1e-2, 1e2)
@@ -129,7 +156,7 @@ def held(draw: Draw, matrix: Any) -> MatrixProblem:
 
 
 def as_kind(draw: Draw, matrix: np.ndarray) -> Any:
-    """Return the matrix dense or sparse."""
+    """Return the matrix as dense or sparse."""
     return matrix if draw.chance(0.5) else scipy.sparse.csr_array(matrix)
 
 
@@ -140,7 +167,10 @@ def small_diagonal(draw: Draw) -> float:
 
 
 def linear_program(draw: Draw) -> MatrixProblem:
-    """Return the optimality conditions of a linear program, with a tiny diagonal: min c'x, A x >= b, x >= 0."""
+    """Return the optimality conditions of min c'x, A x >= b, x >= 0.
+
+    The diagonal is tiny.
+    """
     m, n = draw.whole(1, 100), draw.whole(1, 100)
     A = draw.noise((m, n)) * (draw.rng.random((m, n)) < draw.between(0.2, 1))
     A = A * 10.0 ** draw.rng.uniform(-draw.of(0, 0, 2), 0, (m, 1))
@@ -158,7 +188,10 @@ def skew(draw: Draw) -> MatrixProblem:
 
 
 def least_squares(draw: Draw) -> MatrixProblem:
-    """Return nonnegative least squares: B'B of full or lower rank, columns of any length."""
+    """Return nonnegative least squares: B'B of full or deficient rank.
+
+    Columns have any length.
+    """
     n = draw.whole(2, 150)
     B = draw.noise((max(1, int(n * draw.between(0.4, 3))), n)) * 10.0 ** draw.rng.uniform(
         -draw.of(0, 1, 3), 0, n
