@@ -40,7 +40,7 @@ SEMISMOOTH = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0,
 SOLVED = 1e-8  # PETSc's relative tolerance
 AT_BOUND = 1e-8  # distance from the bound below which PETSc's active set ends
 KINK = 1e-12  # size of x - l and y below which TAO moves the point
-# As TAO's bqpip: 0.95 of the way to a bound, a start with all products w s at their mean, 2000
+# As TAO's bqpip: 0.95 of the way to a bound, and a start whose products w s have TAO's mean, 2000.
 PREDICTOR_CORRECTOR = wl.InteriorPoint(
     precision="double", monotone_cycles=0, backoff=0.95, start=120.0, predictor_eta=1e-8, eta=1e-8
 )
@@ -276,8 +276,8 @@ def put_problem() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.nda
 
     The problem is a time step of an American put by Crank and Nicolson's scheme, for V_t = (rate -
     dividend) S V_S + volatility^2 S^2 / 2 V_SS - rate V, t the time to expiry. The term rate V is
-    treated implicitly. Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V has
-    the 151 values of the step before.
+    treated implicitly. Values 10 at S = 0 and 0 at S = 100 are known, so that A has 149 unknowns; V
+    has the 151 values of the step before.
     """
     strike, rate, dividend, volatility, step = 10.0, 0.04, 0.01, 0.4, 0.1
     S = np.linspace(0, 100, 151)

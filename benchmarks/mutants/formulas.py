@@ -148,12 +148,12 @@ FORMULAS = [
         ("0.5 * float(f @ f), projected=False)", "0.5 * float(f @ f), projected=True)"),
         ("REGULARIZATION = 1e-6", "REGULARIZATION = 1e-3"),
         ("-f - q * gap", "-f + q * gap"),
-        ("A @ dx + gap, float", "A @ dx - gap, float"),
+        ("A @ dx + gap,", "A @ dx - gap,"),
         ("self._mu *= self._factor", "self._mu *= 0.5 * self._factor"),
         ("np.maximum(y, 1.0), y)", "y, y)"),
         ("(1 - length) * np.linalg.norm(gap)", "np.linalg.norm(gap)"),
         ("x - gradient / map_.d**2", "x + gradient / map_.d**2"),
-        ("LOCAL_MINIMUM if failure and", "LOCAL_MINIMUM if not failure and"),
+        ("if failure and np.linalg.norm(inside)", "if not failure and np.linalg.norm(inside)"),
     ),
     *_changes(
         "reduced/nonsmooth_map.py",
@@ -195,8 +195,8 @@ FORMULAS = [
         ("length = min(1.0, share / longest)", "length = min(1.0, 1 / longest)"),
         ("min(1.0, s.backoff / longest)", "min(1.0, 1 / longest)"),
         (
-            "LARGEST_START * self.residual.norm), self.residual.norm)",
-            "LARGEST_START * self.residual.norm), 0.0)",
+            "LARGEST_START * self.residual.norm),\n                    self.residual.norm,",
+            "LARGEST_START * self.residual.norm),\n                    0.0,",
         ),
         ("self.settings.start * size / math.sqrt(unknowns)", "self.settings.start * size"),
     ),
@@ -304,7 +304,10 @@ FORMULAS = [
         "solvers/subspace_minimization.py",
         SUBSPACE,
         ("size * 0.5**halving", "size * 0.25**halving"),
-        ("residual.evaluate(x) < norm or", "residual.evaluate(x) < norm and"),
+        (
+            "residual.evaluate(x) < norm\n                or",
+            "residual.evaluate(x) < norm\n                and",
+        ),
         ("if solve > 0 and not moved", "if not moved"),
         (
             "for halving in range(max(s.backtracks, 0) + 1)",
