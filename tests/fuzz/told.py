@@ -21,8 +21,8 @@ except ImportError:  # not on Windows
     resource = None
 
 COUNT = settings().max_examples
-# a quarter in the short tests, all of them in `make fuzz`
-costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 4)
+# half in the short tests, all of them in `make fuzz`
+costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 2)
 MEMORY = 1 << 30  # bytes that reading one small file may take
 
 

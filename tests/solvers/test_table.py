@@ -1,6 +1,7 @@
 """Every registered method on every family of operators it supports, in each precision, against oracles: new methods are picked up."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ FAMILIES = ("dense", "sparse", "grid")
 BOUNDS = ("lcp", "box", "mixed")
 RTOL = {"mixed": 1e-8, "double": 1e-8, "single": 1e-4}
 CRITERIA = {"max_iterations": 20_000, "patience": 2000}
+EMULATED = "emulated_cuda" in sys.modules
 MANY = 30  # unknowns, for methods that take as many
 
 
@@ -31,11 +33,16 @@ def cases():
             for bounds in BOUNDS:
                 for precision in precisions(cls):
                     if family in families(cls) and (bounds == "lcp" or getattr(cls, "boxed", True)):
+                        # emulated, what blocks of threads do to each other is the same in each type
+                        marks = (
+                            pytest.mark.slow if EMULATED and precision != precisions(cls)[0] else ()
+                        )
                         yield pytest.param(
                             name,
                             family,
                             bounds,
                             precision,
+                            marks=marks,
                             id=f"{name}-{family}-{bounds}-{precision}",
                         )
 
