@@ -31,8 +31,10 @@ test-distributed:
 		echo "no tests on several ranks: $$why"; \
 	fi
 
-# What is done on CUDA, on the CPU (see benchmarks/emulated_cuda.py): all solvers, levels and transfers, steps of all scenes, with threads in an unusual
-# order; EMULATED=tests for all there is, COMPARE=1 to launch every kernel in three orders.
+# What is done on CUDA, on the CPU (see benchmarks/emulated_cuda.py): all solvers, levels and
+# transfers, steps of scenes that have all that there is in scenes, with threads in an unusual order;
+# PYTEST_ARGS="-m ''" for all scenes and all precisions, EMULATED=tests for all there is, COMPARE=1
+# to launch every kernel in three orders.
 EMULATED ?= tests/solvers/test_table.py tests/multigrid/test_small_levels.py tests/grid/test_transfer.py \
 	tests/solvers/test_run_ahead.py tests/grid/test_tally.py tests/rows/test_joined.py tests/granular/test_stress_ahead.py tests/granular/test_front.py \
 	tests/test_as_on_cuda.py

@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import sys
 
 import pytest
 import warp as wp
@@ -21,23 +22,36 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 
+start_warp()
+DEVICES = ["cpu", *(["cuda:0"] if wp.is_cuda_available() else [])]
+
 UNHURRIED = {
     "deadline": None,
     "database": None,
     "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large],
 }
-settings.register_profile("few", max_examples=100, derandomize=True, **UNHURRIED)
+settings.register_profile("few", max_examples=40, derandomize=True, **UNHURRIED)
 settings.register_profile(
     "fuzz", max_examples=int(os.environ.get("FUZZ_EXAMPLES", "10000")), **UNHURRIED
 )
 settings.load_profile("few")
 
 
+gc.disable()  # until tests are collected: of what that makes, nothing is garbage
+
+
+def pytest_collection_finish():
+    """Keep what has been imported and collected, a million objects, out of all searches for garbage: each would take a second."""
+    if "emulated_cuda" not in sys.modules:  # which finds kernels among all objects
+        gc.freeze()
+    gc.set_threshold(2000, 10, 10)  # three times the usual: a test leaves little
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items):
     # The longest first, so that others run beside it.
     items.sort(key=lambda item: item.name.startswith("test_kernels_compile_for_cuda"), reverse=True)
-    start_warp()
-    if not wp.is_cuda_available():
+    if len(DEVICES) == 1:
         skip = pytest.mark.skip(reason="no CUDA device on this machine")
         for item in items:
             if item.get_closest_marker("cuda"):  # not a keyword, since a folder may have that name
@@ -46,15 +60,26 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture
 def only_new_objects():
-    """Exclude existing objects from garbage collection and counts of memory.
-
-    A search of the objects of all other tests, which are millions, takes a second.
-    """
+    """Exclude existing objects from garbage collection and counts of memory."""
+    gc.collect()
     gc.freeze()
-    yield
+
+
+@pytest.fixture
+def every_object():
+    """Include what has been imported in searches of all objects."""
     gc.unfreeze()
+    yield
+    gc.freeze()
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+@pytest.fixture(params=DEVICES)
 def device(request):
+    """Each device of this machine that tests run on."""
     return request.param
+
+
+@pytest.fixture
+def pyvista():
+    """VTK, which draws and reads files back; its tests are skipped where it is missing."""
+    return pytest.importorskip("pyvista", reason="needs pyvista, the extra `render`")

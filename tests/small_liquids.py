@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from scene_tables import box
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 GRAVITY = 9.81
@@ -31,11 +32,6 @@ def scene(
         "liquid": liquid,
     }
     return LiquidScene.model_validate(data | tables)
-
-
-def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
-    """Return a box of liquid or a solid one."""
-    return {"shape": "box", "min": low, "max": high, **more}
 
 
 def create(

@@ -1,5 +1,6 @@
 """Hand-written run folders with surfaces and bodies, for tests of images."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -143,3 +144,37 @@ def sphere() -> tuple[np.ndarray, np.ndarray]:
             divided += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
         corners = divided
     return np.array(points), np.array(corners)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return what `run.json` in a run's folder holds."""
+    return json.loads((folder / "run.json").read_text())
+
+
+def written_files(folder: Path) -> dict[str, bytes]:
+    """Return frames, collections and the last checkpoint of a run by name."""
+    files = [
+        *folder.glob("frames/*"),
+        *folder.glob("*.pvd"),
+        sorted(folder.glob("checkpoints/*.npz"))[-1],
+    ]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+class StepCounter:
+    """An observer that counts steps."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def note(self, text: str) -> None:
+        assert text
+
+    def start(self, time: float, end: float) -> None:
+        assert end > time
+
+    def step(self, row: dict[str, Any]) -> None:
+        self.steps += 1
+
+    def frame(self, index: int, last: int) -> None:
+        assert index <= last

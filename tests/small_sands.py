@@ -3,17 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
 GRAVITY = 9.81
 STEPS = 3000
-
-
-def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
-    """Return a box of sand or a solid one."""
-    return {"shape": "box", "min": low, "max": high, **more}
 
 
 def scene(

@@ -5,20 +5,15 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from warp_lcp.cli import commands as cli
+from command_line import invoke
 from warp_lcp.cli.suites import benchmarks
 
 pytestmark = pytest.mark.usefixtures("only_new_objects")
 
 
-def call(*arguments):
-    return CliRunner().invoke(cli.app, ["bench", *map(str, arguments)])
-
-
 def measured(tmp_path, suite, *options):
-    result = call(suite, "--device", "cpu", "--out", tmp_path, "--repeat", 1, *options)
+    result = invoke("bench", suite, "--device", "cpu", "--out", tmp_path, "--repeat", 1, *options)
     assert result.exit_code == 0, result.stderr
     assert f"{tmp_path / suite}.json" in result.stdout
     assert (tmp_path / f"{suite}.md").read_text().startswith("# ")
@@ -92,7 +87,9 @@ def test_solvers(tmp_path):
     )
     # The method needs symmetric matrices.
     assert "contacts of 12 bodies: incremental-pivoting" not in records
-    again = call("solvers", "--compare", tmp_path / "solvers.json", tmp_path / "solvers.json")
+    again = invoke(
+        "bench", "solvers", "--compare", tmp_path / "solvers.json", tmp_path / "solvers.json"
+    )
     assert again.exit_code == 0
     assert "[1.000, 1.000]    within noise" in again.stdout
 
@@ -114,7 +111,7 @@ def test_devices(tmp_path):
 def test_kept_machines_can_be_compared():
     results = Path(__file__).parents[2] / "benchmarks" / "results"
     cpu, gpu = (results / name / "devices.json" for name in ("amd-epyc", "nvidia-h200"))
-    compared = call("devices", "--compare", cpu, gpu)
+    compared = invoke("bench", "devices", "--compare", cpu, gpu)
     assert compared.exit_code == 0, compared.stderr
     assert "128^3: ProjectedMultigrid" in compared.stdout
 
@@ -144,13 +141,13 @@ def test_run(tmp_path):
     ],
 )
 def test_wrong_input_exits_with_2(arguments, expected):
-    result = call(*arguments)
+    result = invoke("bench", *arguments)
     assert result.exit_code == 2
     assert expected in result.stderr
 
 
 def test_a_suite_that_fails_exits_with_1(tmp_path):
     (tmp_path / "file").touch()
-    result = call("kernels", "--out", tmp_path / "file")
+    result = invoke("bench", "kernels", "--out", tmp_path / "file")
     assert result.exit_code == 1
     assert "the suite kernels ended with exit code 1" in result.stderr

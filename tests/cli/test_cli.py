@@ -8,16 +8,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
+from command_line import invoke
 from warp_lcp.cli import commands as cli
 from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.scene import simulator
 from warp_lcp.simulation import SimulationFailed
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -26,7 +23,9 @@ def out(tmp_path: Path) -> Path:
 
 
 def test_run(scene_file, out):
-    result = call("run", scene_file, "--out", out, "--device", "cpu", "--set", "time.duration=0.2")
+    result = invoke(
+        "run", scene_file, "--out", out, "--device", "cpu", "--set", "time.duration=0.2"
+    )
     assert result.exit_code == 0
     assert "frame 4/4" in result.stderr
     assert "finished: frame 4 of 4 reached" in result.stdout
@@ -34,7 +33,7 @@ def test_run(scene_file, out):
 
 
 def test_a_profile_is_shown_and_written(scene_file, out):
-    result = call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--profile")
+    result = invoke("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--profile")
     assert result.exit_code == 0
     shown = [line.split()[0] for line in result.stdout.splitlines()]
     assert shown[0] == "stage"
@@ -52,7 +51,9 @@ def test_a_profile_is_shown_and_written(scene_file, out):
         == json.loads((out / "run.json").read_text())["steps"]
     )
     assert (
-        call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--force").exit_code
+        invoke(
+            "run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--force"
+        ).exit_code
         == 0
     )
     assert not (out / "profile.json").exists()
@@ -72,7 +73,7 @@ def test_a_profile_is_shown_and_written(scene_file, out):
     ],
 )
 def test_paths_that_no_file_can_have(words, name):
-    result = call(*words.format(name).split())
+    result = invoke(*words.format(name).split())
     assert result.exit_code == 2
     assert name in result.stderr
     assert result.stderr.endswith(": File name too long\n")
@@ -80,7 +81,7 @@ def test_paths_that_no_file_can_have(words, name):
 
 def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert call("run", scene_file, "--frames", 1, "--device", "cpu").exit_code == 0
+    assert invoke("run", scene_file, "--frames", 1, "--device", "cpu").exit_code == 0
     assert (tmp_path / "out" / "dots" / "particles.pvd").is_file()
 
 
@@ -108,7 +109,7 @@ def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
 )
 def test_wrong_input_exits_with_2(scene_file, out, arguments, expected):
     filled = [argument.format(scene=scene_file) for argument in arguments]
-    result = call(*filled, *(["--out", out] if filled[0] == "run" else []))
+    result = invoke(*filled, *(["--out", out] if filled[0] == "run" else []))
     assert result.exit_code == 2
     assert expected in result.stderr
     assert "Traceback" not in result.stderr
@@ -117,23 +118,23 @@ def test_wrong_input_exits_with_2(scene_file, out, arguments, expected):
 
 def test_existing_output_is_kept_without_force(scene_file, out):
     run = ["run", scene_file, "--out", out, "--device", "cpu"]
-    assert call(*run, "--frames", 1).exit_code == 0
-    refused = call(*run)
+    assert invoke(*run, "--frames", 1).exit_code == 0
+    refused = invoke(*run)
     assert refused.exit_code == 2
     assert "--force to delete it" in refused.stderr
-    assert call(*run, "--resume", "--frames", 2).exit_code == 0
-    assert call(*run, "--force", "--frames", 0).exit_code == 0
+    assert invoke(*run, "--resume", "--frames", 2).exit_code == 0
+    assert invoke(*run, "--force", "--frames", 0).exit_code == 0
     assert [path.name for path in out.glob("frames/particles*")] == ["particles_000000.vtu"]
 
 
 def test_a_finished_run_that_is_resumed_says_so(scene_file, out):
-    assert call("run", scene_file, "--out", out, "--device", "cpu").stdout.startswith(
+    assert invoke("run", scene_file, "--out", out, "--device", "cpu").stdout.startswith(
         "finished: frame "
     )
-    again = call("run", "--resume", "--out", out, "--device", "cpu")
+    again = invoke("run", "--resume", "--out", out, "--device", "cpu")
     assert again.exit_code == 0
     assert again.stdout.startswith("finished earlier, nothing to do: frame 10 of 10 reached; ")
-    more = call("run", "--resume", "--out", out, "--device", "cpu", "--set", "time.duration=0.6")
+    more = invoke("run", "--resume", "--out", out, "--device", "cpu", "--set", "time.duration=0.6")
     assert more.stdout.startswith("finished: frame 12 of 12 reached")
 
 
@@ -142,27 +143,28 @@ def test_files_nearby_are_named_where_one_is_not_there(scene_file, tmp_path, mon
     for name in ("my-scene.toml", "other.toml"):
         (tmp_path / name).write_text(scene_file.read_text())
     assert (
-        call("check", "my-scen.toml").stderr
+        invoke("check", "my-scen.toml").stderr
         == "my-scen.toml: there is no such file; did you mean 'my-scene.toml'?\n"
     )
-    assert "did you mean 'my-scene.toml'?" in call("check", "my-scene").stderr
-    assert "did you mean 'dam-break'?" in call("check", "dam-brek").stderr
+    assert "did you mean 'my-scene.toml'?" in invoke("check", "my-scene").stderr
+    assert "did you mean 'dam-break'?" in invoke("check", "dam-brek").stderr
     assert (
-        call("check", "nothing-like-it.toml").stderr
+        invoke("check", "nothing-like-it.toml").stderr
         == "nothing-like-it.toml: there is no such file\n"
     )
     assert (
-        f"did you mean '{tmp_path / 'other.toml'}'?" in call("check", tmp_path / "othr.toml").stderr
+        f"did you mean '{tmp_path / 'other.toml'}'?"
+        in invoke("check", tmp_path / "othr.toml").stderr
     )
 
 
 def test_initials_of_a_key_are_understood(scene_file):
-    said = call("check", scene_file, "--set", "time.fps=24").stderr
+    said = invoke("check", scene_file, "--set", "time.fps=24").stderr
     assert "time.fps: unknown key; did you mean 'frames_per_second'?" in said
 
 
 def test_the_help_of_bench_names_every_suite():
-    shown = call("bench", "--help").stdout
+    shown = invoke("bench", "--help").stdout
     assert {"domains", "tank", *benchmarks()} == {
         name for name in suite_names() if re.search(rf"\b{name}\b", shown)
     }
@@ -201,7 +203,7 @@ def test_a_failed_run_exits_with_1_and_names_the_checkpoint(dots, scene_file, ou
             raise SimulationFailed("step 7: velocity is not finite in cell (3, 1, 0)")
 
     dots.before_step = before_step
-    result = call("run", scene_file, "--out", out, "--device", "cpu")
+    result = invoke("run", scene_file, "--out", out, "--device", "cpu")
     assert result.exit_code == 1
     assert "failed: step 7: velocity is not finite in cell (3, 1, 0)" in result.stderr
     assert f"last checkpoint: {out / 'checkpoints' / 'step_000004.npz'}" in result.stderr
@@ -216,7 +218,7 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(dots, scene_file, out):
             signal.raise_signal(signal.SIGINT)
 
     dots.before_step = before_step
-    result = call("run", scene_file, "--out", out, "--device", "cpu")
+    result = invoke("run", scene_file, "--out", out, "--device", "cpu")
     assert result.exit_code == 1
     assert "stopped: interrupted" in result.stderr
     assert f"warp-lcp run {out / 'scene.toml'} --out {out} --device cpu --resume" in result.stderr
@@ -224,27 +226,28 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(dots, scene_file, out):
     assert signal.getsignal(signal.SIGINT) is before
     dots.before_step = lambda simulation, dt: None
     assert (
-        call("run", out / "scene.toml", "--out", out, "--device", "cpu", "--resume").exit_code == 0
+        invoke("run", out / "scene.toml", "--out", out, "--device", "cpu", "--resume").exit_code
+        == 0
     )
     assert json.loads((out / "run.json").read_text())["resumed_from_step"] == 7
 
 
 def test_check_prints_the_plan(scene_file):
-    result = call("check", scene_file)
+    result = invoke("check", scene_file)
     assert result.exit_code == 0
     assert "8 x 8 = 64 cells of 0.125 m" in result.stdout
     assert "11 at 20 per second" in result.stdout
 
 
 def test_scenes_lists_what_can_be_run():
-    result = call("scenes")
+    result = invoke("scenes")
     assert result.exit_code == 0
     assert "ceiling-drop" in result.stdout
     assert "a column of water breaks over a pillar (3-D)" in result.stdout
 
 
 def test_schema_is_json(dots):
-    schema = json.loads(call("schema", "--simulator", "dots").stdout)
+    schema = json.loads(invoke("schema", "--simulator", "dots").stdout)
     assert schema["properties"].keys() >= {
         "scene",
         "time",
@@ -258,7 +261,7 @@ def test_schema_is_json(dots):
 
 
 def test_info_names_versions_and_devices(dots):
-    result = call("info")
+    result = invoke("info")
     assert result.exit_code == 0
     for expected in (
         "warp-lcp",
@@ -275,7 +278,7 @@ def test_info_names_versions_and_devices(dots):
 def test_a_simulator_that_does_not_load(dots, scene_file, monkeypatch):
     entry = SimpleNamespace(name="fluids", load=lambda: getattr(json, "SIMULATOR"))  # noqa: B009
     monkeypatch.setattr(simulator, "entry_points", lambda group: [entry])
-    result = call("check", scene_file)
+    result = invoke("check", scene_file)
     assert result.exit_code == 2
     assert (
         "a simulator cannot be loaded: module 'json' has no attribute 'SIMULATOR'" in result.stderr

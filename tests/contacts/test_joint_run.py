@@ -11,10 +11,9 @@ import meshio
 import numpy as np
 import pytest
 import scipy.optimize
-from typer.testing import CliRunner
 
+from command_line import succeed
 from every_step import differences_by_step
-from warp_lcp.cli import commands
 from warp_lcp.contacts.kinematics import KinematicSimulation
 from warp_lcp.contacts.methods import JOINTED, KINEMATIC
 from warp_lcp.contacts.scene import ContactScene
@@ -243,22 +242,12 @@ def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
     assert message in str(error.value)
 
 
-def done(*arguments: object) -> str:
-    result = CliRunner().invoke(commands.app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, f"{arguments}: {result.stderr}\n{result.exception!r}"
-    return result.stdout
-
-
 @pytest.mark.parametrize("name", ["gear-pyramid", "gears", "motor-arm", "reach", "snake"])
 def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
-    """Frames of built-in scenes.
-
-    meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists
-    them.
-    """
-    assert "joints" in done("check", name, "--device", "cpu")
-    assert name in done("scenes")
-    done("run", name, "--device", "cpu", "--out", tmp_path / "run", "--frames", 1)
+    """meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists them."""
+    assert "joints" in succeed("check", name, "--device", "cpu")
+    assert name in succeed("scenes")
+    succeed("run", name, "--device", "cpu", "--out", tmp_path / "run", "--frames", 1)
     with open(tmp_path / "run" / "log.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert all(
@@ -268,7 +257,7 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     scene = loaded(name)
     shown = sum(solid.is_body for solid in scene.solid) + len(scene.target)
     assert set(np.unique(mesh.point_data["body"])) == set(range(shown))
-    done("render", tmp_path / "run", "--frame", 1, "--size", "320x240")
+    succeed("render", tmp_path / "run", "--frame", 1, "--size", "320x240")
     assert (tmp_path / "run" / "images" / "frame_000001.png").stat().st_size > 1000
 
 

@@ -17,12 +17,22 @@ launch.find_petsc()
 
 @pytest.fixture
 def mpi(tmp_path):
-    """Run this interpreter on n ranks.
+    """Run this interpreter on ranks in `tmp_path`, see `starter`."""
+    return starter(tmp_path)
 
-    `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with the text of a program.
 
-    A text has a line break. It is written into a file in `tmp_path`, which is the
-    working folder of all runs.
+@pytest.fixture(scope="module")
+def mpi_of_module(tmp_path_factory):
+    """Run this interpreter on ranks in a folder of the module, see `starter`: a start takes seconds, which tests can share."""
+    return starter(tmp_path_factory.mktemp("ranks"))
+
+
+def starter(folder):
+    """Return what runs this interpreter on n ranks.
+
+    `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with a program's text. Text
+    is what has a line break in it; it is written into a file in the folder, which is the working
+    folder of all runs, `mpi.folder`.
 
     Args:
         n: number of ranks.
@@ -43,13 +53,13 @@ def mpi(tmp_path):
     def run(n, *arguments, exit_code=0, seconds=SECONDS, environment=None):
         words = [str(a) for a in arguments]
         if "\n" in words[0]:
-            program = tmp_path / "program.py"
+            program = folder / "program.py"
             program.write_text(textwrap.dedent(words[0]))
             words[0] = str(program)
         process = subprocess.Popen(
             launch.command(n, *words),
             env=launch.environment() | (environment or {}),
-            cwd=tmp_path,
+            cwd=folder,
             text=True,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -70,4 +80,5 @@ def mpi(tmp_path):
         )
         return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
 
+    run.folder = folder
     return run

@@ -6,27 +6,25 @@ Any number of ranks can continue from what was written.
 import fcntl
 import json
 import random
-import time
 from contextlib import suppress
 from pathlib import Path
 
 import faults_on_ranks
 import pytest
 from dots_on_ranks import SCENE
-from test_run_on_ranks import assert_same_run, log, record, run
+from test_run_on_ranks import assert_same_run, log, run
+
+from small_runs import read_record
 
 PROGRAM = Path(__file__).with_name("faults_on_ranks.py")
-SOON = 10.0  # seconds that all ranks may take to end
-LIMIT = 6.0  # [s] by which a rank may be late
+SECONDS = 90.0  # a run that takes longer hangs: without a fault it takes a few
+LIMIT = 6.0  # that a rank may be late, in seconds
 __all__ = ["run"]
 
 
 @pytest.fixture
 def befall(mpi, tmp_path):
-    """Run dots on ranks with a fault on one, see `faults_on_ranks`.
-
-    Return the output and the seconds until the end.
-    """
+    """Run dots on ranks of which one meets a fault, see `faults_on_ranks`, and which end within SECONDS; return what was said."""
 
     def go(ranks, fault, *more):
         (tmp_path / "dots.toml").write_text(SCENE)
@@ -48,12 +46,13 @@ def befall(mpi, tmp_path):
             "dots.toml",
             *options,
             exit_code=None,
-            seconds=90.0,
+            seconds=SECONDS,
             environment={"FAULT": fault},
         )
         assert done.returncode != 0
         assert "finished" not in done.stdout
-        return done.stdout + done.stderr, time.time() - float((tmp_path / "fault").read_text())
+        assert (tmp_path / "fault").exists()
+        return done.stdout + done.stderr
 
     return go
 
@@ -82,10 +81,9 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
     status, reason, said, step = FAULTS[fault]
-    text, seconds = befall(2, fault)
-    assert seconds < SOON + LIMIT * fault.count("late")
-    found = record(tmp_path / "out")
-    # By mpiexec, a second later, before the end of the step.
+    text = befall(2, fault)
+    found = read_record(tmp_path / "out")
+    # by mpiexec, a second later, before the step's end
     killed = "Ctrl-C" in fault and found["status"] == "running"
     assert killed or (found["status"], found["reason"][: len(reason)]) == (status, reason)
     assert said in text
@@ -94,7 +92,7 @@ def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
     run(ranks, "run dots.toml --out out --resume")
     run(0, "run dots.toml --out one")
     assert_same_run(tmp_path / "one", tmp_path / "out")
-    resumed = record(tmp_path / "out")["resumed_from_step"]
+    resumed = read_record(tmp_path / "out")["resumed_from_step"]
     assert resumed == step if step is not None else resumed >= 28
     assert not list((tmp_path / "out").glob(".waits*"))
 
@@ -120,13 +118,13 @@ AFTER = """
 def test_what_fails_after_a_step_leaves_it(mpi, run, tmp_path, rank):
     done = mpi(2, AFTER.format(folder=str(PROGRAM.parent), rank=rank), exit_code=1)
     assert "LookupError: nothing to show" in done.stderr
-    found = record(tmp_path / "out")
+    found = read_record(tmp_path / "out")
     assert (found["status"], found["steps"]) == ("failed", 30)
     assert found["reason"] == (
         "LookupError: nothing to show" if rank == 0 else "rank 1: LookupError: nothing to show"
     )
     run(0, "run dots.toml --out out --resume")
-    assert record(tmp_path / "out")["resumed_from_step"] == 30
+    assert read_record(tmp_path / "out")["resumed_from_step"] == 30
 
 
 MOST = {"file": 80, "wait": 900, "wait-end": 900, "step": 131}
@@ -159,12 +157,10 @@ def test_any_fault_at_any_moment(mpi, run, tmp_path, seed):
         PROGRAM,
         *words,
         exit_code=None,
-        seconds=120.0,
+        seconds=SECONDS,
         environment={"FAULT": f"{rank} {kind} {place} {number}"},
     )
     if (tmp_path / "fault").exists() and done.returncode != 0:
-        late = kind in ("late", "stopped")
-        assert time.time() - float((tmp_path / "fault").read_text()) < SOON + 2 * LIMIT * late
         if rank and kind in ("late", "stopped", "bug", "disk", "disk-full", "small-files"):
             assert f"rank {rank}" in done.stdout + done.stderr
     out = tmp_path / "out"

@@ -39,7 +39,7 @@ def test_an_exit_code_is_seen(mpi):
 def test_a_hang_is_ended(mpi):
     hang = "from mpi4py import MPI; MPI.COMM_WORLD.rank or MPI.COMM_WORLD.recv()"
     with pytest.raises(pytest.fail.Exception, match="2 ranks did not end within"):
-        mpi(2, "-c", hang, seconds=5.0)
+        mpi(2, "-c", hang, seconds=2.0)
 
 
 def test_the_environment_has_the_last_word(monkeypatch):

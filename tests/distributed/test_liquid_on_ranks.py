@@ -1,5 +1,6 @@
 """Liquids and sands on ranks: log, frames and failures of one process."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -163,37 +164,42 @@ def logs():
     return found
 
 
-@pytest.mark.parametrize("ranks", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs, ranks):
-    mpi(
-        ranks,
-        PROGRAM,
-        "run",
-        tmp_path,
-        environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
-        seconds=300.0,
-    )
-    for name, (rows, cells, pressure) in logs.items():
-        same(
-            json.loads((tmp_path / f"{name}_{ranks}.json").read_text()), rows, CLOSE.get(name, 1e-6)
+@pytest.fixture(scope="module")
+def done(mpi_of_module):
+    """Return what runs the program once on n ranks, with all that is wanted of so many, and returns the folder of its logs."""
+    wanted = {2: "run,bare,own-model,fail,differ,launches", 3: "bare,own-model", 4: "run"}
+
+    @functools.cache
+    def on(ranks):
+        mpi_of_module(
+            ranks,
+            PROGRAM,
+            wanted[ranks],
+            ".",
+            environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+            seconds=400.0,
         )
-        saved = np.load(tmp_path / f"{name}_{ranks}.npz")
+        return mpi_of_module.folder
+
+    return on
+
+
+@pytest.mark.parametrize("ranks", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_ranks_have_the_log_and_the_pressure_of_one_process(done, logs, ranks):
+    folder = done(ranks)
+    for name, (rows, cells, pressure) in logs.items():
+        same(json.loads((folder / f"{name}_{ranks}.json").read_text()), rows, CLOSE.get(name, 1e-6))
+        saved = np.load(folder / f"{name}_{ranks}.npz")
         np.testing.assert_array_equal(saved["cells"], cells)
         np.testing.assert_allclose(saved["pressure"], pressure, atol=1e-5 * np.abs(pressure).max())
 
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_a_rank_without_material_takes_every_stage(mpi, tmp_path, ranks):
-    mpi(
-        ranks,
-        PROGRAM,
-        "bare,own-model",
-        tmp_path,
-        environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
-    )
+def test_a_rank_without_material_takes_every_stage(done, ranks):
+    folder = done(ranks)
     for name, tables in BARE.items():
         rows = advance(single(scene(**tables)), BARE_STEPS)
-        same(json.loads((tmp_path / f"bare_{name}_{ranks}.json").read_text()), rows, 1e-5)
+        same(json.loads((folder / f"bare_{name}_{ranks}.json").read_text()), rows, 1e-5)
     for name, tables in {"corner": CORNER, "flat": FLAT}.items():  # the documentation's own model
         rows = advance(
             SIMULATOR.create(
@@ -202,7 +208,7 @@ def test_a_rank_without_material_takes_every_stage(mpi, tmp_path, ranks):
             BARE_STEPS + 1,
         )
         assert rows[-1]["sponge_work"] > 0.0
-        same(json.loads((tmp_path / f"own_{name}_{ranks}.json").read_text()), rows, 1e-5)
+        same(json.loads((folder / f"own_{name}_{ranks}.json").read_text()), rows, 1e-5)
 
 
 @pytest.mark.parametrize("ranks", [3, pytest.param(4, marks=pytest.mark.slow)])
@@ -286,11 +292,8 @@ def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
             same(found, whole, 0.0 if ranks == 2 else CLOSE.get(name, 1e-6))
 
 
-def test_failures_are_those_of_all_ranks_and_steps_of_stresses_need_no_python(mpi, tmp_path):
-    environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    assert (
-        mpi(2, PROGRAM, "fail,differ,launches", tmp_path, environment=environment).returncode == 0
-    )
+def test_failures_are_those_of_all_ranks_and_steps_of_stresses_need_no_python(done):
+    assert done(2)  # by `fail`, `differ` and `launches`, which fail if they are not
 
 
 def test_pieces_of_any_boxes_can_be_read():

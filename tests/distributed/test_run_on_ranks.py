@@ -1,19 +1,18 @@
 """`warp-lcp run --engine petsc` on ranks: one folder, one log, one exit code."""
 
 import csv
-import json
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from dots_on_ranks import COUNT, SCENE, DotsSimulator
 from typer.testing import CliRunner
 
+from small_runs import read_record
 from warp_lcp.cli import commands as cli
 from warp_lcp.distributed import launch
 from warp_lcp.frames.pieces import one_mesh, piece_files
@@ -58,10 +57,6 @@ def log(folder: Path) -> list[dict[str, float]]:
         ]
 
 
-def record(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "run.json").read_text())
-
-
 def particles(folder: Path, index: int) -> dict[str, np.ndarray]:
     """Return the dots of a frame by their numbers, from one file or from parts."""
     whole = folder / "frames" / f"particles_{index:06d}.pvtu"
@@ -99,7 +94,7 @@ def test_ranks_write_the_run_of_one_process(run, tmp_path):
     )
     assert done.stdout.count("rest ") == 1  # the profile
     assert_same_run(tmp_path / "one", tmp_path / "three")
-    found = record(tmp_path / "three")
+    found = read_record(tmp_path / "three")
     assert (found["status"], found["engine"], found["ranks"], found["frames"]) == (
         "finished",
         "petsc",
@@ -125,10 +120,10 @@ def test_a_rank_is_killed_and_other_ranks_go_on(run, tmp_path):
     killed = run(3, "DOTS_TROUBLE='70 1 killed' run dots.toml --out out", exit_code=None)
     assert killed.returncode != 0
     assert "finished" not in killed.stdout
-    assert record(tmp_path / "out")["status"] == "running"
+    assert read_record(tmp_path / "out")["status"] == "running"
     resumed = run(2, "run dots.toml --out out --resume")
     assert "did not end cleanly; taken over" in resumed.stderr
-    found = record(tmp_path / "out")
+    found = read_record(tmp_path / "out")
     assert (found["status"], found["resumed_from_step"], found["ranks"]) == ("finished", 68, 2)
     assert_same_run(tmp_path / "one", tmp_path / "out")
 
@@ -150,7 +145,7 @@ def test_damaged_pieces_are_found(run, tmp_path):
     assert (
         f"rank_0001/step_{newest:06d}.npz: cut short, damaged or not a checkpoint" in resumed.stderr
     )
-    assert record(tmp_path / "out")["resumed_from_step"] == second
+    assert read_record(tmp_path / "out")["resumed_from_step"] == second
     assert_same_run(tmp_path / "one", tmp_path / "out")
     pieces = {path.stem for path in checkpoints.glob("rank_*/step_*.npz")}
     assert pieces == {path.stem for path in checkpoints.glob("step_*.npz")}
@@ -173,18 +168,36 @@ TROUBLES = {  # with the status of the run and its message
 }
 
 
-def test_troubles_end_the_run_with_a_message(run, tmp_path):
+WRONG = {  # commands, with what is said of each
+    "run dots.toml --out out": "holds a run already",
+    "run dots.toml --out out --resume --force": "exclude each other",
+    "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be at least 0.001",
+    "run dots.toml --out out --force --set output.surface_ply=true": "output.surface_ply = true: ",
+    "run dots.toml --out out --force --record-problems problems": "--record-problems cannot be "
+    "combined with --engine petsc",
+    "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",
+    "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank "
+    "1: dots: liquid[11]",
+}
+
+
+def test_wrong_input_and_troubles_end_a_run_with_a_message(run, tmp_path):
+    """One command after the other on the same ranks: what is wrong is said once, and the next command goes as if nothing had been."""
     commands = [
         f"DOTS_TROUBLE='{trouble}' run dots.toml --out {number}"
         for number, trouble in enumerate(TROUBLES)
     ]
-    done = run(2, *commands, exit_code=1)
-    assert done.stderr.count("exit code 1") == 2 * len(TROUBLES)
+    done = run(2, "run dots.toml --out out --frames 1", *WRONG, *commands, exit_code=1)
+    for code, times in enumerate((1, len(TROUBLES), len(WRONG))):
+        assert done.stderr.count(f"exit code {code}") == 2 * times
+    for expected in WRONG.values():
+        assert done.stderr.count(expected) == 1
     assert done.stderr.count("--resume --engine petsc") == len(TROUBLES)
     assert "Traceback" not in done.stderr
+    assert read_record(tmp_path / "out")["status"] == "finished"  # as it was
     for number, (status, expected) in enumerate(TROUBLES.values()):
         assert done.stderr.count(expected) == 1
-        found = record(tmp_path / str(number))
+        found = read_record(tmp_path / str(number))
         assert found["status"] == status
         assert (
             (tmp_path / str(number) / "particles.pvd").read_text().count(".pvtu")
@@ -207,33 +220,10 @@ def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expecte
     """
     done = run(2, f"DOTS_TROUBLE='{trouble}' run dots.toml --out out", exit_code=1)
     assert f"{expected}\nall ranks are aborted" in done.stderr
-    found = record(tmp_path / "out")
+    found = read_record(tmp_path / "out")
     assert found["status"] == "failed"
     assert found["reason"].startswith(f"rank {trouble.split()[1]}")
     assert found["reason"].endswith(expected)
-
-
-WRONG = {  # commands, with the message of each
-    "run dots.toml --out out": "holds a run already",
-    "run dots.toml --out out --resume --force": "exclude each other",
-    "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be at least 0.001",
-    "run dots.toml --out out --force --set output.surface_ply=true": "output.surface_ply = true: ",
-    "run dots.toml --out out --force --record-problems problems": "--record-problems cannot be "
-    "combined with --engine petsc",
-    "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",
-    "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank "
-    "1: dots: liquid[11]",
-}
-
-
-def test_wrong_input_is_said_once(run, tmp_path):
-    done = run(2, "run dots.toml --out out --frames 1", *WRONG, exit_code=2)
-    assert done.stderr.count("exit code 0") == 2
-    assert done.stderr.count("exit code 2") == 2 * len(WRONG)
-    for expected in WRONG.values():
-        assert done.stderr.count(expected) == 1
-    assert "Traceback" not in done.stderr
-    assert record(tmp_path / "out")["status"] == "finished"  # unchanged
 
 
 def test_engines_continue_each_other(run, tmp_path):
@@ -241,7 +231,10 @@ def test_engines_continue_each_other(run, tmp_path):
     run(0, "run dots.toml --out one")
     run(2, "run dots.toml --out out --frames 3")
     run(0, "run dots.toml --out out --frames 7 --resume")
-    assert (record(tmp_path / "out")["engine"], record(tmp_path / "out")["frames"]) == ("single", 7)
+    assert (read_record(tmp_path / "out")["engine"], read_record(tmp_path / "out")["frames"]) == (
+        "single",
+        7,
+    )
     run(2, "run dots.toml --out out --resume")
     assert_same_run(tmp_path / "one", tmp_path / "out")
     for name in ("particles", "grid"):
@@ -305,7 +298,7 @@ def test_ranks_of_another_mpi_are_refused(mpi, tmp_path):
 
 
 SMALL = (
-    "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set "
+    "--set domain.resolution=24 --set time.duration=0.2 --set output.checkpoint_every=4 --set "
     "output.grid_format=vti"
 )
 COLUMNS = ("time", "dt", "particles", "mass", "kinetic_energy", "potential_energy", "max_speed")
@@ -327,8 +320,8 @@ def test_a_material_goes_on_on_other_numbers_of_ranks(mpi, tmp_path, scene, colu
     one, out = tmp_path / "one", tmp_path / "out"
     words = shlex.split(f"run {scene} --device cpu {SMALL}")
     go = ["-c", "from warp_lcp.cli.commands import main; main()", *words]
-    mpi(2, *go, "--out", "out", "--engine", "petsc", "--frames", 3)
-    mpi(3, *go, "--out", "out", "--engine", "petsc", "--frames", 6, "--resume")
+    mpi(2, *go, "--out", "out", "--engine", "petsc", "--frames", 2)
+    mpi(3, *go, "--out", "out", "--engine", "petsc", "--frames", 4, "--resume")
     for options in (["--out", str(one)], ["--out", str(out), "--resume"]):
         alone = CliRunner().invoke(cli.app, [*words, *options])
         assert alone.exit_code == 0, alone.output

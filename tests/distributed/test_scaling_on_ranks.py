@@ -31,7 +31,7 @@ def test_ranks_measure_what_one_process_does(mpi, tmp_path):
         "--engine",
         "petsc",
         "--size",
-        24,
+        16,
         "--repeat",
         1,
         "--out",
@@ -40,7 +40,7 @@ def test_ranks_measure_what_one_process_does(mpi, tmp_path):
     assert done.stdout.split() == [str(tmp_path / "ranks.json"), str(tmp_path / "ranks.md")]
     found = records(tmp_path / "ranks.json")
     for bounds in ("linear", "walls", "everywhere"):
-        here = found[f"24^3 {bounds}, ranks: 2"]
+        here = found[f"16^3 {bounds}, ranks: 2"]
         assert here["converged"] == 1
         assert here["residual"] <= 1e-8  # computed independently of the solve
         assert here["residual"] == pytest.approx(here["told"], rel=1e-3)
@@ -49,7 +49,7 @@ def test_ranks_measure_what_one_process_does(mpi, tmp_path):
         assert here["boxes"] in ("1 x 1 x 2", "1 x 2 x 1", "2 x 1 x 1")
         assert 0.0 <= here["resident_more"] < here["resident"]
     assert "ranks: 2" not in done.stdout
-    assert "| 24^3 | walls | 2 |" in (tmp_path / "ranks.md").read_text()
+    assert "| 16^3 | walls | 2 |" in (tmp_path / "ranks.md").read_text()
 
 
 def test_a_wrong_solution_is_seen(mpi):

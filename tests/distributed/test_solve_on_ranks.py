@@ -42,24 +42,24 @@ def problem(tmp_path):
     )
 
 
-def test_ranks_solve_what_one_process_solves(mpi, problem, tmp_path):
+@pytest.mark.parametrize("ranks", [pytest.param(1, marks=pytest.mark.slow), 3])
+def test_ranks_solve_what_one_process_solves(mpi, problem, tmp_path, ranks):
     alone = solve_recorded(problem, tolerance=1e-9)
     assert bool(alone.result)
-    for ranks in (1, 3):
-        out = tmp_path / f"x{ranks}.npy"
-        done = call(mpi, ranks, problem, "--engine", "petsc", "--out", out, "--tolerance", 1e-9)
-        x = np.load(out)
-        assert x.shape == (20, 20, 20)
-        np.testing.assert_allclose(x, alone.result.x.numpy(), rtol=0, atol=1e-7 * np.abs(x).max())
-        lines = done.stdout.splitlines()
-        assert lines[0].startswith(
-            f"{alone.unknowns} unknowns, 20 x 20 x 20 cells, by projected-multigrid on cpu, ranks: "
-            f"{ranks}, "
-        )
-        assert lines[-1].startswith("CONVERGED: ")
-        assert done.stdout.count("CONVERGED") == 1  # one rank prints
-        iterations = int(lines[-2].split()[0])
-        assert abs(iterations - alone.result.iterations) <= 1
+    out = tmp_path / "x.npy"
+    done = call(mpi, ranks, problem, "--engine", "petsc", "--out", out, "--tolerance", 1e-9)
+    x = np.load(out)
+    assert x.shape == (20, 20, 20)
+    np.testing.assert_allclose(x, alone.result.x.numpy(), rtol=0, atol=1e-7 * np.abs(x).max())
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith(
+        f"{alone.unknowns} unknowns, 20 x 20 x 20 cells, by projected-multigrid on cpu, ranks: "
+        f"{ranks}, "
+    )
+    assert lines[-1].startswith("CONVERGED: ")
+    assert done.stdout.count("CONVERGED") == 1  # one rank speaks
+    iterations = int(lines[-2].split()[0])
+    assert abs(iterations - alone.result.iterations) <= 1
 
 
 def test_two_dimensions_and_boxes(mpi, tmp_path):

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from small_runs import read_record
 from warp_lcp.cli import commands as cli
 
 SCENE = """
@@ -113,10 +114,6 @@ def wait_until_it_holds(process: subprocess.Popen | Fork, out: Path) -> None:
     assert process.poll() is not None, "the process does not begin"
 
 
-def record(out: Path) -> dict:
-    return json.loads((out / "run.json").read_text())
-
-
 def results(out: Path) -> dict[str, bytes]:
     """Return the bytes of every output file, and the log without seconds.
 
@@ -161,13 +158,9 @@ class Before:
         return status.st_ino, status.st_mtime_ns, status.st_size
 
     def check(self) -> int:
-        """Compare with the present contents.
-
-        Nothing up to the checkpoint may have been written again. Return the steps that were not
-        repeated.
-        """
-        assert record(self.out)["resumed_from_step"] == self.step
-        if self.step:  # a row has the seconds of the process that computed it
+        """Compare with what is there now: nothing up to the checkpoint was written again. Return the steps that were not repeated."""
+        assert read_record(self.out)["resumed_from_step"] == self.step
+        if self.step:  # a row keeps the seconds of the process that computed it
             assert (self.out / "log.csv").read_text().splitlines()[: self.step + 1] == self.rows
         assert {path: self.stamp(path) for path in self.frames} == self.frames
         return self.step
@@ -187,7 +180,7 @@ def kill_and_resume(
     for option in (["--set", "time.duration=0.1"], ["--force"]):
         code, text = call(scene, whole, *option)
         assert code == 0, text
-    expected, seconds = results(whole), 1.2 * record(whole)["seconds"]
+    expected, seconds = results(whole), 1.2 * read_record(whole)["seconds"]
     rng, steps, died = np.random.default_rng(seed), [], 0
     for run in range(10 * kills):
         out, before = folder / f"parts_{run}", None
@@ -202,7 +195,9 @@ def kill_and_resume(
             if (
                 before
                 and begun
-                and (process.returncode == 0 or record(out)["resumed_from_step"] == before.step)
+                and (
+                    process.returncode == 0 or read_record(out)["resumed_from_step"] == before.step
+                )
             ):
                 steps.append(before.check())
             if process.returncode == 0:
@@ -211,7 +206,7 @@ def kill_and_resume(
             died += 1
             before = Before(out)
         assert results(out) == expected
-        assert record(out)["steps"] == record(whole)["steps"]
+        assert read_record(out)["steps"] == read_record(whole)["steps"]
         if died == kills:
             return steps
     raise AssertionError("the runs end before they can be killed")
@@ -255,7 +250,7 @@ def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
         process.kill()
     assert process.returncode == 1, text
     assert "stopping after this step" in text
-    found = record(out)
+    found = read_record(out)
     assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGTERM")
     assert newest_step(out) == found["steps"]
     assert f"step_{found['steps']:06d}.npz" in text

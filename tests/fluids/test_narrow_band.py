@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 from pydantic import ValidationError
 
+from grid_fields import particles_of_cells
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
 from warp_lcp.granular.scene import SandScene
@@ -37,15 +38,6 @@ def without(simulation: LiquidSimulation) -> NarrowBand:
     return simulation.band
 
 
-def counts(simulation: LiquidSimulation) -> np.ndarray:
-    """Return the particles of each cell, shape (nz, ny, nx)."""
-    cells = simulation.particles.cells_of(simulation.particles.position.numpy())
-    nx, ny, nz = simulation.grid.counts
-    return np.bincount(
-        (cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz
-    ).reshape(nz, ny, nx)
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_particles_are_near_the_surface_only(dimension):
     """Particles near the surface only.
@@ -55,8 +47,8 @@ def test_particles_are_near_the_surface_only(dimension):
     """
     simulation, everywhere = tank(dimension), tank(dimension, particles={})
     band = without(simulation)
-    rows = counts(simulation).sum(axis=(0, 2))
-    full = counts(everywhere).sum(axis=(0, 2))
+    rows = particles_of_cells(simulation.grid, simulation.particles).sum(axis=(0, 2))
+    full = particles_of_cells(everywhere.grid, everywhere.particles).sum(axis=(0, 2))
     assert np.array_equal(rows[20:24], full[20:24]) and not rows[:20].any()
     assert band.held == full[:20].sum() and band.interior.count == band.held // 2**dimension
     before, after = everywhere.checked_totals("at"), simulation.checked_totals("at")
@@ -75,7 +67,12 @@ def test_particles_below_the_band_are_around_solids_inside_only(dimension):
         dimension, solid=[{"shape": "sphere", "center": center.tolist(), "radius": radius}]
     )
     assert simulation.boundary.distance is not None
-    held = (np.argwhere(counts(simulation)[:, :19] > 0)[:, ::-1][:, :dimension] + 0.5) / 32
+    held = (
+        np.argwhere(particles_of_cells(simulation.grid, simulation.particles)[:, :19] > 0)[:, ::-1][
+            :, :dimension
+        ]
+        + 0.5
+    ) / 32
     gap = 32 * (np.linalg.norm(held - center, axis=1) - radius)
     assert 4.0 < gap.max() < 1.0 + WIDTH + 1.0
 
@@ -123,7 +120,9 @@ def test_rest_stays_rest():
     assert rows[-1]["volume"] == pytest.approx(0.75, rel=2e-3)
     assert rows[-1]["max_speed"] < 0.1 * math.sqrt(GRAVITY / 32)
     assert rows[-1]["mass"] / simulation.particle_mass == pytest.approx(start, abs=1e-6)
-    assert counts(simulation)[0, 20:23].min() >= 1 and not counts(simulation)[0, :19].any()
+    held = particles_of_cells(simulation.grid, simulation.particles)[0]
+    assert held[20:23].min() >= 1
+    assert not held[:19].any()
     assert without(simulation).density == pytest.approx(1.0, abs=0.01)
 
 

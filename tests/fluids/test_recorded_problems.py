@@ -7,12 +7,11 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import warp_lcp as wl
+from command_line import invoke
 from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
-from warp_lcp.cli import commands as cli
 from warp_lcp.files import claims
 from warp_lcp.gallery.recorded import FORMAT, cell_counts, files, load
 from warp_lcp.run.folder import OutputError
@@ -187,10 +186,6 @@ def test_a_folder_takes_one_run(tmp_path):
         ProblemFolder(tmp_path / "file" / "below")
 
 
-def call(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-
-
 def test_record_and_replay_by_the_command_line(tmp_path):
     folder = tmp_path / "problems"
     run = [
@@ -203,16 +198,16 @@ def test_record_and_replay_by_the_command_line(tmp_path):
         "--set",
         "time.duration=0.1",
     ]
-    done = call(*run, "--out", tmp_path / "run", "--frames", 1, "--record-problems", folder)
+    done = invoke(*run, "--out", tmp_path / "run", "--frames", 1, "--record-problems", folder)
     assert done.exit_code == 0, done.stderr
     count = len(files(folder))
     assert count == json.loads((tmp_path / "run" / "run.json").read_text())["steps"]
-    again = call(
+    again = invoke(
         *run, "--out", tmp_path / "run", "--frames", 1, "--force", "--record-problems", folder
     )
     assert again.exit_code == 2
     assert "holds recorded problems already" in again.stderr
-    more = call(
+    more = invoke(
         *run, "--out", tmp_path / "run", "--frames", 2, "--resume", "--record-problems", folder
     )
     assert more.exit_code == 0, more.stderr

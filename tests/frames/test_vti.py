@@ -20,11 +20,6 @@ def some_cells(dimension: int, counts=None) -> Cells:
     return Cells("grid", index, 0.25, dimension, fields, counts)
 
 
-@pytest.fixture
-def pyvista():
-    return pytest.importorskip("pyvista", reason="VTK reads the files back")
-
-
 def drawn(image):
     """Return the cells that ParaView draws, those that this filter passes."""
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter

@@ -24,9 +24,9 @@ except ImportError:  # not on Windows
     resource = None
 
 COUNT = settings().max_examples
-# A quarter in the short tests, all in `make fuzz`.
-costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 4)
-MEMORY = 1 << 30  # bytes of memory for reading one small file
+# half in the short tests, all of them in `make fuzz`
+costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 2)
+MEMORY = 1 << 30  # bytes that reading one small file may take
 
 
 def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) -> int:

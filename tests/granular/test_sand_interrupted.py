@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from small_runs import run_into
+from small_runs import StepCounter, run_into, written_files
 from small_sands import box, create, scene
 from warp_lcp.scene.scene_file import load_scene
 
@@ -19,35 +19,6 @@ SLIDER = {
     "motion": {"kind": "translation", "velocity": [-0.6, 0.0]},
 }
 DISC = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
-
-
-class Silent:
-    """Observer that counts steps."""
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-    def note(self, text: str) -> None:
-        assert text
-
-    def start(self, time: float, end: float) -> None:
-        assert end > time
-
-    def step(self, row: dict[str, Any]) -> None:
-        self.steps += 1
-
-    def frame(self, index: int, last: int) -> None:
-        assert index <= last
-
-
-def written(folder: Path) -> dict[str, bytes]:
-    """Return frames, collections and the last checkpoint by name."""
-    files = [
-        *folder.glob("frames/*"),
-        *folder.glob("*.pvd"),
-        sorted(folder.glob("checkpoints/*.npz"))[-1],
-    ]
-    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
 @pytest.mark.parametrize(
@@ -70,14 +41,14 @@ def written(folder: Path) -> dict[str, bytes]:
 def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
     model = load_scene(name, [*overrides, *FAST])
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_into(model, whole, observer=Silent()).status == "finished"
-    watch = Silent()
+    assert run_into(model, whole, observer=StepCounter()).status == "finished"
+    watch = StepCounter()
     assert (
         run_into(model, parts, observer=watch, stop=lambda: watch.steps >= 13).status == "stopped"
     )
-    second = run_into(model, parts, observer=Silent(), resume=True)
+    second = run_into(model, parts, observer=StepCounter(), resume=True)
     assert (second.status, second.resumed_from_step) == ("finished", 13)
-    assert written(whole) == written(parts)
+    assert written_files(whole) == written_files(parts)
 
 
 @pytest.mark.parametrize(

@@ -3,29 +3,23 @@
 import csv
 import json
 from pathlib import Path
-from typing import Any
 
 import meshio
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from command_line import invoke
 from small_sands import box, create, scene
-from warp_lcp.cli import commands as cli
 from warp_lcp.render.recording import Color, Recording
 
 SMALL = ["--set", "domain.resolution=24", "--set", "time.duration=0.1", "--device", "cpu"]
-
-
-def call(*words: object) -> Any:
-    return CliRunner().invoke(cli.app, [str(word) for word in words])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a short run of the column, with its profile."""
     out = tmp_path_factory.mktemp("sand") / "run"
-    result = call("run", "column-collapse-2d", "--out", out, *SMALL, "--profile")
+    result = invoke("run", "column-collapse-2d", "--out", out, *SMALL, "--profile")
     assert result.exit_code == 0, result.output
     return Path(out)
 
@@ -94,7 +88,7 @@ def test_sand_has_colors_of_its_own(folder: Path) -> None:
 
 
 def test_scenes_schema_and_check_know_sand() -> None:
-    listed = call("scenes").stdout
+    listed = invoke("scenes").stdout
     for name in (
         "column-collapse-2d",
         "column-collapse",
@@ -104,9 +98,9 @@ def test_scenes_schema_and_check_know_sand() -> None:
         "sand-on-mesh",
     ):
         assert f"{name} " in listed
-    schema = json.loads(call("schema", "--simulator", "granular").stdout)
+    schema = json.loads(invoke("schema", "--simulator", "granular").stdout)
     assert {"material", "friction", "gauge", "sand"} <= schema["properties"].keys()
-    checked = call("check", "hourglass-2d", "--set", "friction.model=box").stdout
+    checked = invoke("check", "hourglass-2d", "--set", "friction.model=box").stdout
     assert "box, on walls 0.4, 0.3, 0.3" in checked
     assert "stresses" in checked
 

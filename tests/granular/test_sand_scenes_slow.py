@@ -9,30 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from small_runs import run_into
+from small_runs import StepCounter, run_into
 from warp_lcp.scene.scene_file import load_scene
-
-
-class Silent:
-    """Observer that does nothing."""
-
-    def note(self, text: str) -> None:
-        assert text
-
-    def start(self, time: float, end: float) -> None:
-        assert end > time
-
-    def step(self, row: dict[str, object]) -> None:
-        assert row
-
-    def frame(self, index: int, last: int) -> None:
-        assert index <= last
 
 
 def run(name: str, folder: Path, *overrides: str) -> dict[str, np.ndarray]:
     """Run a scene and return the numeric columns of its log."""
     assert (
-        run_into(load_scene(name, list(overrides)), folder, observer=Silent()).status == "finished"
+        run_into(load_scene(name, list(overrides)), folder, observer=StepCounter()).status
+        == "finished"
     )
     with open(folder / "log.csv", newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.grid.thin_walls import ThinWalls
@@ -33,10 +34,6 @@ def simulate(
     while simulation.time < until - 1e-9:
         rows.append(simulation.step(min(simulation.stable_dt(), 0.005, until - simulation.time)))
     return simulation, rows
-
-
-def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
-    return {"shape": "box", "min": low, "max": high, **more}
 
 
 @pytest.mark.parametrize("thickness", [0.1, 0.5])

@@ -4,6 +4,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grid_fields import uniform_velocity
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.advection import MAX_CLEARANCE, advect, clearance
 from warp_lcp.grid.particles import MARGIN
@@ -27,13 +28,6 @@ def move(
     stopped = wp.zeros(1, dtype=wp.int32, device="cpu")
     advect(grid, fields, clearance(grid, cells), dt, position, stopped)
     return position.numpy(), int(stopped.numpy()[0])
-
-
-def uniform(grid: StaggeredGrid, velocity: tuple[float, ...]) -> list[wp.array]:
-    fields = grid.faces()
-    for field, value in zip(fields, velocity, strict=False):
-        field.fill_(value)
-    return fields
 
 
 def test_third_order_on_a_rotating_blob() -> None:
@@ -104,7 +98,7 @@ def test_no_velocity_carries_a_particle_into_a_solid(
 
 def test_a_wall_stops_one_component_and_lets_the_other_slide() -> None:
     points, stopped = move(
-        FLAT, uniform(FLAT, (1.0, 0.3)), cells_of(FLAT), 0.2, [[0.65, 0.25, 0.0]]
+        FLAT, uniform_velocity(FLAT, (1.0, 0.3)), cells_of(FLAT), 0.2, [[0.65, 0.25, 0.0]]
     )
     assert stopped == 1
     assert points[0] == pytest.approx([0.8 - MARGIN * 0.1, 0.31, 0.0], abs=1e-6)
@@ -114,7 +108,7 @@ def test_a_thin_wall_is_not_jumped() -> None:
     solid = np.zeros((1, 6, 8), bool)
     solid[0, :, 4] = True
     points, stopped = move(
-        FLAT, uniform(FLAT, (5.0, 0.0)), cells_of(FLAT, solid), 0.1, [[0.05, 0.25, 0.0]]
+        FLAT, uniform_velocity(FLAT, (5.0, 0.0)), cells_of(FLAT, solid), 0.1, [[0.05, 0.25, 0.0]]
     )
     assert stopped == 1
     assert points[0, 0] == pytest.approx(0.4 - MARGIN * 0.1, abs=1e-6)
@@ -128,14 +122,18 @@ def test_a_diagonal_gap_is_closed() -> None:
     solid = np.zeros((1, 6, 8), bool)
     solid[0, 2, 4] = solid[0, 3, 3] = True
     starts = [[0.33, 0.22, 0.0], [0.31, 0.24, 0.0], [0.35, 0.25, 0.0]]
-    points, stopped = move(FLAT, uniform(FLAT, (1.0, 1.0)), cells_of(FLAT, solid), 0.15, starts)
+    points, stopped = move(
+        FLAT, uniform_velocity(FLAT, (1.0, 1.0)), cells_of(FLAT, solid), 0.15, starts
+    )
     assert stopped == 3
     assert (points[:, 0] < 0.4).all()
     assert (points[:, 1] < 0.3).all()
 
 
 def test_two_dimensions_ignore_z() -> None:
-    points, stopped = move(FLAT, uniform(FLAT, (0.5, 0.5)), cells_of(FLAT), 0.1, [[0.3, 0.3, 5.0]])
+    points, stopped = move(
+        FLAT, uniform_velocity(FLAT, (0.5, 0.5)), cells_of(FLAT), 0.1, [[0.3, 0.3, 5.0]]
+    )
     assert stopped == 0
     assert points[0] == pytest.approx([0.35, 0.35, 0.0], abs=1e-6)
 
@@ -143,7 +141,7 @@ def test_two_dimensions_ignore_z() -> None:
 def test_velocities_that_are_not_finite_do_not_crash() -> None:
     for bad in (np.nan, np.inf, -np.inf, 1e38):
         points, _ = move(
-            SPACE, uniform(SPACE, (bad, 0.1, bad)), cells_of(SPACE), 0.1, [[0.3, 0.3, 0.2]]
+            SPACE, uniform_velocity(SPACE, (bad, 0.1, bad)), cells_of(SPACE), 0.1, [[0.3, 0.3, 0.2]]
         )
         assert points.shape == (1, 3)
         if not np.isfinite(bad):

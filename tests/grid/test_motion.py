@@ -12,6 +12,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grid_fields import distances
 from warp_lcp.grid.motion import (
     Keyframes,
     Motion,
@@ -356,12 +357,6 @@ SHAPES = {
     "plane": Plane(point=[0.1, 0.2, -0.3], normal=[1.0, 2.0, -2.0]),
     "mesh": TriangleMesh(surface=builtin_mesh("knot")),
 }
-
-
-def distances(geometry, points):
-    out = wp.empty(len(points), dtype=wp.float32, device="cpu")
-    geometry.signed_distance(wp.array(points, dtype=wp.vec3, device="cpu"), out)
-    return out.numpy()
 
 
 @pytest.mark.parametrize("invert", [False, True])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from grid_fields import uniform_velocity
 from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.staggered import StaggeredGrid
 
@@ -17,14 +18,6 @@ def coordinates(grid: StaggeredGrid, axis: int) -> list[np.ndarray]:
     """
     K, J, I = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
     return [(c + (0.0 if a == axis else 0.5)) * grid.spacing for a, c in enumerate((I, J, K))]
-
-
-def uniform(grid: StaggeredGrid, velocity: tuple[float, ...]) -> list[wp.array]:
-    """Return a uniform velocity on the faces."""
-    faces = grid.faces()
-    for field, speed in zip(faces, velocity, strict=False):
-        field.fill_(speed)
-    return faces
 
 
 def carried(
@@ -66,7 +59,7 @@ def test_a_linear_field_goes_with_the_flow(dimension, axis):
     x = coordinates(grid, axis)
     slope, speed, dt = (1.3, -0.7, 0.4 * (dimension == 3)), (0.9, 0.5, -0.6), 0.15
     values = sum(a * c for a, c in zip(slope, x, strict=True))
-    out = carried(grid, uniform(grid, speed[:dimension]), dt, values, axis)
+    out = carried(grid, uniform_velocity(grid, speed[:dimension]), dt, values, axis)
     exact = values - dt * sum(a * u for a, u in zip(slope, speed[:dimension], strict=False))
     k = slice(3, -3) if dimension == 3 else slice(1, 2)
     inner = (k, slice(4, -4), slice(4, -4))
@@ -83,7 +76,7 @@ def test_waves_keep_their_height_and_their_place():
     x = coordinates(grid, 1)[0]
     inside = (x > 12.0) & (x < 60.0)
     values = np.where(inside, np.sin(np.pi * x / 8.0), 0.0).astype(np.float32)
-    velocity = uniform(grid, (0.4, 0.0))
+    velocity = uniform_velocity(grid, (0.4, 0.0))
     for _ in range(80):
         values = carried(grid, velocity, 1.0, values, 1)
     middle = (x[1, 2] > 52.0) & (x[1, 2] < 84.0)
@@ -122,8 +115,8 @@ def test_new_extrema_do_not_appear():
     x, y, _ = coordinates(grid, 0)
     values = ((x > 10.0) & (y > 12.0)).astype(np.float32)
     for _ in range(7):
-        values = carried(grid, uniform(grid, (0.37, 0.61)), 1.0, values, 0)
-    inside = values[1, 12:-1, 12:-1]  # inflow from the domain, not from the ring
+        values = carried(grid, uniform_velocity(grid, (0.37, 0.61)), 1.0, values, 0)
+    inside = values[1, 12:-1, 12:-1]  # what comes from the domain, and not from the ring
     assert inside.min() >= 0.0 and inside.max() <= 1.0
     assert 0.0 < values[1, 18, 14] < 1.0
 
@@ -137,9 +130,9 @@ def test_places_without_the_level_are_left_alone():
     level = np.zeros(grid.shape)
     level[:, :, 5:] = 0.9
     x = coordinates(grid, 0)[0]
-    out = carried(grid, uniform(grid, (0.5, 0.0)), 1.0, x, 0, level)
-    # Face 5 lies at the mean of 0 and 0.9.
+    out = carried(grid, uniform_velocity(grid, (0.5, 0.0)), 1.0, x, 0, level)
+    # face 5 lies at the mean of 0 and 0.9
     assert np.array_equal(out[1, 1:9, 1:6], x.astype(np.float32)[1, 1:9, 1:6])
     assert np.allclose(out[1, 1:9, 6:9], x[1, 1:9, 6:9] - 0.5)
-    out = carried(grid, uniform(grid, (0.5, 0.0)), 1.0, x, CENTERS, level)
+    out = carried(grid, uniform_velocity(grid, (0.5, 0.0)), 1.0, x, CENTERS, level)
     assert not out[1, 1:9, 1:5].any() and out[1, 1:9, 6:9].all()

@@ -6,6 +6,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grid_fields import distances
 from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.solids import (
     Box,
@@ -20,12 +21,6 @@ from warp_lcp.grid.solids import (
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
 PLACEMENT = Placement.from_degrees(1.7, [25.0, -70.0, 130.0], [0.3, -0.4, 0.9], 3)
-
-
-def distances(geometry, points, device="cpu"):
-    out = wp.empty(len(points), dtype=wp.float32, device=device)
-    geometry.signed_distance(wp.array(points, dtype=wp.vec3, device=device), out)
-    return out.numpy()
 
 
 def box_oracle(points, lower, upper):

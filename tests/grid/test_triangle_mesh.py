@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from grid_fields import distances
 from warp_lcp.grid.solids import Placement, TriangleMesh
 from warp_lcp.grid.triangle_mesh import (
     ClosedSurface,
@@ -68,12 +69,6 @@ def icosphere(levels):
     outward = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
     corners[~outward] = corners[~outward][:, ::-1]
     return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
-
-
-def distances(geometry, points):
-    out = wp.empty(len(points), dtype=wp.float32, device=CPU)
-    geometry.signed_distance(wp.array(points, dtype=wp.vec3, device=CPU), out)
-    return out.numpy()
 
 
 def parity_inside(points, surface, direction):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from grid_fields import particles_of_cells
 from small_liquids import advance, box, create, dam, scene
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import Window
@@ -42,15 +43,6 @@ def uneven(
         points = points[(np.abs(points[:, :2] * CELLS - [6.0, 4.0]) > [2.0, 2.0]).any(axis=1)]
     velocity = random.standard_normal(points.shape).astype(np.float32)
     return Particles(grid, points.astype(np.float32), velocity, affine=True)
-
-
-def counts(grid: Any, particles: Particles) -> np.ndarray:
-    """Return the particles of each cell, shape (nz, ny, nx)."""
-    cells = particles.cells_of(particles.position.numpy())
-    nx, ny, nz = grid.counts
-    return np.bincount(
-        (cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz
-    ).reshape(nz, ny, nx)
 
 
 def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
@@ -97,13 +89,13 @@ def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: 
         if dimension == 3
         else (slice(None), slice(2, 7), slice(2, -2))
     )
-    before = counts(grid, particles)
+    before = particles_of_cells(grid, particles)
     assert (before[deep] < least).sum() > 5
     reseed = reseeding(simulation, least, most)
     for step in range(4):
         moved = reseed.apply(particles, grid.everywhere, step)
-    after = counts(grid, particles)
-    # A thin region around one stays thin.
+    after = particles_of_cells(grid, particles)
+    # a thin region around one stays thin
     assert (after[deep] < least).sum() <= 0.15 * (before[deep] < least).sum()
     assert after.sum() == before.sum() == particles.count
     assert moved <= 2
@@ -140,9 +132,9 @@ def test_the_surface_bubbles_and_walls_are_left_alone() -> None:
     ball = {"shape": "sphere", "center": [0.1, 0.1], "radius": 0.13}
     simulation = pool(2, [ball])
     grid, particles = simulation.grid, uneven(simulation, bubble=True)
-    before = counts(grid, particles)[0]
+    before = particles_of_cells(grid, particles)[0]
     assert reseeding(simulation, 3, 6).apply(particles, grid.everywhere, 0) > 0
-    after = counts(grid, particles)[0]
+    after = particles_of_cells(grid, particles)[0]
     assert (after[2:6, 4:8] == 0).all()
     assert (after[9:] == 0).all()
     touched = np.zeros(after.shape, dtype=bool)
@@ -154,9 +146,9 @@ def test_the_surface_bubbles_and_walls_are_left_alone() -> None:
 def test_nothing_is_drawn_from_cells_that_hold_no_more_than_at_rest() -> None:
     simulation = pool(2)
     particles = uneven(simulation)
-    before = counts(simulation.grid, particles)
+    before = particles_of_cells(simulation.grid, particles)
     reseeding(simulation, 4, 4).apply(particles, simulation.grid.everywhere, 0)
-    after = counts(simulation.grid, particles)
+    after = particles_of_cells(simulation.grid, particles)
     assert (after[before > 4] >= 4).all()
     assert (after[before <= 4] <= 4).all()
     assert (after[before <= 4] >= before[before <= 4]).all()

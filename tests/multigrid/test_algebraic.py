@@ -9,23 +9,10 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import poisson
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
-
-
-def poisson(*counts):
-    """Return the stencil of 2 d on the diagonal and -1 to each neighbor.
-
-    The solution is 0 outside.
-    """
-    A = scipy.sparse.csr_array((1, 1))
-    for n in counts:
-        T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(
-            scipy.sparse.eye_array(A.shape[0]), T
-        )
-    return scipy.sparse.csr_array(A)
 
 
 def principal(matrix, free, shift):

@@ -8,31 +8,26 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from matrices import laplacian
 from oracle import natural_residual
 from warp_lcp.operators import renumbering
 from warp_lcp.operators.restated import as_dense, as_grid, as_sparse, renumbered
 
 
-def laplacian(m):
-    T = scipy.sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(m, m))
-    eye = scipy.sparse.eye_array(m)
-    return scipy.sparse.csr_array(scipy.sparse.kron(eye, T) + scipy.sparse.kron(T, eye))
-
-
 def small(seed, *, sparse):
-    A = laplacian(6) + scipy.sparse.diags_array(np.random.default_rng(seed).uniform(0, 1, 36))
+    A = laplacian(6, 2.1) + scipy.sparse.diags_array(np.random.default_rng(seed).uniform(0, 1, 36))
     return scipy.sparse.csr_array(A) if sparse else A.toarray()
 
 
 def shuffled(seed):
-    A, order = laplacian(48), np.random.default_rng(seed).permutation(48 * 48)
+    A, order = laplacian(48, 2.1), np.random.default_rng(seed).permutation(48 * 48)
     return scipy.sparse.csr_array(A[order][:, order])
 
 
 FORMS = {
     "dense": (as_dense, lambda seed: small(seed, sparse=True)),
     "sparse": (as_sparse, lambda seed: small(seed, sparse=False)),
-    "grid": (as_grid, lambda seed: laplacian(48)),
+    "grid": (as_grid, lambda seed: laplacian(48, 2.1)),
     "renumbered": (renumbered, shuffled),
 }
 

@@ -12,6 +12,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import poisson
 from oracle import boxed, lemke
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
@@ -25,20 +26,6 @@ def random_matrix(n, seed, density=0.1):
     keep = rows % 7 != 3
     values = rng.standard_normal(count)
     return scipy.sparse.coo_array((values[keep], (rows[keep], columns[keep])), shape=(n, n))
-
-
-def poisson(*counts):
-    """Return the stencil of 2 d on the diagonal and -1 to each neighbor.
-
-    The solution is 0 outside.
-    """
-    A = scipy.sparse.csr_array((1, 1))
-    for n in counts:
-        T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(
-            scipy.sparse.eye_array(A.shape[0]), T
-        )
-    return scipy.sparse.csr_array(A)
 
 
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])

@@ -9,14 +9,10 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import spd
 from oracle import assemble
 
 ASKED = wl.StoppingCriteria(rtol=1e-10, max_iterations=200, merits=True)
-
-
-def spd(n, seed):
-    B = np.random.default_rng(seed).standard_normal((n, n))
-    return B @ B.T / n + 0.5 * np.eye(n)
 
 
 @pytest.mark.parametrize(
@@ -29,7 +25,7 @@ def spd(n, seed):
     ],
 )
 def test_each_record_has_the_merits_of_its_iterate(method, device):
-    A, b = spd(12, 5101), np.random.default_rng(5103).standard_normal(12)
+    A, b = spd(12, 5101, 0.5), np.random.default_rng(5103).standard_normal(12)
     problem = wl.LCP(wl.DenseOperator(A, device=device), b)
     work, iterates = method.init(problem), []
     result = wl.solve(
@@ -52,11 +48,8 @@ def test_each_record_has_the_merits_of_its_iterate(method, device):
 
 
 def test_sweeps_converge_linearly_in_the_modified_merit():
-    """Linear convergence of sweeps in the modified merit.
-
-    [Book] fig. C.2 draws eq. 2.200 for PGS: a straight line on a logarithmic scale.
-    """
-    A, b = spd(40, 5107), np.random.default_rng(5109).standard_normal(40)
+    """[Book] fig. C.2 draws eq. 2.200 for PGS: a straight line on a logarithmic scale."""
+    A, b = spd(40, 5107, 0.5), np.random.default_rng(5109).standard_normal(40)
     result = wl.solve(
         wl.LCP(wl.DenseOperator(A, device="cpu"), b), wl.ProjectedSOR(omega=1.0), stopping=ASKED
     )
@@ -117,7 +110,10 @@ def test_on_a_grid_cells_that_are_no_unknowns_do_not_count(device):
 
 
 def test_none_are_recorded_unless_asked_for_and_residuals_stay_as_they_are():
-    A, b = scipy.sparse.csr_array(spd(30, 5123)), np.random.default_rng(5129).standard_normal(30)
+    A, b = (
+        scipy.sparse.csr_array(spd(30, 5123, 0.5)),
+        np.random.default_rng(5129).standard_normal(30),
+    )
     plain, asked = (
         wl.solve(wl.LCP(A, b), stopping=wl.StoppingCriteria(rtol=1e-8, merits=merits))
         for merits in (False, True)

@@ -10,18 +10,11 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 import warp_lcp as wl
+from matrices import laplacian
 from oracle import natural_residual
 from warp_lcp.problem.curvature import has_negative_curvature
 
 CURVED, INFEASIBLE = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
-
-
-def laplacian(n):
-    T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-    return (
-        scipy.sparse.kron(scipy.sparse.eye_array(n), T)
-        + scipy.sparse.kron(T, scipy.sparse.eye_array(n))
-    ).tocsr()
 
 
 def drawn(seed):

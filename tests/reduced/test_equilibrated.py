@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import posed
 from oracle import boxed, lemke
 from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.interior_point import InteriorPoint
@@ -35,15 +36,6 @@ def matrix(kind, rng):
     return scipy.sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(N, N)).toarray()
 
 
-def problem(A, b, kind, lower=0.0, upper=np.inf):
-    operator = (
-        wl.DenseOperator(A, device="cpu")
-        if kind == "dense"
-        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
-    )
-    return wl.LCP(operator, b, lower, upper)
-
-
 @pytest.mark.cpu_form("the CPU factors so few unknowns")
 @pytest.mark.parametrize("method", METHODS, ids=name)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
@@ -56,7 +48,7 @@ def test_extreme_rows(kind, method):
     for seed in range(6):
         rng = np.random.default_rng(seed)
         A, b, D = matrix(kind, rng), rng.standard_normal(N), 10 ** rng.uniform(-8, 8, N)
-        scaled = problem(D[:, None] * A * D, D * b, kind)
+        scaled = posed(D[:, None] * A * D, D * b, kind)
         result = wl.solve(scaled, wl.default_chain(method, scaled))
         assert result, (seed, result.status)
         # The criterion is in units of y: it distinguishes these rows from 0.
@@ -77,7 +69,7 @@ def test_the_same_steps_in_any_units(kind):
         plain, scaled = [], []
         for units, residuals in ((np.ones(N), plain), (D, scaled)):
             limits = (lower, upper) if np.isscalar(lower) else (lower / units, upper / units)
-            p = problem(units[:, None] * A * units, units * b, kind, *limits)
+            p = posed(units[:, None] * A * units, units * b, kind, *limits)
             work = InteriorPoint().init(p)
             result = wl.solve(
                 p,
@@ -98,11 +90,8 @@ def test_the_same_steps_in_any_units(kind):
 @pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
 @pytest.mark.parametrize("precision", ["mixed", "double", "single"])
 def test_no_solution_is_proved(b, kind, precision):
-    """Proof that no solution exists.
-
-    y_2 = -x_1 - 1 < 0 for every x >= 0: iterates diverge, and were once reported as not finite.
-    """
-    result = wl.solve(problem(TURN, np.array(b), kind), InteriorPoint(precision=precision))
+    """y_2 = -x_1 - 1 < 0 whatever x >= 0 is: iterates leave for infinity, and were once said to be not finite."""
+    result = wl.solve(posed(TURN, np.array(b), kind), InteriorPoint(precision=precision))
     assert result.status is wl.SolveStatus.INFEASIBLE
     assert np.isfinite(result.x.numpy()).all()
     assert np.isfinite(result.residual)
@@ -116,7 +105,7 @@ def test_what_is_no_solution_is_not_called_infeasible_where_there_is_one(seed):
     """
     rng = np.random.default_rng(seed)
     A, b = rng.standard_normal((4, 4)), rng.standard_normal(4)
-    result = wl.solve(problem(A + A.T, b, "dense"), InteriorPoint())
+    result = wl.solve(posed(A + A.T, b, "dense"), InteriorPoint())
     if boxed(A + A.T, b, np.zeros(4), np.full(4, np.inf)) is not None:
         assert result.status is not wl.SolveStatus.INFEASIBLE
     else:
@@ -131,7 +120,7 @@ def test_entries_bounds_and_b_may_change_in_place(kind):
     A, D = matrix(kind, rng), 10 ** rng.uniform(-3, 3, N)
     b, upper = (wp.zeros(N, dtype=wp.float64, device="cpu") for _ in range(2))
     upper.fill_(1.0)
-    p = problem(A, b, kind, 0.0, upper)
+    p = posed(A, b, kind, 0.0, upper)
     work = InteriorPoint().init(p)
     assert isinstance(work, EquilibratedWorkspace)
     for units in (np.ones(N), D, 1 / D) if kind == "sparse" else (np.ones(N), np.full(N, 2.0)):
@@ -145,7 +134,7 @@ def test_entries_bounds_and_b_may_change_in_place(kind):
         upper.assign(0.5 / units)
         again = wl.solve(p, InteriorPoint(), workspace=work, stopping=TIGHT)
         fresh = wl.solve(
-            problem(values, right, kind, 0.0, 0.5 / units), InteriorPoint(), stopping=TIGHT
+            posed(values, right, kind, 0.0, 0.5 / units), InteriorPoint(), stopping=TIGHT
         )
         assert again, again.status
         assert again.iterations == fresh.iterations
@@ -158,7 +147,7 @@ def test_a_guess_counts_in_any_units(kind):
     A, b, D = matrix(kind, rng), rng.standard_normal(N), 4.0 ** rng.integers(-13, 14, N)
     x, counts = lemke(A, b), []
     for units, guess in ((np.ones(N), None), (np.ones(N), x + 0.01), (D, x + 0.01)):
-        p = problem(units[:, None] * A * units, units * b, kind)
+        p = posed(units[:, None] * A * units, units * b, kind)
         result = wl.solve(
             p, InteriorPoint(), x0=None if guess is None else guess / units, stopping=TIGHT
         )
@@ -173,6 +162,6 @@ def test_a_guess_and_rows_without_a_diagonal_entry():
     D = np.array([1e-5, 1e4])
     A, b = D[:, None] * TURN * D, D * np.array([-1.0, 1.0])
     for x0 in (None, rng.random(2) / D, np.ones(2) / D):
-        result = wl.solve(problem(A, b, "dense"), InteriorPoint(), x0=x0, stopping=TIGHT)
+        result = wl.solve(posed(A, b, "dense"), InteriorPoint(), x0=x0, stopping=TIGHT)
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy() * D, [1.0, 1.0], atol=1e-4)

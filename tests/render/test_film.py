@@ -5,10 +5,9 @@ import sys
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from small_runs import ball, write_run
-from warp_lcp.cli import commands as cli
 from warp_lcp.render.film import Film, check_rate, film_suffix
 from warp_lcp.render.recording import RenderError
 
@@ -37,10 +36,6 @@ def shoot(file, count, rate):
         for number in range(count):
             film.add(lambda number=number: picture(number))
     return file
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["render", *map(str, arguments)])
 
 
 def test_a_gif_holds_the_images_their_times_and_repeats(encoder, tmp_path):
@@ -155,7 +150,7 @@ def test_without_an_encoder_the_command_says_what_to_install(dots, tmp_path, mon
     pytest.importorskip("pyvista")
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]])
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    result = call(folder, "--film", tmp_path / f"film{suffix}")
+    result = invoke("render", folder, "--film", tmp_path / f"film{suffix}")
     assert result.exit_code == 2
     assert "pip install 'imageio-ffmpeg" in result.stderr
     assert not (tmp_path / f"film{suffix}").exists()
@@ -183,7 +178,7 @@ def test_the_command_films_a_run(encoder, dots, tmp_path, suffix):
         tmp_path / "run", [[ball([0.2 + 0.1 * number, 0.5], 0.15)] for number in range(5)]
     )
     film = tmp_path / "new" / f"film.{suffix}"
-    result = call(folder, "--film", film, "--size", "320x240")
+    result = invoke("render", folder, "--film", film, "--size", "320x240")
     assert result.exit_code == 0, result.stderr
     assert f"{film}: 5 frames" in result.stdout
     if suffix == "mp4":
@@ -193,7 +188,9 @@ def test_the_command_films_a_run(encoder, dots, tmp_path, suffix):
     with Image.open(film) as read:
         assert read.n_frames == 5
         assert read.info["duration"] == 50
-    assert call(folder, "--film", film, "--size", "320x240", "--fps", "5").exit_code == 0
+    assert (
+        invoke("render", folder, "--film", film, "--size", "320x240", "--fps", "5").exit_code == 0
+    )
     with Image.open(film) as read:
         assert read.info["duration"] == 200
 
@@ -201,7 +198,7 @@ def test_the_command_films_a_run(encoder, dots, tmp_path, suffix):
 @pytest.mark.parametrize("arguments", [["--frame", "1"], ["--sheet"], ["--out", "x"]])
 def test_options_that_a_film_does_not_have(dots, tmp_path, arguments):
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]])
-    result = call(folder, "--film", tmp_path / "film.gif", *arguments)
+    result = invoke("render", folder, "--film", tmp_path / "film.gif", *arguments)
     assert result.exit_code == 2
     assert "cannot be combined with --frame, --frames, --sheet or --out" in result.stderr.replace(
         "\n", " "

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from small_runs import ball
-from warp_lcp.cli import commands as cli
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.actors import shaded
 from warp_lcp.render.live import Live
@@ -26,11 +25,6 @@ from warp_lcp.simulation import Cells, Points
 RNG = np.random.default_rng(9127)
 WHITE = 255
 DISC = '[[solid]]\nshape = "sphere"\ncenter = [0.5, 0.5]\nradius = 0.4\ninvert = true\n'
-
-
-@pytest.fixture
-def pyvista():
-    return pytest.importorskip("pyvista", reason="images need pyvista, the extra `render`")
 
 
 @pytest.fixture
@@ -82,10 +76,6 @@ def drops(count: int, dimension: int = 2) -> tuple[np.ndarray, np.ndarray]:
     return points, np.tile([0.6, 0.8, 0.0], (count, 1))
 
 
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["render", *map(str, arguments)])
-
-
 def pixels(path: Path) -> np.ndarray:
     from PIL import Image
 
@@ -104,7 +94,7 @@ def is_blue(image: np.ndarray) -> np.ndarray:
 def test_without_pyvista_the_command_says_what_to_install(make_run, monkeypatch):
     folder = make_run([drops(3)])
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    result = call(folder)
+    result = invoke("render", folder)
     assert result.exit_code == 2
     assert INSTALL in result.stderr
     assert "Traceback" not in result.stderr
@@ -130,7 +120,7 @@ def test_without_pyvista_the_command_says_what_to_install(make_run, monkeypatch)
 )
 def test_wrong_input_exits_with_2(pyvista, make_run, arguments, expected):
     folder = make_run([drops(3), drops(3)])
-    result = call(*[argument.format(run=folder) for argument in arguments])
+    result = invoke("render", *[argument.format(run=folder) for argument in arguments])
     assert result.exit_code == 2
     assert expected in result.stderr.replace("\n", " ")
     assert "Traceback" not in result.stderr
@@ -138,7 +128,7 @@ def test_wrong_input_exits_with_2(pyvista, make_run, arguments, expected):
 
 
 def test_a_run_without_frames(pyvista, make_run):
-    result = call(make_run([]))
+    result = invoke("render", make_run([]))
     assert result.exit_code == 2
     assert "holds no frames of particles" in result.stderr
 
@@ -147,7 +137,7 @@ def test_a_frame_that_is_cut_short(pyvista, make_run):
     folder = make_run([drops(20)])
     file = folder / "frames" / "particles_000000.vtu"
     file.write_bytes(file.read_bytes()[:400])
-    result = call(folder)
+    result = invoke("render", folder)
     assert result.exit_code == 2
     assert f"{file}: is not a readable frame" in result.stderr
 
@@ -160,7 +150,9 @@ def test_pressure_needs_the_cells(pyvista, make_run):
 
 def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
     folder = make_run([drops(5) for _ in range(4)])
-    result = call(folder, "--frame", -1, "--frame", 1, "--frame", 3, "--size", "320x240")
+    result = invoke(
+        "render", folder, "--frame", -1, "--frame", 1, "--frame", 3, "--size", "320x240"
+    )
     assert result.exit_code == 0
     assert "2 images" in result.stdout
     assert sorted(path.name for path in (folder / "images").iterdir()) == [
@@ -168,7 +160,10 @@ def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
         "frame_000003.png",
     ]
     assert pixels(folder / "images" / "frame_000001.png").shape == (240, 320, 3)
-    assert call(folder, "--out", tmp_path / "elsewhere", "--size", "320x240").exit_code == 0
+    assert (
+        invoke("render", folder, "--out", tmp_path / "elsewhere", "--size", "320x240").exit_code
+        == 0
+    )
     assert len(list((tmp_path / "elsewhere").glob("frame_*.png"))) == 4
 
 
@@ -191,9 +186,9 @@ def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
     ]
     assert more[0] == 2 * said[0]
     assert more[1] > said[0] > 0.0
-    result = call(folder, "--size", "320x240")
+    result = invoke("render", folder, "--size", "320x240")
     assert result.stderr.startswith("drawing takes about 0:00:01 on one core")
-    assert "takes about" not in call(folder, "--size", "320x240", "--frame", 0).stderr
+    assert "takes about" not in invoke("render", folder, "--size", "320x240", "--frame", 0).stderr
 
 
 @pytest.mark.parametrize(
@@ -236,7 +231,7 @@ def test_sand_is_drawn_as_grains_and_liquid_as_its_surface_unless_told(
 
 def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
     folder = make_run([drops(number + 1) for number in range(8)])
-    result = call(folder, "--sheet", "--size", "600x480")
+    result = invoke("render", folder, "--sheet", "--size", "600x480")
     assert result.exit_code == 0
     assert result.stdout.strip() == str(folder / "images" / "sheet.png")
     image = pixels(folder / "images" / "sheet.png")

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from small_runs import ball, box, sphere, write_run
-from warp_lcp.cli import commands as cli
 from warp_lcp.render.actors import is_round, surface_meshes
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, render_run
@@ -21,15 +20,6 @@ PARTICLE = Points(
 )
 SIZE = (400, 300)
 TURN = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
-
-
-@pytest.fixture
-def pyvista():
-    return pytest.importorskip("pyvista", reason="images need pyvista, the extra `render`")
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["render", *map(str, arguments)])
 
 
 def pixels(path) -> np.ndarray:
@@ -273,7 +263,7 @@ def test_empty_surfaces_and_frames_without_bodies(pyvista, dots, tmp_path):
 )
 def test_wrong_input_exits_with_2(pyvista, dots, tmp_path, arguments, expected):
     folder = write_run(tmp_path / "run", [[PARTICLE, ball([0.5, 0.5, 0.5], 0.3)]], size=ROOM)
-    result = call(folder, *arguments)
+    result = invoke("render", folder, *arguments)
     assert result.exit_code == 2
     assert expected in result.stderr.replace("\n", " ")
     assert "Traceback" not in result.stderr
@@ -286,7 +276,8 @@ def test_a_camera_from_the_command_line(pyvista, dots, tmp_path):
     for number, look_at in enumerate(("[0.2, 0.5, 0.5]", "[0.8, 0.5, 0.5]")):
         out = tmp_path / str(number)
         settings = ["camera.position=[0.5, 0.5, 4.0]", f"camera.look_at={look_at}"]
-        result = call(
+        result = invoke(
+            "render",
             folder,
             "--out",
             out,

@@ -4,10 +4,9 @@ import sys
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from small_runs import ball, sphere, write_run
-from warp_lcp.cli import commands as cli
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import INSTALL_MATPLOTLIB, Looks, render_run
 from warp_lcp.render.section import cut
@@ -21,10 +20,6 @@ SOLID = '[[solid]]\nshape = "sphere"\ncenter = [{}]\nradius = 0.2\n'
 @pytest.fixture(autouse=True)
 def no_pyvista(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["render", *map(str, arguments)])
 
 
 def material(dimension: int, column: int = 2):
@@ -154,13 +149,16 @@ def test_a_surface_alone_is_drawn_over_plain_cells(dots, tmp_path):
 
 def test_a_film_and_a_sheet_of_sections(dots, tmp_path):
     folder = write_run(tmp_path / "run", [material(2, column) for column in (2, 4, 6)])
-    assert call(folder, "--slice", "--sheet", "--size", "600x300").exit_code == 0
+    assert invoke("render", folder, "--slice", "--sheet", "--size", "600x300").exit_code == 0
     assert (folder / "images" / "sheet.png").is_file()
     assert (
-        call(folder, "--slice", "--film", tmp_path / "film.gif", "--size", "320x240").exit_code == 0
+        invoke(
+            "render", folder, "--slice", "--film", tmp_path / "film.gif", "--size", "320x240"
+        ).exit_code
+        == 0
     )
     assert (tmp_path / "film.gif").stat().st_size > 1000
-    assert call(folder, "--slice", "--frame", "-1").exit_code == 0
+    assert invoke("render", folder, "--slice", "--frame", "-1").exit_code == 0
     assert (folder / "images" / "slice_000002.png").is_file()
 
 
@@ -185,14 +183,14 @@ def test_wrong_cuts(dots, tmp_path):
 
 def test_without_pyvista_the_error_names_the_section(dots, tmp_path):
     folder = write_run(tmp_path / "run", [material(2)])
-    result = call(folder)
+    result = invoke("render", folder)
     assert result.exit_code == 2
     assert "--slice draws a section without it" in result.stderr.replace("\n", " ")
-    assert call(folder, "--slice").exit_code == 0
+    assert invoke("render", folder, "--slice").exit_code == 0
 
 
 def test_without_matplotlib_the_command_says_what_to_install(dots, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    result = call(write_run(tmp_path / "run", [material(2)]), "--slice")
+    result = invoke("render", write_run(tmp_path / "run", [material(2)]), "--slice")
     assert result.exit_code == 2
     assert INSTALL_MATPLOTLIB in result.stderr

@@ -7,12 +7,11 @@ import meshio
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from mesh_checks import assert_closed, enclosed
 from small_liquids import GRAVITY, scene
 from small_runs import ball, box, run_into, write_run
-from warp_lcp.cli import commands as cli
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.recording import RenderError, Show
 from warp_lcp.render.usd import INSTALL, export_run, usd_suffix
@@ -43,10 +42,6 @@ def falls(tmp_path_factory) -> dict[int, Path]:
         runs[dimension] = tmp_path_factory.mktemp("falls") / f"fall-{dimension}"
         run_into(falling, runs[dimension], last_frame=LAST)
     return runs
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["export", *map(str, arguments)])
 
 
 def exported(folder: Path, file: Path, **options) -> Usd.Stage:
@@ -313,7 +308,7 @@ def test_kinds_of_files(dots, tmp_path, name):
         size=ROOM,
     )
     file = tmp_path / "new" / name
-    result = call(folder, "--out", file, "--first", 1, "--last", 2)
+    result = invoke("export", folder, "--out", file, "--first", 1, "--last", 2)
     assert result.exit_code == 0, result.stderr
     assert f"{file}: 2 frames" in result.stdout.replace("\n", "")
     assert file.read_bytes().startswith(b"#usda" if name.endswith("a") else b"PXR-USDC")
@@ -324,7 +319,7 @@ def test_kinds_of_files(dots, tmp_path, name):
         20.0,
     )
     assert get(stage, "surface", "points", 2)[:, 0].max() == pytest.approx(0.5)
-    assert call(folder, "--out", file).exit_code == 0  # replaces the older one
+    assert invoke("export", folder, "--out", file).exit_code == 0  # in place of the older one
     assert [entry.name for entry in file.parent.iterdir()] == [name]
 
 
@@ -401,7 +396,7 @@ def test_wrong_input(dots, tmp_path, monkeypatch, arguments, expected):
     write_run(Path("run"), [[ball([0.5, 0.5], 0.2)]] * 2)
     Path("folder.usd").mkdir()
     Path("file").write_text("")
-    result = call(*arguments)
+    result = invoke("export", *arguments)
     assert result.exit_code == 2
     assert expected in " ".join(result.stderr.split())
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.usd", "run"]
@@ -431,7 +426,7 @@ def test_a_full_disk_is_told(dots, tmp_path):
 def test_without_usd_the_command_says_what_to_install(dots, tmp_path, monkeypatch):
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]])
     monkeypatch.setitem(sys.modules, "pxr", None)
-    result = call(folder, "--out", tmp_path / "run.usdc")
+    result = invoke("export", folder, "--out", tmp_path / "run.usdc")
     assert result.exit_code == 2
     assert INSTALL in " ".join(result.stderr.split())
 

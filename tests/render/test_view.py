@@ -22,11 +22,6 @@ class Clock:
 
 
 @pytest.fixture
-def pyvista():
-    return pytest.importorskip("pyvista", reason="a window needs pyvista, the extra `render`")
-
-
-@pytest.fixture
 def folder(dots, tmp_path):
     return write_run(
         tmp_path / "run",

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak
 from warp_lcp.cli import commands as cli
 from warp_lcp.files import claims
@@ -19,10 +19,6 @@ from warp_lcp.run.trial import MOST, step_seconds
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import StepFailed
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 @pytest.mark.usefixtures("only_new_objects")
@@ -89,11 +85,11 @@ def test_what_does_not_fit_is_refused_unless_forced(
         ["check", "dam-break-2d", "--device", "cpu"],
         ["run", "dam-break-2d", "--device", "cpu", "--out", out, "--frames", 0],
     ):
-        refused = call(*arguments)
+        refused = invoke(*arguments)
         assert refused.exit_code == cli.WRONG_INPUT
         assert "--force-memory" in refused.stderr
         assert not out.exists(), "a refused run leaves nothing"
-        assert call(*arguments, "--force-memory").exit_code == 0
+        assert invoke(*arguments, "--force-memory").exit_code == 0
     assert out.is_dir()
 
 
@@ -118,11 +114,19 @@ def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(
     check_memory(load_scene("dam-break", ["domain.resolution=4096"]), "cpu")
 
 
-def test_the_time_of_a_step_leaves_the_first_out(dots: Any, scene_file: Path) -> None:
-    dots.before_step = lambda simulation, dt: time.sleep(0.002 if simulation.step_count else 0.5)
+def test_the_time_of_a_step_leaves_the_first_out(
+    dots: Any, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+
+    def move_on(simulation: Any, dt: float) -> None:
+        now[0] += 0.002 if simulation.step_count else 0.5
+
+    dots.before_step = move_on
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     seconds, steps = step_seconds(load_scene(scene_file), device="cpu")
     assert steps == MOST
-    assert 0.002 <= seconds < 0.1
+    assert seconds == pytest.approx(0.002)
 
 
 def test_long_steps_are_few(dots: Any, scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,8 +137,8 @@ def test_long_steps_are_few(dots: Any, scene_file: Path, monkeypatch: pytest.Mon
 def test_check_calibrates_on_request_and_says_when_a_step_fails(
     dots: Any, scene_file: Path
 ) -> None:
-    assert "seconds a step" not in call("check", scene_file, "--device", "cpu").stdout
-    shown = call("check", scene_file, "--device", "cpu", "--calibrate")
+    assert "seconds a step" not in invoke("check", scene_file, "--device", "cpu").stdout
+    shown = invoke("check", scene_file, "--device", "cpu", "--calibrate")
     assert shown.exit_code == 0
     assert f"on cpu, the median of {MOST}" in shown.stdout
 
@@ -142,6 +146,6 @@ def test_check_calibrates_on_request_and_says_when_a_step_fails(
         raise StepFailed("no luck")
 
     dots.before_step = fail
-    failed = call("check", scene_file, "--device", "cpu", "--calibrate")
+    failed = invoke("check", scene_file, "--device", "cpu", "--calibrate")
     assert failed.exit_code == cli.FAILED
     assert "no luck" in failed.stderr

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from typer.testing import CliRunner, Result
 
+from command_line import invoke
 from particle_scenes import particle_scenes
 from warp_lcp.cli import commands as cli
 from warp_lcp.run.check import check_scene, start
@@ -27,10 +27,6 @@ from warp_lcp.scene.table import SceneError
 LIQUID = {"shape": "box", "min": [0.0, 0.0], "max": [1.0, 0.3]}
 FILLS = {"shape": "box", "min": [-1.0, -1.0], "max": [2.0, 2.0]}
 BEAM = {"shape": "box", "min": [0.4, 0.55], "max": [0.9, 0.65]}
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 def written(
@@ -80,8 +76,8 @@ def test_what_a_run_refuses_at_its_start_check_refuses_with_the_same_words(
 ) -> None:
     scene, out = written(tmp_path / "scene.toml", [LIQUID], **tables), tmp_path / "out"
     checked, ran = (
-        call("check", scene, "--device", "cpu"),
-        call("run", scene, "--device", "cpu", "--out", out),
+        invoke("check", scene, "--device", "cpu"),
+        invoke("run", scene, "--device", "cpu", "--out", out),
     )
     assert checked.exit_code == ran.exit_code == cli.WRONG_INPUT
     with pytest.raises(SceneError, match=message):
@@ -94,7 +90,7 @@ def test_both_name_the_shape_whose_mesh_is_open(tmp_path: Path) -> None:
     pool = {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.3, 1.0]}
     domain, solid = {"size": [1.0, 1.0, 1.0]}, [{"shape": "mesh", "file": "sheet.obj"}]
     scene = written(tmp_path / "scene.toml", [pool], domain=domain, solid=solid)
-    for result in (call("check", scene), call("run", scene, "--out", tmp_path / "out")):
+    for result in (invoke("check", scene), invoke("run", scene, "--out", tmp_path / "out")):
         assert result.exit_code == cli.WRONG_INPUT
         assert re.search(r"solid\[0\]: \S*sheet.obj: the surface is not closed", result.stderr)
 
@@ -117,7 +113,7 @@ def test_check_says_what_a_run_says(tmp_path: Path) -> None:
     ]
     mesh.write_text("\n".join(lines))
     scene = written(tmp_path / "scene.toml", [LIQUID], solid=[{"shape": "mesh", "file": str(mesh)}])
-    shown = call("check", scene, "--device", "cpu")
+    shown = invoke("check", scene, "--device", "cpu")
     assert shown.exit_code == 0
     assert f"{mesh}: dropped 2 repeated triangles, the first at [" in shown.stdout
     assert " particles, 16 x 16 cells" in shown.stdout

@@ -3,19 +3,13 @@
 import json
 import random
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from warp_lcp.cli import commands as cli
+from command_line import invoke
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.scene.scene_file import dump_scene, keys
-
-
-def call(*arguments: Any) -> Any:
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 def ran(out: Path, given: GivenScene) -> None:
@@ -43,13 +37,15 @@ def frames(out: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("way", ["the scene", "the folder's scene", "no scene"])
 def test_resume_without_repeating_set_is_the_same_run(scene_file, tmp_path, way):
     run = ["--device", "cpu", "--set", "domain.resolution=16", "--set", "time.dt_max=0.01"]
-    assert call("run", scene_file, "--out", tmp_path / "whole", *run, "--frames", 2).exit_code == 0
+    assert (
+        invoke("run", scene_file, "--out", tmp_path / "whole", *run, "--frames", 2).exit_code == 0
+    )
     out = tmp_path / "parts"
-    assert call("run", scene_file, "--out", out, *run, "--frames", 1).exit_code == 0
+    assert invoke("run", scene_file, "--out", out, *run, "--frames", 1).exit_code == 0
     named = {"the scene": [scene_file], "the folder's scene": [out / "scene.toml"], "no scene": []}[
         way
     ]
-    result = call("run", *named, "--out", out, "--device", "cpu", "--frames", 2, "--resume")
+    result = invoke("run", *named, "--out", out, "--device", "cpu", "--frames", 2, "--resume")
     assert result.exit_code == 0, result.stderr
     assert ("earlier --set values: domain.resolution=16, time.dt_max=0.01" in result.stderr) == (
         way == "the scene"
@@ -68,7 +64,7 @@ def test_resume_without_repeating_set_is_the_same_run(scene_file, tmp_path, way)
 def test_what_is_given_anew_changes_and_is_told(scene_file, tmp_path):
     out = tmp_path / "out"
     assert (
-        call(
+        invoke(
             "run",
             scene_file,
             "--out",
@@ -83,7 +79,7 @@ def test_what_is_given_anew_changes_and_is_told(scene_file, tmp_path):
         == 0
     )
     edit(scene_file, duration="0.6")
-    result = call(
+    result = invoke(
         "run",
         scene_file,
         "--out",
@@ -143,7 +139,7 @@ def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
     ],
 )
 def test_without_a_scene(dots, tmp_path, arguments, expected):
-    result = call("run", *(argument.format(out=tmp_path / "none") for argument in arguments))
+    result = invoke("run", *(argument.format(out=tmp_path / "none") for argument in arguments))
     assert result.exit_code == 2
     assert expected in result.stderr
     assert not (tmp_path / "none").exists()

@@ -7,13 +7,12 @@ import json
 import os
 import signal
 import threading
-from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from small_runs import run_into
+from small_runs import read_record, run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import interruption
 from warp_lcp.run.folder import mark_ended
@@ -57,10 +56,6 @@ def run(scene_file, tmp_path):
     return call
 
 
-def record(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "out" / "run.json").read_text())
-
-
 def at(step: int, *numbers: signal.Signals) -> Any:
     def before_step(simulation: Any, dt: float) -> None:
         if simulation.step_count == step:
@@ -78,7 +73,7 @@ def test_after_a_step(dots, run, tmp_path, number):
     assert result.exit_code == 1
     assert result.stderr.count(f"{number.name}: stopping after this step") == 1
     assert f"stopped: interrupted by {number.name}\n" in result.stderr
-    found = record(tmp_path)
+    found = read_record(tmp_path / "out")
     assert (found["status"], found["reason"], found["steps"]) == (
         "stopped",
         f"interrupted by {number.name}",
@@ -88,7 +83,7 @@ def test_after_a_step(dots, run, tmp_path, number):
     assert [signal.getsignal(each) for each in SIGNALS] == handlers
     dots.before_step = at(-1)
     assert run("--resume").exit_code == 0
-    assert record(tmp_path)["resumed_from_step"] == 6
+    assert read_record(tmp_path / "out")["resumed_from_step"] == 6
 
 
 @EACH
@@ -98,7 +93,7 @@ def test_before_the_first_step_has_ended(dots, run, tmp_path, number, frames):
     result = run("--frames", frames)
     assert result.exit_code == 1
     assert f"{number.name}: stopping before the first step has ended" in result.stderr
-    found = record(tmp_path)
+    found = read_record(tmp_path / "out")
     assert (found["status"], found["steps"]) == ("stopped", 0)
     assert found["reason"] == f"interrupted by {number.name} during the first step"
     dots.before_step = at(-1)
@@ -107,10 +102,13 @@ def test_before_the_first_step_has_ended(dots, run, tmp_path, number, frames):
 
 def test_before_the_first_step_of_a_part(dots, run, tmp_path):
     assert run("--frames", 2).exit_code == 0
-    begun = record(tmp_path)["steps"]
+    begun = read_record(tmp_path / "out")["steps"]
     dots.before_step = at(begun, signal.SIGTERM)
     assert run("--resume").exit_code == 1
-    assert (record(tmp_path)["status"], record(tmp_path)["steps"]) == ("stopped", begun)
+    assert (read_record(tmp_path / "out")["status"], read_record(tmp_path / "out")["steps"]) == (
+        "stopped",
+        begun,
+    )
 
 
 def test_before_the_run_has_begun(dots, run, tmp_path, monkeypatch):
@@ -130,14 +128,14 @@ def test_several_signals_are_one(dots, run, tmp_path):
     dots.before_step = at(5, signal.SIGTERM, signal.SIGINT, signal.SIGTERM)
     result = run()
     assert result.stderr.count("stopping after this step") == 1
-    assert record(tmp_path)["reason"] == "interrupted by SIGTERM"
+    assert read_record(tmp_path / "out")["reason"] == "interrupted by SIGTERM"
 
 
 def test_a_second_ctrl_c_does_not_wait(dots, run, tmp_path):
     dots.before_step = at(5, signal.SIGINT, signal.SIGINT)
     assert run().exit_code == 1
-    assert record(tmp_path)["status"] == "failed"
-    assert record(tmp_path)["steps"] == 5
+    assert read_record(tmp_path / "out")["status"] == "failed"
+    assert read_record(tmp_path / "out")["steps"] == 5
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows")
@@ -149,7 +147,7 @@ def test_what_is_ignored_stays_ignored(dots, run, tmp_path):
         assert run().exit_code == 0
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert record(tmp_path)["status"] == "finished"
+    assert read_record(tmp_path / "out")["status"] == "finished"
 
 
 def test_a_compiler_is_not_waited_for(monkeypatch):
@@ -174,12 +172,12 @@ def test_a_compiler_is_not_waited_for(monkeypatch):
 def test_the_record_of_a_run_that_is_ended(run, tmp_path):
     assert run("--frames", 0).exit_code == 0
     mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT during the first step")
-    assert record(tmp_path)["status"] == "finished"
+    assert read_record(tmp_path / "out")["status"] == "finished"
     (tmp_path / "out" / "run.json").write_text(
-        json.dumps({**record(tmp_path), "status": "running"})
+        json.dumps({**read_record(tmp_path / "out"), "status": "running"})
     )
     mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT during the first step")
-    found = record(tmp_path)
+    found = read_record(tmp_path / "out")
     assert (found["status"], found["reason"]) == (
         "stopped",
         "interrupted by SIGINT during the first step",

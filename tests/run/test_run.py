@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from small_runs import run_into
+from small_runs import read_record, run_into
 from warp_lcp.frames import vtu as vtu_module
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.run import loop as run_module
@@ -48,10 +48,6 @@ def go(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
 def rows(out: Path) -> list[dict[str, str]]:
     with open(out / "log.csv", newline="") as file:
         return list(csv.DictReader(file))
-
-
-def record(out: Path) -> dict[str, Any]:
-    return json.loads((out / "run.json").read_text())
 
 
 def contents(out: Path) -> dict[str, Any]:
@@ -144,7 +140,7 @@ def test_log_and_record(scene_file, tmp_path):
     ]
     assert [int(row["step"]) for row in log] == list(range(1, len(log) + 1))
     assert {row["volume"] for row in log} == {""}
-    written = record(out)
+    written = read_record(out)
     assert (written["status"], written["steps"], written["frames"], written["device"]) == (
         "finished",
         len(log),
@@ -236,7 +232,7 @@ def test_a_killed_run_resumes_from_its_last_checkpoint(dots, scene_file, tmp_pat
     dots.before_step = fail_on(15, error=KeyboardInterrupt)  # the second Ctrl-C
     with pytest.raises(KeyboardInterrupt):
         go(scene_file, parts)
-    assert (record(parts)["status"], record(parts)["reason"]) == (
+    assert (read_record(parts)["status"], read_record(parts)["reason"]) == (
         "failed",
         "the program ended unexpectedly",
     )
@@ -279,7 +275,7 @@ def test_resume_reports_a_broken_checkpoint_and_takes_the_one_before(scene_file,
     observer = Watcher()
     result = go(scene_file, parts, resume=True, observer=observer)
     assert result.resumed_from_step == 8
-    assert result.warnings == observer.notes == record(parts)["warnings"]
+    assert result.warnings == observer.notes == read_record(parts)["warnings"]
     assert "step_000010.npz: cut short" in observer.notes[0]
     assert observer.notes[1].startswith("continuing from step 8 instead")
     assert (parts / "checkpoints" / "refused_000010.npz").is_file()
@@ -311,7 +307,7 @@ def test_a_step_that_keeps_failing_ends_the_run(dots, scene_file, tmp_path):
     assert result.reason.startswith("step 6 at t = ")
     assert result.reason.endswith("retries 6: no convergence")
     np.testing.assert_allclose(tried, tried[0] / 2.0 ** np.arange(7))
-    assert record(out)["reason"] == result.reason
+    assert read_record(out)["reason"] == result.reason
     assert (out / "checkpoints" / "step_000005.npz").is_file()
     dots.before_step = lambda simulation, dt: None
     assert go(scene_file, out, resume=True).resumed_from_step == 5
@@ -360,7 +356,7 @@ def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path
     result = go(scene_file, out)
     assert result.status == "failed"
     assert result.reason.startswith("the disk is full")
-    assert record(out)["status"] == "failed"
+    assert read_record(out)["status"] == "failed"
     assert sorted(path.name for path in (out / "frames").glob("particles*")) == [
         f"particles_{k:06d}.vtu" for k in range(4)
     ]
@@ -525,7 +521,7 @@ def test_a_scene_that_cannot_be_simulated(dots, scene_file, tmp_path):
     dots.refuse = "liquid[0]: holds no particle"
     with pytest.raises(SceneError, match=r"dots: liquid\[0\]: holds no particle"):
         go(scene_file, tmp_path / "out", force=True)
-    assert record(tmp_path / "out")["status"] == "finished"  # nothing was deleted for it
+    assert read_record(tmp_path / "out")["status"] == "finished"  # nothing was deleted for it
 
 
 def test_a_simulator_that_cannot_change_grids(scene_file, tmp_path):
@@ -535,7 +531,7 @@ def test_a_simulator_that_cannot_change_grids(scene_file, tmp_path):
         SceneError, match=r"domain.resolution: must stay 8: dots cannot change grids"
     ):
         go(scene_file, out, "domain.resolution=16", resume=True)
-    assert record(out)["status"] == "stopped"  # nothing was changed
+    assert read_record(out)["status"] == "stopped"  # nothing was touched
     assert go(scene_file, out, resume=True).resumed_from_step == 5
 
 
@@ -559,6 +555,6 @@ def test_a_run_says_how_many_steps_missed_their_tolerance(scene_file, dots, tmp_
     dots.before_step = before_step
     result = go(scene_file, tmp_path / "out")
     expected = f"2 of {result.steps} steps missed solver.tolerance = 0.0001"
-    assert result.warnings == record(tmp_path / "out")["warnings"] == [expected]
+    assert result.warnings == read_record(tmp_path / "out")["warnings"] == [expected]
     dots.before_step = lambda simulation, dt: None
     assert go(scene_file, tmp_path / "fine").warnings == []

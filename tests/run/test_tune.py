@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from warp_lcp.cli import commands as cli
+from command_line import invoke
 from warp_lcp.run import tune as tuning
 from warp_lcp.run.trial import Differences, Look, Trial, look_times, spread, trial
 from warp_lcp.scene.presets import price_table
@@ -265,10 +264,6 @@ def test_the_reference_is_not_doubted_where_its_bounds_are_kept(
     assert found.verdict("standard")[0].startswith("standard: time.cfl=8 ")
 
 
-def call(*arguments: object) -> Any:
-    return CliRunner().invoke(cli.app, ["tune", *map(str, arguments)])
-
-
 def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
     out = tmp_path / "tuned.toml"
     options = [
@@ -283,7 +278,7 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
         "--out",
         out,
     ]
-    result = call("dam-break-2d", *options)
+    result = invoke("tune", "dam-break-2d", *options)
     assert result.exit_code == 0, result.stderr
     assert "preview: time.cfl=" in result.stdout
     assert "distance: displaced fraction of the mass" in result.stdout
@@ -319,6 +314,6 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_input_exits_with_2(arguments: list[str], message: str) -> None:
-    result = call(*arguments)
+    result = invoke("tune", *arguments)
     assert result.exit_code == 2
     assert message in result.stderr

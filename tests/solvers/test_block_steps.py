@@ -7,27 +7,16 @@ import itertools
 
 import numpy as np
 import pytest
-import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import dense_and_sparse, spd
 from oracle import assemble, boxed
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.staggering import Staggering
 
 FRICTION = 0.4
 ORDERS = {"forward": (1,), "backward": (-1,), "symmetric": (1, -1)}
-
-
-def spd(n, seed):
-    B = np.random.default_rng(seed).standard_normal((n, n))
-    return B @ B.T / n + 0.3 * np.eye(n)
-
-
-def operators(A, device):
-    return wl.DenseOperator(A, device=device), wl.SparseOperator(
-        scipy.sparse.csr_array(A), device=device
-    )
 
 
 def held_others(A, b, x, block):
@@ -91,7 +80,7 @@ def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device)
     Each block is solved by exhaustive search; x moves by omega of the way and is projected.
     """
     rng = np.random.default_rng(4801)
-    A, b = spd(11, 4801), 2 * rng.standard_normal(11)
+    A, b = spd(11, 4801, 0.3), 2 * rng.standard_normal(11)
     lower, upper = (
         np.where(rng.random(11) < 0.3, -np.inf, -rng.random(11)),
         np.where(rng.random(11) < 0.3, np.inf, rng.random(11)),
@@ -107,7 +96,7 @@ def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device)
                     x[block] + omega * (solution - x[block]), lower[block], upper[block]
                 )
         expected.append(x.copy())
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         method = BlockedGaussSeidel(blocks=blocks, omega=omega, direction=direction)
         if operator.device.is_cuda:
             continue  # in colors, another order
@@ -130,7 +119,7 @@ def test_contacts_with_friction_are_blocks_whose_limits_are_part_of_them(omega, 
     )
     for seed in range(4811, 4816):
         rng = np.random.default_rng(seed)
-        A, b, x = spd(9, seed), 2 * rng.standard_normal(9) - 1.0, np.zeros(9)
+        A, b, x = spd(9, seed, 0.3), 2 * rng.standard_normal(9) - 1.0, np.zeros(9)
         problem = wl.LCP(
             wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
         )
@@ -156,7 +145,7 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
     """
     rng = np.random.default_rng(4821)
     C = rng.standard_normal((12, 12))
-    A, b = spd(12, 4821) + 0.2 * (C - C.T), 2 * rng.standard_normal(12)
+    A, b = spd(12, 4821, 0.3) + 0.2 * (C - C.T), 2 * rng.standard_normal(12)
     lower, upper = (
         np.where(rng.random(12) < 0.3, -np.inf, -rng.random(12)),
         np.where(rng.random(12) < 0.3, np.inf, rng.random(12)),
@@ -182,7 +171,7 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
             solvers=[wl.Lemke(), wl.ProjectedSOR(omega=1.0), wl.MinimumMapNewton(direct=True)],
             eta=1e-12,
         )
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         for got, x in zip(
             steps_of(wl.LCP(operator, b, lower, upper), solver, 3), expected, strict=True
         ):
@@ -200,7 +189,7 @@ def test_normal_and_tangential_forces_in_turn(device):
     normals, tangential = np.flatnonzero(normal < 0), np.flatnonzero(normal >= 0)
     slides = sticks = 0
     for seed in range(4831, 4836):
-        A, b, x = spd(9, seed), 2 * np.random.default_rng(seed).standard_normal(9), np.zeros(9)
+        A, b, x = spd(9, seed, 0.3), 2 * np.random.default_rng(seed).standard_normal(9), np.zeros(9)
         problem = wl.LCP(
             wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
         )

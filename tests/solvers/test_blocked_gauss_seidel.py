@@ -12,23 +12,13 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import dense_and_sparse, spd
 from oracle import assemble, boxed, lemke
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.staggering import color_blocks
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=5000, patience=2000)
-
-
-def spd(n, seed, shift=0.2):
-    B = np.random.default_rng(seed).standard_normal((n, n))
-    return B @ B.T / n + shift * np.eye(n)
-
-
-def operators(A, device):
-    return wl.DenseOperator(A, device=device), wl.SparseOperator(
-        scipy.sparse.csr_array(A), device=device
-    )
 
 
 def block_sweep(A, b, lower, upper, x, blocks):
@@ -42,7 +32,7 @@ def block_sweep(A, b, lower, upper, x, blocks):
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
 def test_a_sweep_solves_each_block_exactly(size, device):
     rng = np.random.default_rng(149 + size)
-    A, b = spd(13, size), 2 * rng.standard_normal(13)
+    A, b = spd(13, size, 0.2), 2 * rng.standard_normal(13)
     lower, upper = (
         np.where(rng.random(13) < 0.3, -np.inf, -rng.random(13)),
         np.where(rng.random(13) < 0.3, np.inf, rng.random(13)),
@@ -50,7 +40,7 @@ def test_a_sweep_solves_each_block_exactly(size, device):
     order = rng.permutation(13)
     blocks = [order[i : i + size] for i in range(0, 13, size)]
     expected = block_sweep(A, b, lower, upper, np.clip(np.zeros(13), lower, upper), blocks)
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         problem = wl.LCP(operator, b, lower, upper)
         result = wl.solve(
             problem,
@@ -68,7 +58,7 @@ def test_contacts_in_space_are_blocks_without_being_asked_for(device):
     Where nothing else couples them, one sweep solves all.
     """
     rng = np.random.default_rng(163)
-    contacts, b = [spd(3, seed) for seed in range(5)], -rng.random(15)
+    contacts, b = [spd(3, seed, 0.2) for seed in range(5)], -rng.random(15)
     A = scipy.sparse.block_diag(contacts).toarray()
     expected = np.concatenate(
         [
@@ -76,7 +66,7 @@ def test_contacts_in_space_are_blocks_without_being_asked_for(device):
             for i, a in enumerate(contacts)
         ]
     )
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         result = wl.solve(wl.LCP(operator, b), BlockedGaussSeidel(), stopping=TIGHT)
         assert (result.status, result.iterations) == (wl.SolveStatus.CONVERGED, 1)
         np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-12)
@@ -84,8 +74,8 @@ def test_contacts_in_space_are_blocks_without_being_asked_for(device):
 
 def test_blocks_of_one_are_projected_gauss_seidel(device):
     rng = np.random.default_rng(151)
-    A, b = spd(20, 3), rng.standard_normal(20)
-    for operator in operators(A, device):
+    A, b = spd(20, 3, 0.2), rng.standard_normal(20)
+    for operator in dense_and_sparse(A, device):
         problem = wl.LCP(operator, b)
         for direction in ("forward", "backward", "symmetric"):
             scalar = wl.solve(
@@ -107,8 +97,8 @@ def test_blocks_of_one_are_projected_gauss_seidel(device):
 @pytest.mark.parametrize("sub_solver", [None, wl.MinimumMapNewton(), Lemke()])
 def test_one_block_is_its_solver(sub_solver, device):
     rng = np.random.default_rng(157)
-    A, b = spd(25, 4), rng.standard_normal(25)
-    for operator in operators(A, device):
+    A, b = spd(25, 4, 0.2), rng.standard_normal(25)
+    for operator in dense_and_sparse(A, device):
         result = wl.solve(
             wl.LCP(operator, b),
             BlockedGaussSeidel(blocks=25, sub_solver=sub_solver, eta=1e-12),
@@ -127,9 +117,9 @@ def test_strong_coupling_inside_blocks_costs_no_sweeps(device):
     """
     pairs, rng = 10, np.random.default_rng(163)
     A = np.kron(np.eye(pairs), [[1.0, 0.999], [0.999, 1.0]])
-    A += 1e-4 * spd(2 * pairs, 5)
+    A += 1e-4 * spd(2 * pairs, 5, 0.2)
     b = -A @ rng.uniform(0.1, 1.0, 2 * pairs)
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         problem = wl.LCP(operator, b)
         blocks = wl.solve(problem, BlockedGaussSeidel(blocks=2), stopping=TIGHT)
         scalar = wl.solve(
@@ -176,7 +166,7 @@ def test_unsymmetric_blocks_read_rows_not_columns(device):
     rng = np.random.default_rng(167)
     A = rng.uniform(-1, 1, (12, 12)) / 4 + 2 * np.eye(12)
     b = rng.standard_normal(12)
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         for blocks, sub_solver in ((3, None), (5, None), (7, None), (4, Lemke())):
             result = wl.solve(
                 wl.LCP(operator, b),

@@ -304,12 +304,11 @@ def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision)
         wl.LowRankOperator(U, [weight] * 2, device="cpu"),
     )
     criteria = wl.StoppingCriteria(rtol=1e-6)
-    for _ in range(2):
-        result = wl.solve(
-            wl.LCP(A, b, lower), wl.ProjectedMultigrid(precision=precision), stopping=criteria
-        )
-        assert result, result.status
-        assert result.iterations <= 40
+    result = wl.solve(
+        wl.LCP(A, b, lower), wl.ProjectedMultigrid(precision=precision), stopping=criteria
+    )
+    assert result, result.status
+    assert result.iterations <= 40
     u = U.reshape(-1, 2)[fluid]
     matrix = assemble(cells)[np.ix_(fluid, fluid)] + weight * u @ u.T
     fields = b.ravel()[fluid], lower.ravel()[fluid], np.full(fluid.sum(), np.inf)

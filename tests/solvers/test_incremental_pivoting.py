@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
+from matrices import planted_solution
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting, PrincipalInverse
 
@@ -33,18 +34,12 @@ def semidefinite(rng, n, zeros):
     return (A + A.T) / 2
 
 
-def planted(A, rng):
-    held = rng.random(len(A)) < 0.5
-    x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))
-    return np.where(held, rng.uniform(0.1, 1.0, len(A)), 0.0) - A @ x
-
-
 @pytest.mark.parametrize("zeros", [0.0, 0.2, 0.5, 0.8])
 def test_semidefinite_problems(zeros):
     rng = np.random.default_rng(int(700 + 10 * zeros))
     for _ in range(20):
         A = semidefinite(rng, 60, zeros)
-        b = planted(A, rng)
+        b = planted_solution(A, rng, 0.5)[0]
         result = solve(A, b)
         assert result, result.status
         x = result.x.numpy()
@@ -109,7 +104,7 @@ def test_degenerate_problem_does_not_cycle():
 def test_warm_start_needs_few_pivots():
     rng = np.random.default_rng(727)
     A = semidefinite(rng, 60, 0.0) + 0.1 * np.eye(60)
-    b = planted(A, rng)
+    b = planted_solution(A, rng, 0.5)[0]
     cold = solve(A, b)
     warm = solve(A, b + 1e-3 * rng.standard_normal(60), x0=cold.x.numpy())
     assert warm
@@ -123,7 +118,7 @@ def test_a_pivot_is_a_step_where_asked_for():
     """
     rng = np.random.default_rng(733)
     A = semidefinite(rng, 40, 0.0) + 0.1 * np.eye(40)
-    b = planted(A, rng)
+    b = planted_solution(A, rng, 0.5)[0]
     single = IncrementalPivoting(pivots_per_step=1)
     result = solve(A, b, solver=single)
     assert result
@@ -143,7 +138,7 @@ def test_a_pivot_is_a_step_where_asked_for():
 def test_patience_does_not_end_a_sequence_of_pivots():
     rng = np.random.default_rng(739)
     A = semidefinite(rng, 60, 0.5)
-    b = planted(A, rng)
+    b = planted_solution(A, rng, 0.5)[0]
     stopping = wl.StoppingCriteria(rtol=1e-8, max_iterations=1000, patience=1, divergence=1.001)
     assert solve(A, b, solver=IncrementalPivoting(pivots_per_step=1), stopping=stopping)
 

@@ -5,10 +5,10 @@ They are solved by the proximal-point method, and by the fallbacks of active-set
 
 import numpy as np
 import pytest
-import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import posed
 from oracle import lemke, natural_residual
 from warp_lcp.gallery import semidefinite
 
@@ -16,15 +16,6 @@ METHODS = [wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
 NAMES = ["newton", "active-set"]
 ALL, ALL_NAMES = [*METHODS, wl.ProximalPoint()], [*NAMES, "proximal-point"]
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-
-
-def problem(A, b, kind, lower=0.0, upper=np.inf):
-    operator = (
-        wl.DenseOperator(A, device="cpu")
-        if kind == "dense"
-        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
-    )
-    return wl.LCP(operator, b, lower, upper)
 
 
 def solved(p, method, **more):
@@ -56,7 +47,7 @@ def test_a_quarter_turn(kind, method):
     Free blocks of one unknown are 0, and active-set methods alone stay at x = 0.
     """
     result = solved(
-        problem(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9)
+        posed(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9)
     )
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), [1.0, 1.0], atol=1e-8)
@@ -67,8 +58,8 @@ def test_a_quarter_turn(kind, method):
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
 def test_no_solution_is_proved(b, kind, method):
-    """Proof of no solution: y_2 = -x_1 - 1 < 0 for every x >= 0."""
-    assert solved(problem(TURN, np.array(b), kind), method).status is wl.SolveStatus.INFEASIBLE
+    """y_2 = -x_1 - 1 < 0 whatever x >= 0 is."""
+    assert solved(posed(TURN, np.array(b), kind), method).status is wl.SolveStatus.INFEASIBLE
 
 
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
@@ -77,7 +68,7 @@ def test_linear_programs(kind, method):
     rng = np.random.default_rng(97)
     for _ in range(6):
         A, b = program(rng, 6, 9)
-        result = solved(problem(A, b, kind), method)
+        result = solved(posed(A, b, kind), method)
         assert result, result.status
         x, c, h = result.x.numpy(), b[:9], -b[9:]
         assert x.min() >= -1e-6
@@ -94,7 +85,7 @@ def test_semidefinite_matrices_are_solved(zeros, method):
     """
     for seed in range(10):
         p = semidefinite(100, zeros=zeros, seed=seed)
-        result = solved(problem(p.A, p.b, "dense"), method)
+        result = solved(posed(p.A, p.b, "dense"), method)
         assert result, (seed, result.status)
         assert result.residual == pytest.approx(
             natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()), rel=1e-6, abs=1e-14
@@ -108,7 +99,7 @@ def test_regular_problems_take_no_proximal_step():
     B = rng.standard_normal((30, 30))
     A, b = B @ B.T / 30 + 0.1 * np.eye(30), rng.standard_normal(30)
     for method in METHODS:
-        result = solved(problem(A, b, "dense"), method, stopping=wl.StoppingCriteria(rtol=1e-10))
+        result = solved(posed(A, b, "dense"), method, stopping=wl.StoppingCriteria(rtol=1e-10))
         assert "proximal point" not in {r.step for r in result.history}
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-8)
 
@@ -116,7 +107,7 @@ def test_regular_problems_take_no_proximal_step():
 def test_the_rounding_floor_is_no_reason_for_it():
     rng = np.random.default_rng(103)
     B = rng.standard_normal((30, 30))
-    p = problem(B @ B.T / 30 + 0.1 * np.eye(30), rng.standard_normal(30), "dense")
+    p = posed(B @ B.T / 30 + 0.1 * np.eye(30), rng.standard_normal(30), "dense")
     result = solved(p, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-30))
     assert result.status is wl.SolveStatus.FLOOR
     assert "proximal point" not in {r.step for r in result.history}
@@ -139,7 +130,7 @@ def test_the_method_alone_against_lemke(kind):
     for seed in range(3):
         p = semidefinite(40, zeros=0.5, seed=seed)
         result = wl.solve(
-            problem(p.A, p.b, kind),
+            posed(p.A, p.b, kind),
             wl.ProximalPoint(),
             stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=400),
         )
@@ -174,12 +165,8 @@ def test_a_workspace_begins_anew():
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_solution_nearest_to_the_start_is_found(kind):
-    """Solution nearest to the start.
-
-    A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2
-    stays 8.
-    """
-    p = problem(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([-1.0, 1.0]), kind)
+    """A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2 stays 8."""
+    p = posed(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([-1.0, 1.0]), kind)
     result = wl.solve(
         p, wl.ProximalPoint(), x0=np.array([5.0, 3.0]), stopping=wl.StoppingCriteria(rtol=1e-9)
     )

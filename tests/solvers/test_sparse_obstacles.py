@@ -10,15 +10,8 @@ import scipy.spatial
 import warp as wp
 
 import warp_lcp as wl
+from matrices import laplacian
 from warp_lcp.multigrid.aggregates import coarse_points
-
-
-def laplacian(n):
-    second, one = (
-        scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)),
-        scipy.sparse.eye_array(n),
-    )
-    return (scipy.sparse.kron(one, second) + scipy.sparse.kron(second, one)).tocsr()
 
 
 def nodes(n):

@@ -6,6 +6,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import spd
 from oracle import assemble, lemke
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.staggering import Staggering
@@ -13,15 +14,10 @@ from warp_lcp.solvers.staggering import Staggering
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=500, patience=100)
 
 
-def spd(n, seed, shift=0.5):
-    B = np.random.default_rng(seed).standard_normal((n, n))
-    return B @ B.T / n + shift * np.eye(n)
-
-
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_blocks_with_a_method_each(count, device):
     rng = np.random.default_rng(179)
-    A, b = spd(24, 7), rng.standard_normal(24)
+    A, b = spd(24, 7, 0.5), rng.standard_normal(24)
     blocks = np.array_split(rng.permutation(24), count)
     solvers = [Lemke(), wl.ProjectedSOR(), wl.MinimumMapNewton(), wl.ProjectedSOR(omega=1.0)][
         :count
@@ -67,7 +63,7 @@ def test_grid_blocks_are_grids(device):
 
 def test_operators_that_change_in_place_are_taken_again(device):
     rng = np.random.default_rng(193)
-    matrices = [scipy.sparse.csr_array(spd(12, seed)) for seed in (8, 9)]
+    matrices = [scipy.sparse.csr_array(spd(12, seed, 0.5)) for seed in (8, 9)]
     A = wl.SparseOperator(matrices[0], device=device)
     b = rng.standard_normal(12)
     problem, solver = wl.LCP(A, b), Staggering()
@@ -128,7 +124,8 @@ def test_what_cannot_be_taken_apart_is_refused():
 
 def test_one_method_serves_all_blocks():
     problem = wl.LCP(
-        wl.DenseOperator(spd(8, 3), device="cpu"), np.random.default_rng(197).standard_normal(8)
+        wl.DenseOperator(spd(8, 3, 0.5), device="cpu"),
+        np.random.default_rng(197).standard_normal(8),
     )
     alone, listed = (
         wl.solve(problem, Staggering(solvers=solvers), stopping=TIGHT)

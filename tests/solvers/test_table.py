@@ -4,6 +4,7 @@ Against oracles; new methods are included automatically.
 """
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ FAMILIES = ("dense", "sparse", "grid")
 BOUNDS = ("lcp", "box", "mixed")
 RTOL = {"mixed": 1e-8, "double": 1e-8, "single": 1e-4}
 CRITERIA = {"max_iterations": 20_000, "patience": 2000}
-MANY = 30  # number of unknowns, for methods that take as many
+EMULATED = "emulated_cuda" in sys.modules
+MANY = 30  # unknowns, for methods that take as many
 
 
 def precisions(cls):
@@ -34,11 +36,16 @@ def cases():
             for bounds in BOUNDS:
                 for precision in precisions(cls):
                     if family in families(cls) and (bounds == "lcp" or getattr(cls, "boxed", True)):
+                        # emulated, what blocks of threads do to each other is the same in each type
+                        marks = (
+                            pytest.mark.slow if EMULATED and precision != precisions(cls)[0] else ()
+                        )
                         yield pytest.param(
                             name,
                             family,
                             bounds,
                             precision,
+                            marks=marks,
                             id=f"{name}-{family}-{bounds}-{precision}",
                         )
 

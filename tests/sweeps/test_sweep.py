@@ -10,6 +10,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import dense_and_sparse, spd
 from oracle import assemble, boxed
 from warp_lcp import gallery
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
@@ -27,17 +28,6 @@ SCALAR = {
     "nncg": NNCG(),
     "blocks": BlockedGaussSeidel(blocks=1),
 }
-
-
-def spd(n, seed):
-    B = np.random.default_rng(seed).standard_normal((n, n))
-    return B @ B.T / n + np.eye(n)
-
-
-def operators(A, device):
-    return wl.DenseOperator(A, device=device), wl.SparseOperator(
-        scipy.sparse.csr_array(A), device=device
-    )
 
 
 def swept(A, b, x, order, omega):
@@ -81,10 +71,10 @@ def test_one_sweep_is_the_loop_of_its_definition(name, device):
     value, as scalar ones do.
     """
     rng = np.random.default_rng(77)
-    A, b, x = spd(9, 5), rng.standard_normal(9), rng.random(9)
+    A, b, x = spd(9, 5, 1.0), rng.standard_normal(9), rng.random(9)
     solver, order = ORDERS[name]
     expected = swept(A, b, x.copy(), order(x), 1.3)
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         problem = wl.LCP(operator, b)
         work = solver.init(problem)
         work.residual.start(work.x, keep=False)
@@ -96,8 +86,8 @@ def test_one_sweep_is_the_loop_of_its_definition(name, device):
 
 def test_greedy_sweeps_take_the_row_that_would_change_most(device):
     rng = np.random.default_rng(79)
-    A, b = spd(9, 6), rng.standard_normal(9)
-    for operator in operators(A, device):
+    A, b = spd(9, 6, 1.0), rng.standard_normal(9)
+    for operator in dense_and_sparse(A, device):
         result = wl.solve(
             wl.LCP(operator, b), wl.ProjectedSOR(omega=1.1, order="greedy"), stopping=ONE
         )
@@ -133,7 +123,7 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
     solution.
     """
     A = np.diag([0.0, 2.0])
-    for operator in operators(A, device):
+    for operator in dense_and_sparse(A, device):
         result = wl.solve(
             wl.LCP(operator, np.array([b, -1.0]), -1.0, 3.0), SCALAR[name], stopping=TIGHT
         )
@@ -146,12 +136,8 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
 
 @pytest.mark.parametrize("name", SCALAR)
 def test_negative_diagonal_goes_to_the_bound_of_lesser_energy(name, device):
-    """Negative diagonal: x at the bound of lower energy.
-
-    For -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6; the rule
-    of the upright parabola stays inside.
-    """
-    for operator in operators(np.array([[-1.0]]), device):
+    """Of -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6: the upright parabola's rule stays inside."""
+    for operator in dense_and_sparse(np.array([[-1.0]]), device):
         result = wl.solve(
             wl.LCP(operator, np.array([0.2]), -1.0, 2.0), SCALAR[name], stopping=TIGHT
         )
@@ -303,7 +289,7 @@ def test_grids_are_swept_by_the_advised_omega(device):
     assert found.iterations == advised.iterations <= 80
     assert np.array_equal(found.x.numpy(), advised.x.numpy())
     assert book.iterations >= 2.5 * found.iterations
-    for A in operators(spd(9, 5), device):
+    for A in dense_and_sparse(spd(9, 5, 1.0), device):
         matrix = wl.LCP(A, np.linspace(-1, 1, 9))
         one, other = (
             wl.solve(matrix, wl.ProjectedSOR(omega=w), stopping=LOOSE) for w in (None, 1.4)
@@ -355,10 +341,10 @@ def test_advised_omega_of_a_free_set_is_that_of_its_block():
 
 
 def test_spectrum_is_that_of_the_scaled_matrix():
-    A = spd(12, 11) * np.outer(np.arange(1, 13), np.arange(1, 13))
+    A = spd(12, 11, 1.0) * np.outer(np.arange(1, 13), np.arange(1, 13))
     d = np.sqrt(np.diag(A))
     values = np.linalg.eigvalsh(A / np.outer(d, d))
-    for operator in operators(A, "cpu"):
+    for operator in dense_and_sparse(A, "cpu"):
         assert scaled_spectrum(wl.LCP(operator, np.ones(12)), 12) == pytest.approx(
             (values[0], values[-1]), rel=1e-8
         )

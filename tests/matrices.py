@@ -1,0 +1,56 @@
+"""Matrices of tests, as NumPy and SciPy have them, and what is posed with them."""
+
+import numpy as np
+import scipy.sparse
+
+import warp_lcp as wl
+
+
+def spd(n, seed, shift):
+    """Return a random symmetric positive definite matrix whose eigenvalues are at least `shift`, shape (n, n)."""
+    B = np.random.default_rng(seed).standard_normal((n, n))
+    return B @ B.T / n + shift * np.eye(n)
+
+
+def poisson(*counts):
+    """Return the stencil of 2 d on the diagonal and -1 to each neighbor, held at 0 outside, as a CSR matrix."""
+    A = scipy.sparse.csr_array((1, 1))
+    for n in counts:
+        T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
+        A = scipy.sparse.kron(A, scipy.sparse.eye_array(n)) + scipy.sparse.kron(
+            scipy.sparse.eye_array(A.shape[0]), T
+        )
+    return scipy.sparse.csr_array(A)
+
+
+def laplacian(n, diagonal=2.0):
+    """Return the five-point stencil on n x n points, -1 to each neighbor and twice `diagonal` in the middle, as a CSR matrix."""
+    T, one = (
+        scipy.sparse.diags_array([-1.0, diagonal, -1.0], offsets=[-1, 0, 1], shape=(n, n)),
+        scipy.sparse.eye_array(n),
+    )
+    return scipy.sparse.csr_array(scipy.sparse.kron(one, T) + scipy.sparse.kron(T, one))
+
+
+def dense_and_sparse(A, device):
+    """Return both operators of a matrix."""
+    return wl.DenseOperator(A, device=device), wl.SparseOperator(
+        scipy.sparse.csr_array(A), device=device
+    )
+
+
+def posed(A, b, kind, lower=0.0, upper=np.inf):
+    """Return the problem of a matrix as an operator of a kind, "dense" or "sparse"."""
+    operator = (
+        wl.DenseOperator(A, device="cpu")
+        if kind == "dense"
+        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    )
+    return wl.LCP(operator, b, lower, upper)
+
+
+def planted_solution(A, rng, share):
+    """Return b and a strictly complementary solution x of A x + b = y, of which a share of the unknowns is at 0."""
+    held = rng.random(len(A)) < share
+    x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))
+    return np.where(held, rng.uniform(0.1, 1.0, len(A)), 0.0) - A @ x, x
