@@ -8,10 +8,10 @@ lost, as it is there, and recorded programs launch what a graph would hold.
 
 With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels
 whose results depend on it and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of
-cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory: `launched_by_cells`
-counts such launches, `otherwise` those whose fields differ in a bit, or whose sums differ by more
-than rounding. `meter` counts launches, readbacks and allocations, and calls: of Python, to launch,
-copy or clear, one for a whole graph.
+cells (`warp_lcp/rows/headers/quad.h`), which are loaded in blocks where rows allow it, also runs by
+cells, from equal memory: `launched_by_cells` counts such launches, `otherwise` those whose fields
+differ in a bit, or whose sums differ by more than rounding. `meter` counts launches, readbacks and
+allocations, and calls: of Python, to launch, copy or clear, one for a whole graph.
 
 What it cannot show: torn interleavings and the memory model (threads run one after another),
 graphs' own rules, the order of streams.
@@ -359,9 +359,7 @@ def equal_bits(one, other, kind):
     """Return whether two arrays of a type have the same bits; every NaN counts as the same."""
     if one == other or kind not in (wp.float32, wp.float64):
         return one == other
-    a, b = (
-        np.frombuffer(data, dtype=wp.types.warp_type_to_np_dtype[kind]) for data in (one, other)
-    )
+    a, b = (np.frombuffer(data, dtype=wp.dtype_to_numpy(kind)) for data in (one, other))
     either = np.isnan(a) | np.isnan(b)
     return np.array_equal(np.isnan(a), np.isnan(b)) and a[~either].tobytes() == b[~either].tobytes()
 
@@ -388,11 +386,12 @@ if COMPARE:
 
 def replayed():
     """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
-    from warp_lcp.rows import device_graph, host_kernel, joined
+    from warp_lcp.rows import device_graph, host_kernel, joined, layout
     from warp_lcp.rows.program import LaunchGraph, Loop, Program
 
     if CELLS:
         context.invoke = checked_by_cells(context.invoke)
+        layout.MANY_CELLS_OF_BLOCKS = 1  # all quads are loaded in blocks where rows allow it
 
     class HostGraph(LaunchGraph):
         """Kernels on the host's memory, which run at once on every machine: what waits for the device waits on."""
