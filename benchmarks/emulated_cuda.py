@@ -7,12 +7,12 @@ barriers. Threads and blocks run in an unusual order (ORDER = forward, reversed,
 `.numpy()` returns a copy, so that writes to it are lost, as on CUDA. Recorded programs launch what
 a graph would hold.
 
-With COMPARE=1 every launch runs in all three orders from equal memory. `differs` counts the kernels
-whose results depend on the order and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by
-quads of cells (`warp_lcp/rows/headers/quad.h`) also runs by cells, from equal memory.
-`launched_by_cells` counts such launches; `otherwise` counts those whose fields differ in a bit, or
-whose sums differ by more than rounding. `meter` counts launches, readbacks, allocations and calls.
-A call is one of Python to launch, copy or clear; a whole graph is one call.
+With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels
+whose results depend on it and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of
+cells (`warp_lcp/rows/headers/quad.h`), which are loaded in blocks where rows allow it, also runs by
+cells, from equal memory: `launched_by_cells` counts such launches, `otherwise` those whose fields
+differ in a bit, or whose sums differ by more than rounding. `meter` counts launches, readbacks and
+allocations, and calls: of Python, to launch, copy or clear, one for a whole graph.
 
 Not emulated: torn interleavings and the memory model (threads run one after another), rules of
 graphs, the order of streams.
@@ -380,9 +380,7 @@ def equal_bits(one, other, kind):
     """Return whether two arrays of a type have equal bits; all NaN are equal."""
     if one == other or kind not in (wp.float32, wp.float64):
         return one == other
-    a, b = (
-        np.frombuffer(data, dtype=wp.types.warp_type_to_np_dtype[kind]) for data in (one, other)
-    )
+    a, b = (np.frombuffer(data, dtype=wp.dtype_to_numpy(kind)) for data in (one, other))
     either = np.isnan(a) | np.isnan(b)
     return np.array_equal(np.isnan(a), np.isnan(b)) and a[~either].tobytes() == b[~either].tobytes()
 
@@ -408,15 +406,13 @@ if COMPARE:
 
 
 def replayed():
-    """Keep recorded commands and launch them in place of a graph.
-
-    Call this once the package can be imported. Loops of graphs read their conditions in place.
-    """
-    from warp_lcp.rows import device_graph, host_kernel, joined
+    """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
+    from warp_lcp.rows import device_graph, host_kernel, joined, layout
     from warp_lcp.rows.program import LaunchGraph, Loop, Program
 
     if CELLS:
         context.invoke = checked_by_cells(context.invoke)
+        layout.MANY_CELLS_OF_BLOCKS = 1  # all quads are loaded in blocks where rows allow it
 
     class HostGraph(LaunchGraph):
         """Launch graph in host memory.

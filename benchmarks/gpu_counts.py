@@ -2,10 +2,10 @@
 
 The passes over the finest grid are heard in CUDA's form (`benchmarks/emulated_cuda.py`), compiled
 for sm_90, and one warp of each is executed on the memory that the solve has left
-(`benchmarks/sass.py`). A pass takes as long as the slowest of: its instructions at one a clock and
-scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the bytes of
-its fields at `SHARE` of the bandwidth; and a latency of memory for each plane of a thread, as often
-as the multiprocessors are filled.
+(`benchmarks/machine_counts.py`). A pass takes as long as the slowest of: its instructions at one a
+clock and scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the
+bytes of its fields at `SHARE` of the bandwidth; and a latency of memory for each plane of a thread,
+as often as the multiprocessors are filled.
 """
 
 from benchmarks import emulated_cuda  # before the package
@@ -13,9 +13,10 @@ from benchmarks import emulated_cuda  # before the package
 # ruff: isort: split
 
 import math
+import re
 import struct
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.sass import Issued, Kernel, Memory, assemble, constants_of, issued, tools_missing
+from benchmarks.machine_code import Kernel, assemble, tools_missing
+from benchmarks.machine_counts import Issued, issued
+from benchmarks.machine_thread import Memory, constants_of
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.rows import RowPass, layout
 from warp_lcp.rows.row_pass import Bound
@@ -71,7 +74,8 @@ class Count:
         cells: that a thread takes, of the finer level of a transfer.
         planes: one after another, of these.
         registers: of a thread.
-        bytes: of the fields of a cell.
+        bytes: of a cell, of the fields that are read and of those that are written.
+        spilled: bytes of registers that a thread keeps in memory.
     """
 
     name: str
@@ -80,11 +84,17 @@ class Count:
     planes: int
     registers: int
     bytes: float
+    spilled: int = 0
 
     @property
     def a_cell(self) -> float:
         """Issued instructions a cell."""
         return self.issued.instructions / self.cells
+
+    @property
+    def key(self) -> str:
+        """Name without how threads take cells."""
+        return key(self.name)
 
     def resident(self, gpu: Gpu) -> int:
         """Return the warps that a multiprocessor holds."""
@@ -103,6 +113,18 @@ class Count:
             "bytes": self.bytes * cells / (SHARE * gpu.bandwidth * 1e6),
             "latency": turns * self.planes * LATENCY / (gpu.clock * 1e6),
         }
+
+
+def key(name: str) -> str:
+    """Return the name of a pass without how threads take cells: the same on small grids and large."""
+    return " ".join(
+        word for word in name.split() if not re.fullmatch(r"quads|(at|of)\d(or\d)?", word)
+    )
+
+
+def kinds(given: dict[str, Any]) -> str:
+    """Return what of a pass's arguments decides how much it does, as an end of its name."""
+    return "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
 
 
 def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
@@ -142,41 +164,47 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
         heard.append((Heard(bound, fields), bound.given))
         return bound
 
-    many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1)
+    many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1, MANY_CELLS_OF_BLOCKS=1)
     with many, mock.patch.object(RowPass, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
-        for method, lower in (
-            (wl.ProjectedMultigrid(), np.where(wall, 0.0, -np.inf)),
-            (wl.ProjectedMultigrid(), -np.inf),
-        ):
-            wl.solve(
-                wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower), method, stopping=stopping
-            )
         lower = np.where(wall, 0.0, -np.inf)
-        wl.solve(
-            wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower),
-            wl.MinimumMapNewton(),
-            stopping=stopping,
-        )
+        # fields of weights, as coarser levels have
+        faces = np.full((*SHAPE[:2], SHAPE[2] + 1), 0.5)
+        multigrid, newton = wl.ProjectedMultigrid(), wl.MinimumMapNewton()
+        for method, least, face_x in (
+            (multigrid, lower, 1.0),
+            (multigrid, -np.inf, 1.0),
+            (newton, lower, 1.0),
+            (multigrid, lower, faces),
+            (multigrid, -np.inf, faces),
+            (newton, lower, faces),
+        ):
+            A = wl.GridPoisson(cells, device="cpu", face_x=face_x)
+            wl.solve(wl.LCP(A, b, least), method, stopping=stopping)
         A = wl.GridPoisson(cells, device="cpu")
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
         A.stencil.product(x, wp.zeros_like(x))
     found: dict[str, tuple[Heard, dict[str, Any]]] = {}
     for one, given in heard:
         rows, declared = one.bound.rows, one.bound.form.declared
-        kinds = "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
         if max(rows.size, rows.other_size) == A.layout.size and not (
             declared.box or declared.listed
         ):
-            found.setdefault(one.name + kinds, (one, given))
+            found.setdefault(one.name + kinds(given), (one, given))
     return found
+
+
+def cells_of(bound: Bound) -> int:
+    """Return how many cells, or entries of a list, a pass visits; with ghosts those of the larger grid of a transfer."""
+    rows, L = bound.rows, bound.layout
+    return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
 def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Count:
     """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
     Raises:
-        NotImplementedError: it has an instruction that `benchmarks.sass` does not know.
+        NotImplementedError: it has an instruction that `benchmarks.machine_thread` does not know.
         KeyError: it reads what is not among its fields.
     """
     form, rows = one.bound.form, one.bound.layout
@@ -207,17 +235,20 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Count:
     ratio = max(one.bound.rows.other_size // size, 1) if size else 1
     finer = 8 if ratio > 4 else 1  # a thread takes an aggregate of the finer level
     cells = planes * (max(rows.grain, 1)) * finer
-    whole = max(size, one.bound.rows.other_size)
+    whole = cells_of(one.bound)
     apart = {*form.declared.by_row, *form.declared.whole, "out"}
-    moved = (
-        sum(
-            a.size * wp.types.type_size_in_bytes(a.dtype)
-            for n, a in one.fields.items()
-            if n not in apart
-        )
-        / whole
+    fields = {
+        int(a.ptr): a.size * wp.types.type_size_in_bytes(a.dtype)
+        for n, a in one.fields.items()
+        if n not in apart
+    }
+    moved = sum(
+        size
+        for reached in (found.read, found.written)
+        for begin, size in fields.items()
+        if any(begin <= address < begin + size for address in reached)
     )
-    return Count(name, found, cells, planes, kernel.registers, moved)
+    return Count(name, found, cells, planes, kernel.registers, moved / whole, kernel.spilled)
 
 
 def _compiled(form: Any, folder: Path) -> Kernel:
@@ -231,9 +262,7 @@ def _compiled(form: Any, folder: Path) -> Kernel:
     (ptx,) = place.glob("*.ptx")
     made = assemble(ptx.read_text(), place / "module.cubin")
     return next(
-        one
-        for one in made
-        if one.name.startswith(f"{form.name}_") and one.name.endswith("kernel_forward")
+        one for one in made if re.fullmatch(f"{form.name}_[0-9a-f]+_cuda_kernel_forward", one.name)
     )
 
 
@@ -250,15 +279,15 @@ def counts(words: tuple[str, ...] = AREAS) -> Iterator[Count]:
                     print(f"{name}: {error!r}")
 
 
-def table(n: int) -> Iterator[str]:
-    """Yield the lines of a table of all passes, with times over n^3 cells."""
+def table(found: Iterable[Count], n: int) -> Iterator[str]:
+    """Yield the lines of a table of passes, with times over n^3 cells."""
     times = " | ".join(f"{name} ms | limit" for name in GPUS)
     yield (
         "| pass | issued a cell | loads | stores | L1 wavefronts | bytes | registers | warps | "
         f"{times} |"
     )
     yield "|---" * (8 + 2 * len(GPUS)) + "|"
-    for one in counts():
+    for one in found:
         i, c = one.issued, one.cells
         cells = [f"{v / c:.1f}" for v in (i.instructions, i.loads, i.stores, i.wavefronts)]
         cells += [f"{one.bytes:.1f}", str(one.registers), str(one.resident(GPUS["H200"]))]

@@ -16,10 +16,10 @@ from benchmarks import emulated_cuda, gpu_counts  # before the package
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -57,6 +57,9 @@ class Work:
         bytes: of the fields that each launch declares.
         graph: which launches were in a graph.
         names: of the kernels.
+        keys: of passes, as `gpu_counts` names them.
+        cells: that they visit.
+        bounds: a launch of each pass, by key.
         stages: of small levels, each with a barrier.
         readbacks: how often the host waited.
     """
@@ -64,6 +67,9 @@ class Work:
     bytes: list[float] = field(default_factory=list)
     graph: list[bool] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
+    keys: list[str] = field(default_factory=list)
+    cells: list[float] = field(default_factory=list)
+    bounds: dict[str, Heard] = field(default_factory=dict)
     stages: int = 0
     readbacks: int = 0
 
@@ -81,14 +87,43 @@ class Work:
             / 1e3
         )
 
+    def terms(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.Count]) -> dict[str, float]:
+        """Return the time [ms] that each limit holds launches: that of a launch is the slowest one."""
+        found = {
+            "barriers": BARRIER * self.stages / 1e3,
+            "readbacks": READBACK * self.readbacks / 1e3,
+        }
+        for size, graph, key, cells in zip(
+            self.bytes, self.graph, self.keys, self.cells, strict=True
+        ):
+            one = counts.get(key)
+            by_bytes = {"bytes": size / (SHARE * gpu.bandwidth * 1e6)}
+            limits = by_bytes if one is None else one.limits(gpu, round(cells))
+            limits["launches"] = (RECORDED if graph else LAUNCHED) / 1e3
+            limit = max(limits, key=lambda name: limits[name])
+            found[limit] = found.get(limit, 0.0) + limits[limit]
+        return found
+
+    def uncounted(self, counts: dict[str, gpu_counts.Count]) -> float:
+        """Return the share of the bytes that passes move which have not been counted."""
+        moved = [size for size, key in zip(self.bytes, self.keys, strict=True) if key not in counts]
+        return sum(moved) / max(sum(self.bytes), 1.0)
+
     def grown(self, before: "Work", levels: int) -> "Work":
         """Return the work on a grid 2^levels times as fine; `before`: on one half as fine. Launches and stages grow by as many a level."""
         more = [b for b, g in zip(self.bytes, self.graph, strict=True) if g]
         added = max(len(self.bytes) - len(before.bytes), 0) * levels
         sizes = [b * 8.0**levels for b in self.bytes] + sorted(more)[len(more) // 2 :][:1] * added
-        graph, names = [*self.graph, *[True] * added], [*self.names, *["coarse"] * added]
         stages = self.stages + max(self.stages - before.stages, 0) * levels
-        return replace(self, bytes=sizes, graph=graph, names=names, stages=stages)
+        return replace(
+            self,
+            bytes=sizes,
+            graph=[*self.graph, *[True] * added],
+            names=[*self.names, *["coarse"] * added],
+            keys=[*self.keys, *[""] * added],
+            cells=[*(c * 8.0**levels for c in self.cells), *[0.0] * added],
+            stages=stages,
+        )
 
     def passes(self, most: int = 12) -> str:
         """Return a table of the kernels that move most."""
@@ -102,6 +137,16 @@ class Work:
         return "\n".join(["| kernel | launches | share of the bytes |", "|---|---|---|", *rows])
 
 
+class Launched(NamedTuple):
+    """A launch: bytes of its fields, barriers, and of a pass its name and its cells; the kernel's name."""
+
+    bytes: float
+    stages: int
+    key: str = ""
+    cells: float = 0.0
+    name: str = ""
+
+
 def name_of(kernel: Any) -> str:
     """Return a kernel's module, without the package, and its name."""
     return f"{kernel.module.name.removeprefix('warp_lcp.')}:{kernel.key}"
@@ -110,21 +155,21 @@ def name_of(kernel: Any) -> str:
 def heard(make: Callable[[], Callable[[], object]]) -> Work:
     """Return what a call launches; `make` returns it, and is heard itself, for what is made in the first run is replayed by later ones."""
     given: dict[int, tuple[Bound, Heard]] = {}
-    tags: dict[int, tuple[Any, float, int, str]] = {}
-    bind, launch_bound, launch_sequence = RowPass.bind, Bound.launch, Sequence.launch
+    tags: dict[int, tuple[Any, Launched]] = {}
+    bind, launch_bound, launch_sequence = RowPass.bind_arguments, Bound.launch, Sequence.launch
     plain, replay = wp.launch, wp.Launch.launch
-    current: list[tuple[float, int]] = []
+    current: list[Launched] = []
     found = Work()
 
     def binding(
         declared: RowPass,
         rows: Any,
-        *structs: Any,
+        structs: Any,
+        arguments: dict[str, Any],
         stencil: Any = None,
         bounds: Any = None,
-        **arguments: Any,
     ) -> Bound:
-        bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **arguments)
+        bound = bind(declared, rows, structs, arguments, stencil, bounds)
         taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
@@ -141,14 +186,19 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
 
     def launching(bound: Bound, *args: Any) -> None:
         known = given.get(id(bound))
-        current.append(
-            (sum(known[1].reads.values()) + sum(known[1].writes.values()) if known else 0.0, 0)
-        )
+        launched = Launched(0.0, 0)
+        if known:
+            one = known[1]
+            moved = float(sum(one.reads.values()) + sum(one.writes.values()))
+            key = gpu_counts.key(one.name + gpu_counts.kinds(bound.given))
+            launched = Launched(moved, 0, key, gpu_counts.cells_of(bound))
+            found.bounds[key] = one
+        current.append(launched)
         launch_bound(bound, *args)
         current.pop()
 
     def sequencing(sequence: Sequence, *args: Any) -> None:
-        current.append((0.0, len(sequence._stages)))
+        current.append(Launched(0.0, len(sequence._stages)))
         launch_sequence(sequence, *args)
         current.pop()
 
@@ -161,31 +211,30 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         **options: Any,
     ) -> Any:
         arrays = [a for a in inputs if isinstance(a, wp.array)]  # of a kernel that is no pass
-        cost = (
-            current[-1]
-            if current
-            else (float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays)), 0)
-        )
+        moved = float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays))
+        launched = (current[-1] if current else Launched(moved, 0))._replace(name=name_of(kernel))
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
         if record_cmd:
-            tags[id(made)] = made, *cost, name_of(kernel)
+            tags[id(made)] = made, launched
         else:
-            note(*cost, name_of(kernel), graph=False)
+            note(launched, graph=False)
         return made
 
     def replaying(command: Any, *args: Any) -> None:
         replay(command, *args)
-        _, size, stages, name = tags.get(id(command), (None, 0.0, 0, ""))
-        note(size, stages, name, graph=True)
+        _, launched = tags.get(id(command), (None, Launched(0.0, 0)))
+        note(launched, graph=True)
 
-    def note(size: float, stages: int, name: str, *, graph: bool) -> None:
-        found.bytes.append(size)
+    def note(launched: Launched, *, graph: bool) -> None:
+        found.bytes.append(launched.bytes)
         found.graph.append(graph)
-        found.names.append(name)
-        found.stages += stages
+        found.names.append(launched.name)
+        found.keys.append(launched.key)
+        found.cells.append(launched.cells)
+        found.stages += launched.stages
 
     patches = (
-        mock.patch.object(RowPass, "bind", binding),
+        mock.patch.object(RowPass, "bind_arguments", binding),
         mock.patch.object(Bound, "launch", launching),
         mock.patch.object(Sequence, "launch", sequencing),
         mock.patch.object(wp, "launch", launch),
@@ -195,7 +244,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         patch.start()
     work = make()
     work()
-    for kept in (found.bytes, found.graph, found.names):
+    for kept in (found.bytes, found.graph, found.names, found.keys, found.cells):
         kept.clear()
     found.stages = 0
     emulated_cuda.meter.clear()
@@ -260,6 +309,32 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
     return "\n".join(lines)
 
 
+def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.Count]) -> str:
+    """Return a table of what holds solves on GPUs, from the work at n / 2 and at n and counted passes."""
+    names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
+    lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
+    for size in (s for s in SIZES[:3] if s >= n // 2):
+        work = (
+            large.grown(small, int(np.log2(size / n)))
+            if size > n
+            else large
+            if size == n
+            else small
+        )
+        for name, gpu in gpu_counts.GPUS.items():
+            terms = work.terms(gpu, counts)
+            columns = " | ".join(f"{terms.get(term, 0.0):.2f}" for term in names)
+            lines.append(f"| {size}^3 | {name} | {sum(terms.values()):.1f} | {columns} |")
+    return "\n".join(lines)
+
+
+def counted(counts: dict[str, gpu_counts.Count]) -> Iterator[gpu_counts.Count]:
+    """Count passes, and note each by its key."""
+    for one in gpu_counts.counts():
+        counts[one.key] = one
+        yield one
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(
@@ -280,14 +355,32 @@ def main() -> None:
         default=256,
         help="of --sass: times are of passes over so many cells along each axis",
     )
+    parser.add_argument(
+        "--solves",
+        action="store_true",
+        help="of --sass: whole solves, too, each launch by its slowest limit",
+    )
     given = parser.parse_args()
     if given.sass:
         print(
             f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as "
             "predicted\n"
         )
-        for line in gpu_counts.table(given.size):
+        counts = dict[str, gpu_counts.Count]()
+        for line in gpu_counts.table(counted(counts), given.size):
             print(line, flush=True)
+        if given.solves:
+            n = given.cells
+            (small, _), (large, iterations) = solve(n // 2), solve(n)
+            print(
+                f"\nA cold solve to 1e-6: {iterations} iterations; what holds it, and for how long "
+                "[ms]\n"
+            )
+            print(limits_table(small, large, n, counts))
+            print(
+                f"\nOf the bytes {large.uncounted(counts):.1%} are of passes that have not been "
+                "counted."
+            )
         return
     n, cells = given.cells, given.step_cells or given.cells
     (small, _), (large, iterations) = solve(n // 2), solve(n)

@@ -31,6 +31,7 @@ from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.rows import Rows
+from warp_lcp.rows.layout import Alignment
 from warp_lcp.rows.native import sections
 from warp_lcp.rows.pass_form import Form
 from warp_lcp.rows.row_pass import RowPass
@@ -45,6 +46,8 @@ ONE_LAUNCH = [
     CycleSettings(one_launch_cpu=4096),
     CycleSettings(one_launch_cpu=4096, coarsest_cpu=8),
 ]
+EVERY_SECOND = Alignment(1, either=True)  # as rows of an even number of cells begin
+IN_BLOCKS = EVERY_SECOND, EVERY_SECOND
 METHODS = [
     wl.MinimumMapNewton(),
     wl.MinimumMapNewton(precision="double"),
@@ -390,7 +393,8 @@ def modules_of_every_kernel(reals):
     for form in [made for made in gc.get_objects() if isinstance(made, Form)]:
         assert form.kernel  # kernel of the pass alone, which the CPU launches in waves
         if form.by_quads:
-            assert form.by_quads.kernel  # its replacement on CUDA
+            assert form.by_quads.kernel  # in place of it on CUDA
+            assert form.with_quads(IN_BLOCKS).kernel  # and on large grids
     from warp._src.context import user_modules
 
     return sorted(
@@ -446,7 +450,8 @@ def compile_for_cuda(name, archs, folder):
     from warp._src.context import user_modules
 
     module = user_modules[name]
-    bounds = {kernel.options.get("launch_bounds", CUDA_BLOCK) for kernel in module.kernels.values()}
+    given = {kernel.options.get("launch_bounds", CUDA_BLOCK) for kernel in module.kernels.values()}
+    bounds = {bound if isinstance(bound, int) else bound[0] for bound in given}
     module.options["block_dim"], *others = bounds
     assert not others, f"{name}: kernels of blocks of {bounds} threads"
     wp.compile_aot_module(name, device=None, arch=archs, module_dir=folder, use_ptx=True)

@@ -13,7 +13,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.multigrid import CycleSettings
-from warp_lcp.rows import Rows
+from warp_lcp.rows import Rows, layout
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.layout import copy_of, put
@@ -26,14 +26,13 @@ SEEDS = [1, 2, int(os.environ.get("SEED", "3414447061"))]  # SEED=... draws othe
 WIDTHS = (1, 2, 3, 4, 5, 7, 8, 11, 13, 18, 30)
 
 
-@pytest.fixture
-def checked(monkeypatch):
-    """Run each quad pass by cells as well.
-
-    Return the counts of launches and of differences.
-    """
+@pytest.fixture(params=[1, 1 << 18], ids=["blocks", "single loads"])
+def checked(monkeypatch, request):
+    """Have each pass by quads run by cells as well; return the counts of launches and of differences."""
     from benchmarks import emulated_cuda
 
+    monkeypatch.setattr(layout, "MANY_CELLS_OF_BLOCKS", request.param)
+    layout._flat.cache_clear()
     monkeypatch.setattr(
         emulated_cuda.context,
         "invoke",
@@ -43,6 +42,7 @@ def checked(monkeypatch):
     emulated_cuda.launched_by_cells.clear()
     yield emulated_cuda.launched_by_cells, emulated_cuda.otherwise
     emulated_cuda.otherwise.clear()
+    layout._flat.cache_clear()
 
 
 def drawn_problem(seed):
@@ -112,18 +112,15 @@ HEADER = """// Kernels of a test.
 double products = 0, most = -1e300; int total = 0;
 for (int k = 0; k < n; ++k) {
     total += (int)x[k]; products += x[k]*(y ? y[k] : 1.0); most = x[k] > most ? x[k] : most;
-    z[k] = x[k-1] + 10*x[k+1] + 100*x[k+ym] + 1000*(x + yp)[k] + 10000*x[k+zm] + 100000*x[k+zp]; }
+    z[k] = x[k-1] + 10*x[k+1] + 100*x[k+ym] + 1000*(x + yp)[k] + 10000*(x + zm)[k] + 100000*x[k+zp]; }
 for (int k = 0; k < n; ++k) if (z[k] > 700000) { z[k] = -z[k]; changed[P.row] = 1; }
 """
 
 
 @EMULATED
 @pytest.mark.parametrize("seed", SEEDS)
-def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
-    """Equal sums of whole numbers.
-
-    They are exact in every order: no cell is left out, and none counts twice.
-    """
+def test_sums_of_whole_numbers_are_equal(seed, tmp_path, checked):
+    """Such sums are exact in every order: no cell is left out, and none counts twice."""
     (tmp_path / "quads.h").write_text(HEADER)
     kernel, rng, device = (
         KernelFile(tmp_path / "quads.h")["quads.whole"],
@@ -151,7 +148,7 @@ def test_sums_of_whole_numbers_are_equal(seed, tmp_path):
             z, changed = wp.full_like(x, -7.0), wp.zeros(shape[:2], dtype=wp.uint8, device=device)
             out = wp.full(3 * there.places, -1e9, dtype=wp.float64, device=device)
             bound = kernel.bind(there, x=x, y=y, z=z, changed=changed.flatten(), out=out)
-            assert bound.form.quads == (there is rows)
+            assert (bound.form.quads is not None) == (there is rows)
             bound.launch()
             sums = out.numpy().reshape(3, -1)
             found.append(

@@ -23,7 +23,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.joined import settle, waits
 from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
-from warp_lcp.rows.pass_form import task_of
+from warp_lcp.rows.pass_form import BLOCKS_OF_QUADS, task_of
 from warp_lcp.rows.program import Conditional, DeviceCopy, Loop, NotRecordable, Program, Task
 
 ALIGNED = 16  # bytes
@@ -78,7 +78,8 @@ def pass_from_memory(form: Any) -> Any:
     name = form.declared.name.rpartition(".")[2]
     from_memory.__name__ = from_memory.__qualname__ = name
     words = "_".join([form.declared.name, *form.words])
-    return Piece, forward_kernel(module=f"{run.module.name}.memory.{words}")(from_memory)
+    options = {"launch_bounds": BLOCKS_OF_QUADS} if form.quads else {}
+    return Piece, forward_kernel(module=f"{run.module.name}.memory.{words}", **options)(from_memory)
 
 
 _KERNELS: dict[Any, Any] = {}

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 import warp as wp
@@ -30,6 +30,37 @@ UNSUMMED_PLANES, MANY_CELLS = 4, 1 << 21
 # fewer cells: threads that take quads sum over as few planes, or they are too few to hide
 # latencies; as computed
 SUMMED_CELLS = 1 << 24
+
+
+# cells of a grid from which quads are loaded in blocks of 16 bytes: smaller grids are held by
+# latencies, and kernels of their alignments would have to be compiled for them
+MANY_CELLS_OF_BLOCKS = 1 << 18
+
+
+class Alignment(NamedTuple):
+    """Where the rows of a grid's fields begin.
+
+    Attributes:
+        first: elements between a multiple of four and the first cell of a row; -1: any number.
+        either: whether there are two more in every second row of a plane.
+    """
+
+    first: int = -1
+    either: bool = False
+
+    @property
+    def word(self) -> str:
+        """Name in kernels; empty where rows begin anywhere."""
+        return (
+            ""
+            if self.first < 0
+            else f"{self.first}or{self.first + 2}"
+            if self.either
+            else f"{self.first}"
+        )
+
+
+ANYWHERE = Alignment()
 
 
 @wp.struct
@@ -308,6 +339,7 @@ class Rows:
             rows are always these.
         quads: their layout for a pass on CUDA that does not sum and whose threads take quads of
             cells; threads that sum take as many there. None: threads take cells.
+        alignments: where rows of fields begin, and those of the other level.
     """
 
     summed: Any
@@ -320,6 +352,7 @@ class Rows:
     weight: int = 1
     memory: Any = None
     quads: Any = None
+    alignments: tuple[Alignment, Alignment] = (ANYWHERE, ANYWHERE)
 
     @staticmethod
     def of(
@@ -550,7 +583,9 @@ class Rows:
             )
         by_quads = put(copy_of(single), {"grain": QUAD, "chunks": -(-counts[2] // QUAD)})
         slab = UNSUMMED_PLANES if few else slab
-        return Rows(put(copy_of(by_quads), {"slab": slab}), single, size, 0, device, quads=by_quads)
+        alignments = _alignment(by_quads), ANYWHERE
+        summed = put(copy_of(by_quads), {"slab": slab})
+        return Rows(summed, single, size, 0, device, quads=by_quads, alignments=alignments)
 
     def beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
         """Return the same rows with another level's beside them.
@@ -590,7 +625,9 @@ class Rows:
         if not self.device.is_cpu and factors[0] < 0:
             members |= {"grain": -factors[0], "chunks": -(L.nx // factors[0])}
         single = put(copy_of(L), members)
-        return Rows(summed or single, single, self.size, other.size, self.device, quads=quads)
+        alignments = self.alignments[0], ANYWHERE if factors[0] < 0 else other.alignments[0]
+        made = Rows(summed or single, single, self.size, other.size, self.device, quads=quads)
+        return replace(made, alignments=alignments)
 
     @functools.cached_property
     def count(self) -> int:
@@ -602,6 +639,16 @@ class Rows:
         """How many sums a pass makes of each kind, one a thread."""
         planes, rows, chunks = threads(self.summed)
         return planes * rows * chunks
+
+
+def _alignment(layout: Any) -> Alignment:
+    """Return where rows begin, as far as reading fields in blocks needs it."""
+    first, plane, row = layout.base % 4, layout.s1 % 4, layout.s2 % 4
+    if layout.planes * layout.rows * layout.nx < MANY_CELLS_OF_BLOCKS:
+        return ANYWHERE
+    if plane == row == 0:
+        return Alignment(first)
+    return Alignment(1, either=True) if first % 2 and (plane, row) == (0, 2) else ANYWHERE
 
 
 @functools.lru_cache(maxsize=1024)

@@ -12,6 +12,8 @@ import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import (
+    ANYWHERE,
+    Alignment,
     BoundFields,
     Pattern,
     RowLayout,
@@ -32,7 +34,10 @@ C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 # types of fields that quads keep in registers
 LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)
 POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
-QUADS = "quads"
+Quads = tuple[Alignment, Alignment]  # of fields of passes by quads, and of those of the other level
+QUADS = ANYWHERE, ANYWHERE
+# threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most
+BLOCKS_OF_QUADS = 256, 2
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
@@ -40,6 +45,16 @@ SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 # stencils: with a weight an axis, with arrays of them, with a product in place
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"
+
+
+def words_of(quads: Quads | None) -> list[str]:
+    """Return what tells forms by quads from those by cells, and from each other."""
+    if quads is None:
+        return []
+    return [
+        "quads",
+        *(f"{name}{a.word}" for name, a in zip(("at", "of"), quads, strict=True) if a.word),
+    ]
 
 
 @functools.cache
@@ -50,7 +65,7 @@ def form_of(
     shape: str | Pattern,
     bounds: str,
     *,
-    quads: bool = False,
+    quads: Quads | None = None,
 ) -> "Form":
     """Return the form of a pass with these types, constants, stencil and bounds, by `quads` of cells if told."""
     return Form(declared, dict(letters), dict(constants), shape, bounds, quads=quads)
@@ -64,7 +79,7 @@ def make_kernels_of_module(form: "Form", letters: Any, shape: str | Pattern, bou
     if not form.declared.module or form.pattern is not None:
         return
     for other in TOGETHER[form.declared.module]:
-        words = other.words(dict(letters), other.constants, shape, bounds) + [QUADS] * form.quads
+        words = other.words(dict(letters), other.constants, shape, bounds) + words_of(form.quads)
         if (
             other.letters == form.declared.letters
             and words == form.words
@@ -81,8 +96,8 @@ class Form:
     Attributes:
         words: what tells it from other forms.
         joins: whether it is compiled with other passes.
-        quads: whether a thread takes four cells of a row at a time, on CUDA only; see
-            `headers/quad.h`.
+        quads: alignments, where a thread takes four cells of a row at a time, on CUDA only; see
+            `headers/quad.h`. None: it does not.
         name: of its kernel.
         fields: struct of its arguments.
         native: that struct in C.
@@ -97,7 +112,7 @@ class Form:
         shape: str | Pattern,
         bounds: str,
         *,
-        quads: bool = False,
+        quads: Quads | None = None,
     ) -> None:
         self.declared, self.letters, self.bounds, self.quads, d = (
             declared,
@@ -111,7 +126,7 @@ class Form:
         self.joins = bool(d.module) and pattern is None  # the module of other passes
         shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
-        self.words = d.words(letters, constants, shape, bounds) + [QUADS] * quads
+        self.words = d.words(letters, constants, shape, bounds) + words_of(quads)
         weights = (
             of(d.stencil[1])
             if d.stencil and (shape == VARIABLE or (pattern and pattern.names))
@@ -299,6 +314,10 @@ class Form:
         ]
         function = [*common, text(d.header, d.declared), '#line 1 "sums"', *sums]
         head = [*head, f"constexpr bool FINER = {str(d.finer).lower()};"]
+        for level, at in zip(("Ours_", "Others_"), self.quads, strict=True):
+            head.append(
+                f"struct {level} {{ enum {{ FIRST = {at.first}, EITHER = {int(at.either)} }}; }};"
+            )
         before = [
             "#define QUADS",
             shared("native.h"),
@@ -308,12 +327,10 @@ class Form:
             '#line 1 "fields"',
         ]
         whole = [
-            "if (P.n == 4) {",
-            "constexpr int n = 4;",
-            *self._fields_of_quad(of, kept=True),
-            *function,
-            "}",
-        ]
+            line
+            for half in self._halves()
+            for line in (*half, *self._fields_of_quad(of, kept=True), *function, "}", "else")
+        ][:-1]
         rest = [
             "else if (FOUND || P.n > 0) {",
             "const int n = P.n;",
@@ -334,22 +351,39 @@ class Form:
         ]
         return "\n".join(["", *before, *whole, *once, *rest, *after])
 
+    def _halves(self) -> list[list[str]]:
+        """Return C++ that begins the row function for whole quads: once for each place of rows."""
+        finer = self.declared.finer
+        either = self.quads[finer].either
+        made = []
+        for half in ("false", "true")[: 1 + either]:
+            ours, others = ("half_", half) if finer else (half, "other_half_")
+            here = f" && {'other_' * finer}half_ == {half}" * either
+            lines = [f"if (P.n == 4{here}) {{", "constexpr int n = 4;"]
+            lines += [
+                f"const auto in_ = reading_(Ours_(), {ours});",
+                f"const auto in_other_ = reading_(Others_(), {others});",
+            ]
+            made.append([*lines, f"const auto out_ = writing_({ours});"])
+        return made
+
     def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
         """Return C++ that declares the fields at a quad's first cell, by name; `kept`: in registers, as `quad.h` does."""
         d = self.declared
         made = []
+        of_other = "in_other_" if kept else "in_"
+        reading = lambda other, data: f"{of_other}({data}, q)" if other else f"in_({data}, p)"  # noqa: E731
         for n in (n for n in d.arrays if not (d.found and n == "out")):
             if (
                 kept
                 and self.types[n] in LOADED
                 and (n in d.reads or n in d.writes or (d.finer and n in d.other))
             ):
-                way = (
-                    "auto {n} = out_({data}, p);"
-                    if n in d.writes
-                    else f"const auto {{n}} = in_({{data}}, {'q' if n in d.other else 'p'});"
+                data = f"given.{n}.data"
+                out = f"auto {n} = out_({data}, p);"
+                made.append(
+                    out if n in d.writes else f"const auto {n} = {reading(n in d.other, data)};"
                 )
-                made.append(way.format(n=n, data=f"given.{n}.data"))
                 continue
             pointer = f"given.{n}.data" + (
                 " + p" if n in d.reads or n in d.writes else " + q" * (n in d.other)
@@ -369,8 +403,7 @@ class Form:
         if d.stencil:
             fields, numbers = ("d", "wx", "wy", "wz", "known"), ("unit", "cx", "cy", "cz")
             made += [
-                f"const auto {n} = in_(given.stencil.{n}.data, {'q' if d.finer else 'p'});"
-                for n in fields
+                f"const auto {n} = {reading(d.finer, f'given.stencil.{n}.data')};" for n in fields
             ]
             made += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
         return made
@@ -431,6 +464,8 @@ class Form:
                 run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
 
         alone.__name__ = alone.__qualname__ = self.name
+        if self.quads:
+            return forward_kernel(module=run.module.name, launch_bounds=BLOCKS_OF_QUADS)(alone)
         if touch is not None:  # the caller's function may need what the project's flags leave out
             return wp.kernel(enable_backward=False, module=run.module.name)(alone)
         return forward_kernel(module=run.module.name)(alone)
@@ -443,11 +478,13 @@ class Form:
     @property
     def by_quads(self) -> "Form | None":
         """The same of quads, as CUDA launches it on grids; None where there is none."""
-        return (
-            form_of(self.declared, *self._chosen, quads=True)
-            if self.declared.quads and self.pattern is None
-            else None
-        )
+        return self.with_quads(QUADS)
+
+    def with_quads(self, quads: Quads) -> "Form | None":
+        """Return the same of quads at these alignments; None where there is none."""
+        if not self.declared.quads or self.pattern is not None:
+            return None
+        return form_of(self.declared, *self._chosen, quads=quads)
 
     def dim(self, layout: Any) -> tuple[int, ...]:
         """Return the dimensions of a launch of the kernel: by quads one, for three would be divided in 64 bits."""

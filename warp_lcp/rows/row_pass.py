@@ -22,6 +22,7 @@ from warp_lcp.rows.pass_form import (
     NUMBERS,
     PACKED,
     PLACE,
+    QUADS,
     TOGETHER,
     UNIFORM,
     VARIABLE,
@@ -33,6 +34,7 @@ from warp_lcp.rows.pass_form import (
 from warp_lcp.rows.program import Launch, device_program, is_recording, perform
 from warp_lcp.rows.team import Operation, Patch, Stage, ranges, team
 
+BLOCK_BYTES = 16  # that a thread loads at a time
 # fields of one element a row that row functions only set, or find it set
 FLAGGED = ("changed", "away")
 # names of the layer's own
@@ -318,12 +320,15 @@ class RowPass:
                     f"{self.label}: the stencil has {d.size} elements, not "
                     f"{rows.other_size if self.finer else rows.size}"
                 )
-        quads = (
-            self.quads
-            and rows.quads is not None
+        quads = None
+        if (
+            rows.quads is not None
+            and self.quads
             and rows.memory is None
             and not (stored and stored[1])
-        )
+        ):
+            fields = rows.alignments != QUADS and self._fields_of_rows(given, stencil, bounds)
+            quads = rows.alignments if fields and in_blocks(fields) else QUADS
         key = (constants, kind, quads, *stored, *types)
         made = self._forms.get(key)
         if made is None:
@@ -382,6 +387,13 @@ class RowPass:
         ]
         kinds = [shape] * bool(self.stencil) + [bounds] * (self.bounds and bounds != NUMBERS)
         return [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
+
+    def _fields_of_rows(self, given: dict[str, Any], stencil: Any, bounds: Any) -> list[Any]:
+        """Return the fields that quads may read in blocks."""
+        fields = [given[name] for name in (*self.reads, *self.writes, *self.other)]
+        if stencil is not None:
+            fields += [stencil.d, *(stencil.weights or ()), getattr(stencil, "y", None)]
+        return [*fields, *(bounds or ())[::2]]
 
     @functools.cached_property
     def _members(self) -> dict[tuple[type, ...], Any]:
@@ -488,6 +500,14 @@ def _getter(names: list[str]) -> Any:
     if len(names) == 1:
         return lambda s, name=names[0]: (getattr(s, name),)
     return attrgetter(*names) if names else None
+
+
+def in_blocks(fields: list[Any]) -> bool:
+    """Return whether the memory of all fields begins with a block of 16 bytes, and stays where it is."""
+    arrays = [value for value in fields if isinstance(value, wp.array) and value.size]
+    return all(
+        value.ptr % BLOCK_BYTES == 0 and getattr(value, "slot", None) is None for value in arrays
+    )
 
 
 class Bound(NamedTuple):

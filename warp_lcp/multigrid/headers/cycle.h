@@ -91,15 +91,15 @@ with_pairs(pairs, [&](auto fx) {
     for (int begin = 0; begin < n; begin += M) {
         const int m = n - begin < M ? n - begin : (int)M;
         SIMD for (int k = 0; k < fx * m; ++k) r[k] = 0;
-        for (int z = 0; z < deep; ++z)
-            for (int y = 0; y < wide; ++y) {
-                const long long at = z * zp + y * yp + fx * begin;
-                SIMD for (int k = 0; k < fx * m; ++k) {
-                    const int i = (int)at + k;
-                    const T e = diagonal(i), v = b[i] - e * x[i] + neighbors(x, i);
-                    r[k] += e != 0 ? v : (T)0;
-                }
+        each_row(deep, wide, [&](int z, int y) {
+            const long long at = z * zp + y * yp + fx * begin;
+            const auto here = x + at, right = b + at;
+            SIMD for (int k = 0; k < fx * m; ++k) {
+                const T e = diagonal(k, at),
+                        v = right[k] - e * here[k] + around(here, k, zm, zp, at);
+                r[k] += e != 0 ? v : (T)0;
             }
+        });
         if (fx == 2) {
             SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2 * k] + r[2 * k + 1];
         } else {

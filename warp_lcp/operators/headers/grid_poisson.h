@@ -2,21 +2,21 @@
 // fields.
 
 // snippet coefficients: Coefficients of lower faces: fields or numbers.
-const auto face_x = [&](long long k) -> T {
+const auto face_x = [&](int k) -> T {
     if constexpr (FIELD_X)
         return fx[k];
     else
         return nx;
 };
-const auto face_y = [&](long long k) -> T {
+const auto face_y = [&](int k, long long at = 0) -> T {
     if constexpr (FIELD_Y)
-        return fy[k];
+        return (fy + at)[k];
     else
         return ny;
 };
-const auto face_z = [&](long long k) -> T {
+const auto face_z = [&](int k, long long at = 0) -> T {
     if constexpr (FIELD_Z)
-        return fz[k];
+        return (fz + at)[k];
     else
         return nz;
 };
@@ -30,12 +30,12 @@ const auto face_z = [&](long long k) -> T {
 //   module     grid
 #include "snippets.h:bytes"
 const unsigned char along_x = around_x, along_y = around_y, along_z = around_z;
-const auto open = [&](long long k, unsigned char axis) -> unsigned char {
-    return cells[k] != 2 ? axis : (unsigned char)0;
+const auto open = [&](int k, unsigned char axis, long long at = 0) -> unsigned char {
+    return (cells + at)[k] != 2 ? axis : (unsigned char)0;
 };
 const auto count = [&](int k) {
-    const unsigned char v = open(k - 1, along_x) + open(k + 1, along_x) + open(k + ym, along_y) +
-                            open(k + yp, along_y) + open(k + zm, along_z) + open(k + zp, along_z);
+    const unsigned char v = open(k - 1, along_x) + open(k + 1, along_x) + open(k, along_y, ym) +
+                            open(k, along_y, yp) + open(k, along_z, zm) + open(k, along_z, zp);
     diagonal[k] = cells[k] == 1 ? v : (unsigned char)0;
 };
 const int whole = n / 64 * 64;
@@ -56,8 +56,9 @@ if (MASKED_BYTES) {
 #include "coefficients"
 SIMD for (int k = 0; k < n; ++k) {
     T v = (cells[k - 1] != 2 ? face_x(k) : (T)0) + (cells[k + 1] != 2 ? face_x(k + 1) : (T)0) +
-          (cells[k + ym] != 2 ? face_y(k) : (T)0) + (cells[k + yp] != 2 ? face_y(k + yp) : (T)0) +
-          (cells[k + zm] != 2 ? face_z(k) : (T)0) + (cells[k + zp] != 2 ? face_z(k + zp) : (T)0);
+          ((cells + ym)[k] != 2 ? face_y(k) : (T)0) +
+          ((cells + yp)[k] != 2 ? face_y(k, yp) : (T)0) +
+          ((cells + zm)[k] != 2 ? face_z(k) : (T)0) + ((cells + zp)[k] != 2 ? face_z(k, zp) : (T)0);
     if constexpr (SHIFTED) v = v + shift[k];
     diagonal[k] = cells[k] == 1 ? v : (T)0;
 }
@@ -72,8 +73,8 @@ SIMD for (int k = 0; k < n; ++k) {
 #include "coefficients"
 SIMD for (int k = 0; k < n; ++k) {
     wx[k] = ((cells[k] == 1) & (cells[k - 1] == 1)) ? face_x(k) : (T)0;
-    wy[k] = ((cells[k] == 1) & (cells[k + ym] == 1)) ? face_y(k) : (T)0;
-    wz[k] = ((cells[k] == 1) & (cells[k + zm] == 1)) ? face_z(k) : (T)0;
+    wy[k] = ((cells[k] == 1) & ((cells + ym)[k] == 1)) ? face_y(k) : (T)0;
+    wz[k] = ((cells[k] == 1) & ((cells + zm)[k] == 1)) ? face_z(k) : (T)0;
 }
 
 // kernel grid_poisson.face_gradient: (mu_i - mu_j) (x_i - x_j) of lower faces, 0 where one of the
@@ -82,20 +83,22 @@ SIMD for (int k = 0; k < n; ++k) {
 //   reads      int8 cells; float64 multiplier, x
 //   writes     float64 face_x?, face_y?, face_z?, shift?
 //   sums       sum_x, sum_y, sum_z, sum_shift
-const auto across = [&](int k, long long to) -> T {
-    const bool open = (cells[k] != 2) & (cells[k + to] != 2);
-    return open ? (multiplier[k] - multiplier[k + to]) * (x[k] - x[k + to]) : (T)0;
+// and the cell `left` to the left of that at `to`
+const auto across = [&](int k, int left, long long to) -> T {
+    const bool open = (cells[k] != 2) & ((cells + to)[k - left] != 2);
+    return open ? (multiplier[k] - (multiplier + to)[k - left]) * (x[k] - (x + to)[k - left])
+                : (T)0;
 };
 T sum_x = 0, sum_y = 0, sum_z = 0, sum_shift = 0;
 SIMD for (int k = 0; k < n; ++k) {
-    sum_x += across(k, -1);
-    sum_y += across(k, ym);
-    sum_z += across(k, zm);
+    sum_x += across(k, 1, 0);
+    sum_y += across(k, 0, ym);
+    sum_z += across(k, 0, zm);
     sum_shift += cells[k] == 1 ? multiplier[k] * x[k] : (T)0;
 }
-if (face_x) SIMD for (int k = 0; k < n; ++k) face_x[k] = across(k, -1);
-if (face_y) SIMD for (int k = 0; k < n; ++k) face_y[k] = across(k, ym);
-if (face_z) SIMD for (int k = 0; k < n; ++k) face_z[k] = across(k, zm);
+if (face_x) SIMD for (int k = 0; k < n; ++k) face_x[k] = across(k, 1, 0);
+if (face_y) SIMD for (int k = 0; k < n; ++k) face_y[k] = across(k, 0, ym);
+if (face_z) SIMD for (int k = 0; k < n; ++k) face_z[k] = across(k, 0, zm);
 if (shift) SIMD for (int k = 0; k < n; ++k) shift[k] = cells[k] == 1 ? multiplier[k] * x[k] : (T)0;
 
 // kernel grid_poisson.copy_cells: a copy of the cells' labels

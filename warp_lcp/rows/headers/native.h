@@ -98,8 +98,20 @@ const auto with_pairs = [](bool pairs, auto body) {
     else
         body(One());
 };
+// body(plane, row) of an aggregate's rows, in quads compiled for each row: fields begin elsewhere
+// there
+const auto each_row = [](int deep, int wide, auto body) {
+    for (int z = 0; z < deep; ++z) {
+        body(z, 0);
+        if (wide == 2) body(z, 1);
+    }
+};
 #else
 const auto with_pairs = [](bool pairs, auto body) { body(pairs ? 2 : 1); };
+const auto each_row = [](int deep, int wide, auto body) {
+    for (int z = 0; z < deep; ++z)
+        for (int y = 0; y < wide; ++y) body(z, y);
+};
 #endif
 // a / e. In quads a division of float32 has no branch, for loads do not merge across branches: it
 // is rounded as IEEE division is, but where e or the quotient is not a normal number.

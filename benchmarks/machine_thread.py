@@ -1,37 +1,30 @@
-"""Executes machine code of NVIDIA GPUs (SASS of sm_90) on the host, to count what a warp issues; no GPU is needed.
+"""Executes a thread's machine code (SASS of sm_90) on the host, on copies of the device's memory.
 
-A cubin is made by `ptxas` and printed by `cuobjdump` with the help of `nvdisasm`, which are in the
-extra `ptxas`. The lanes of a warp run one after another on copies of memory. An instruction of the
-warp is issued as often as by the lane that executes it most often, as branches join again.
-Shuffles, votes and atomics, which need other lanes, do nothing.
+Shuffles, votes and atomics, which need other threads, do nothing.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import math
-import os
 import re
 import struct
-import subprocess
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.machine_code import Instruction
+
 PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
 MOST = 200_000  # instructions of a lane
-LINE = re.compile(r"^\s+/\*([0-9a-f]{4,})\*/\s+(.*?)\s*;")
-GUARD = re.compile(r"@(!?)(U?P\w+)\s+(.*)")
 PREDICATE = re.compile(r"U?P(\d|T)$")
-FLOAT64 = frozenset(("DADD", "DMUL", "DFMA", "DSETP", "DMNMX"))
 IGNORED = frozenset(
-    "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL RED ATOMG ATOM".split()  # noqa: SIM905
+    "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL RED REDG "
+    "ATOMG ATOM".split()  # noqa: SIM905
 )
 COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: true of NaN
     "LT": lambda a, b: a < b,
@@ -49,92 +42,6 @@ COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: 
     "NEU": lambda a, b: a != b,
     "GEU": lambda a, b: not a < b,
 }
-
-
-def tool(name: str) -> Path | None:
-    """Return where a tool of the extra `ptxas` is; None if it is not installed."""
-    spec = importlib.util.find_spec("nvidia")
-    places = [Path(p) for p in (spec.submodule_search_locations or [])] if spec else []
-    return next((found for place in places for found in place.glob(f"*/bin/{name}")), None)
-
-
-def tools_missing() -> list[str]:
-    """Return the names of the tools that are not installed."""
-    return [name for name in ("ptxas", "cuobjdump", "nvdisasm") if tool(name) is None]
-
-
-@dataclass(frozen=True)
-class Instruction:
-    """An instruction: its guard (predicate, whether it is negated), its operation with modifiers, its operands."""
-
-    guard: tuple[str, bool] | None
-    name: str
-    modifiers: tuple[str, ...]
-    operands: tuple[str, ...]
-    text: str
-
-
-@dataclass(frozen=True)
-class Kernel:
-    """A kernel of a cubin: instructions by address, and registers of a thread."""
-
-    name: str
-    code: dict[int, Instruction]
-    registers: int
-    spilled: int
-
-
-def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
-    """Assemble PTX to a cubin and return its kernels."""
-    ptxas, cuobjdump, nvdisasm = (tool(name) for name in ("ptxas", "cuobjdump", "nvdisasm"))
-    assert ptxas and cuobjdump and nvdisasm, tools_missing()
-    text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
-    made = subprocess.run(
-        [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin],
-        input=text,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    environment = {
-        **os.environ,
-        "NVDISASM_PATH": str(nvdisasm.parent),
-        "PATH": f"{nvdisasm.parent}{os.pathsep}{os.environ.get('PATH', '')}",
-    }
-    printed = subprocess.run(
-        [cuobjdump, "-sass", cubin], capture_output=True, text=True, check=True, env=environment
-    ).stdout
-    codes: dict[str, dict[int, Instruction]] = {}
-    name = ""
-    for line in printed.splitlines():
-        if "Function :" in line:
-            name = line.split("Function :")[1].strip()
-            codes[name] = {}
-        elif name and (found := LINE.match(line)):
-            codes[name][int(found[1], 16)] = parsed(found[2])
-    kernels = []
-    for part in re.split(r"Compiling entry function '", made.stderr)[1:]:
-        name = part.partition("'")[0]
-        registers, spilled = (
-            re.search(r"Used (\d+) registers", part),
-            re.search(r"(\d+) bytes spill stores", part),
-        )
-        assert registers, part
-        kernels.append(
-            Kernel(name, codes[name], int(registers[1]), int(spilled[1]) if spilled else 0)
-        )
-    return kernels
-
-
-def parsed(text: str) -> Instruction:
-    """Return an instruction from its text."""
-    guard, rest = None, text
-    if found := GUARD.match(text):
-        guard, rest = (found[2], bool(found[1])), found[3]
-    operation, _, operands = rest.partition(" ")
-    name, *modifiers = operation.split(".")
-    split = re.split(r",\s*(?![^\[]*\])", operands) if operands.strip() else []
-    return Instruction(guard, name, tuple(modifiers), tuple(part.strip() for part in split), text)
 
 
 class Memory:
@@ -172,56 +79,6 @@ class Memory:
     def write(self, at: int, data: bytes) -> None:
         """Write bytes."""
         self.written.update((at + k, byte) for k, byte in enumerate(data))
-
-
-@dataclass
-class Issued:
-    """What a warp issues.
-
-    Attributes:
-        instructions: how many.
-        float64: of these, in float64.
-        loads: from global memory.
-        stores: to global memory.
-        wavefronts: passes through the L1 cache, of at most 128 bytes and one line each.
-    """
-
-    instructions: int = 0
-    float64: int = 0
-    loads: int = 0
-    stores: int = 0
-    wavefronts: int = 0
-
-
-def issued(
-    code: dict[int, Instruction],
-    constants: bytes,
-    memory: Memory,
-    threads: Sequence[tuple[int, int]],
-) -> Issued:
-    """Return what a warp issues whose threads have these (place in the block, block).
-
-    Raises:
-        NotImplementedError: the kernel has an instruction that is not known here.
-    """
-    most: Counter[int] = Counter()
-    groups: dict[tuple[int, int, bool], list[tuple[int, int]]] = defaultdict(list)
-    for thread, block in threads:
-        lane = Lane(code, constants, memory, thread, block)
-        lane.run()
-        for at, count in lane.count.items():
-            most[at] = max(most[at], count)
-        for at, turn, address, size, is_load in lane.accesses:
-            groups[at, turn, is_load].append((address, size))
-    found = Issued(sum(most.values()), sum(n for at, n in most.items() if code[at].name in FLOAT64))
-    for (_, _, is_load), accesses in groups.items():
-        lines = {
-            byte // 128 for address, size in accesses for byte in (address, address + size - 1)
-        }
-        found.loads += is_load
-        found.stores += not is_load
-        found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
-    return found
 
 
 def _signed(value: int, bits: int = 32) -> int:

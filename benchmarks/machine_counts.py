@@ -1,0 +1,78 @@
+"""What a warp of a kernel issues: instructions, loads, stores, passes through the L1 cache.
+
+The lanes of the warp are executed one after another (`benchmarks/machine_thread.py`). An
+instruction of the warp is issued as often as by the lane that executes it most often, as branches
+join again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.machine_code import Instruction
+from benchmarks.machine_thread import Lane, Memory
+
+FLOAT64 = frozenset(("DADD", "DMUL", "DFMA", "DSETP", "DMNMX"))
+ATOMIC = frozenset(("RED", "REDG", "ATOM", "ATOMG"))
+
+
+@dataclass
+class Issued:
+    """What a warp issues.
+
+    Attributes:
+        instructions: how many.
+        float64: of these, in float64.
+        loads: from global memory.
+        stores: to global memory.
+        wavefronts: passes through the L1 cache, of at most 128 bytes and one line each.
+        atomics: of the instructions, atomic ones on global memory.
+        read: addresses in global memory that are loaded.
+        written: those that are stored.
+    """
+
+    instructions: int = 0
+    float64: int = 0
+    loads: int = 0
+    stores: int = 0
+    wavefronts: int = 0
+    atomics: int = 0
+    read: frozenset[int] = frozenset()
+    written: frozenset[int] = frozenset()
+
+
+def issued(
+    code: dict[int, Instruction],
+    constants: bytes,
+    memory: Memory,
+    threads: Sequence[tuple[int, int]],
+) -> Issued:
+    """Return what a warp issues whose threads have these (place in the block, block).
+
+    Raises:
+        NotImplementedError: the kernel has an instruction that is not known here.
+    """
+    most: Counter[int] = Counter()
+    groups: dict[tuple[int, int, bool], list[tuple[int, int]]] = defaultdict(list)
+    for thread, block in threads:
+        lane = Lane(code, constants, memory, thread, block)
+        lane.run()
+        for at, count in lane.count.items():
+            most[at] = max(most[at], count)
+        for at, turn, address, size, is_load in lane.accesses:
+            groups[at, turn, is_load].append((address, size))
+    of = lambda names: sum(n for at, n in most.items() if code[at].name in names)  # noqa: E731
+    found = Issued(sum(most.values()), float64=of(FLOAT64), atomics=of(ATOMIC))
+    reached: dict[bool, set[int]] = {True: set(), False: set()}
+    for (_, _, is_load), accesses in groups.items():
+        reached[is_load] |= {address for address, _ in accesses}
+        lines = {
+            byte // 128 for address, size in accesses for byte in (address, address + size - 1)
+        }
+        found.loads += is_load
+        found.stores += not is_load
+        found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
+    found.read, found.written = frozenset(reached[True]), frozenset(reached[False])
+    return found
