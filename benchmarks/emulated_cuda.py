@@ -359,9 +359,7 @@ def equal_bits(one, other, kind):
     """Return whether two arrays of a type have the same bits; every NaN counts as the same."""
     if one == other or kind not in (wp.float32, wp.float64):
         return one == other
-    a, b = (
-        np.frombuffer(data, dtype=wp.types.warp_type_to_np_dtype[kind]) for data in (one, other)
-    )
+    a, b = (np.frombuffer(data, dtype=wp.dtype_to_numpy(kind)) for data in (one, other))
     either = np.isnan(a) | np.isnan(b)
     return np.array_equal(np.isnan(a), np.isnan(b)) and a[~either].tobytes() == b[~either].tobytes()
 
