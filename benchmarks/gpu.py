@@ -16,6 +16,7 @@ if "--rehearse" in sys.argv:
 # ruff: isort: split
 
 import argparse
+import functools
 import json
 import shutil
 import subprocess
@@ -33,7 +34,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks import gpu_cases, kernels
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Table
+from warp_lcp.benchmarks.harness.record import Record, Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.problems import natural, splash
@@ -90,6 +91,7 @@ class Verdict:
                 "s)",
                 flush=True,
             )
+            self.write()  # whatever ends this process early leaves what has been found
 
     def all(self) -> None:
         """Try everything."""
@@ -366,11 +368,16 @@ class Verdict:
         self.tables += found.tables
         return f"{sum(len(t.rows) for t in found.tables[1:])} kernels at {n}^3"
 
+    @functools.cached_property
+    def machine(self) -> Record:
+        """The device and its machine."""
+        return machine(self.device, elements=1 << 20)
+
     def write(self) -> None:
         """Leave the page, and the file to send in."""
         rows = [["PASS" if c.holds else "FAIL", c.name, c.found] for c in self.claims]
         tables = [Table("Claims", ["", "claim", "found"], rows), *self.tables]
-        record = machine(self.device, elements=1 << 20)
+        record = self.machine
         lines = [
             f"# Verdict on {self.device}{' (a rehearsal on the CPU)' if self.rehearsal else ''}",
             "",

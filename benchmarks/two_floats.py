@@ -41,6 +41,7 @@ KINDS = {
     "1/x": "rcp",
     "others": "div sqrt",
 }
+DRAWN = 40  # problems
 SIZES, TOLERANCES, CELLS = (32, 64, 128), (1e-6, 1e-8, 1e-10, 1e-12, 1e-15), 256
 
 PAIRS = """
@@ -300,6 +301,39 @@ def compare() -> None:
     )
 
 
+def drawn_problem(seed: int) -> wl.LCP:
+    """Return a problem on a grid with holes and air, with bounds here and there, as it comes."""
+    rng = np.random.default_rng(seed)
+    shape = tuple(rng.integers(5, 50, 3))
+    share = rng.uniform(0.93, 1)  # few cells are cut off from the air
+    cells = np.where(rng.random(shape) < share, wl.FLUID, rng.choice([wl.SOLID, wl.AIR], shape))
+    cells[-1], cells[0, 0, 0] = wl.AIR, wl.FLUID
+    size = 10.0 ** rng.uniform(-3, 3)
+    b = np.where(cells == wl.FLUID, size * (rng.standard_normal(shape) - rng.uniform(0, 1)), 0.0)
+    lower = np.where(rng.random(shape) < rng.random(), 0.0, -np.inf)
+    return wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower)
+
+
+def compare_drawn(count: int) -> None:
+    """Print what residuals are by each way of evaluation at solutions of drawn problems."""
+    rows = []
+    for rtol in (1e-6, 1e-8, 1e-10):
+        found: dict[str, list[float]] = {way: [] for way in WAYS}
+        for seed in range(count):
+            problem = drawn_problem(seed)
+            stopping = wl.StoppingCriteria(rtol=rtol)
+            result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=stopping)
+            assert result, f"seed {seed}: {result.status}"
+            unit = result.history[0].residual
+            for way, residuals in found.items():
+                r = evaluated(problem, way, result.x.numpy())
+                residuals.append(float(np.linalg.norm(r.ravel()) / unit))
+        reached = [sum(r <= rtol for r in residuals) for residuals in found.values()]
+        rows.append([f"{rtol:.0e}", *reached, *(max(residuals) for residuals in found.values())])
+    columns = ["rtol", *(f"{way}: reach it" for way in WAYS), *(f"{way}: most" for way in WAYS)]
+    table(f"{count} drawn problems, solved with residuals in float64", columns, rows)
+
+
 def count(module: str, kind: str, stored: str) -> list[int]:
     """Return the instructions of a cell, of each kind and in all.
 
@@ -340,5 +374,6 @@ def instructions() -> None:
 
 if __name__ == "__main__":
     check_pairs()
+    compare_drawn(DRAWN)
     compare()
     instructions()

@@ -26,9 +26,6 @@ REGISTERS = 65536  # registers of all threads of a multiprocessor
 SPILLS = {
     "warp_lcp.blocked_gauss_seidel.*_[56]:*": "a thread enumerates the sets of a block of 5 or 6 "
     "unknowns with its matrix at hand",
-    "warp_lcp.small_levels.coarsen.*": "a few hundred bytes once a solve, in one block",
-    "warp_lcp.small_levels.cycle.solve.*": "84 bytes of a level that is solved directly, all there "
-    "is of it",
     "warp_lcp.coarsest.invert_*": "20 bytes once a solve, in one block",
 }
 # Kernels with more than 128 registers, so that fewer than 512 threads fit on a multiprocessor, and
@@ -44,6 +41,7 @@ LARGE = {
     "granular.packing:contents_kernel": "once a run",
     "warp_lcp.grid.mesh_crossings:find_crossings": "once a mesh",
     "fluids.coupling:*": "bodies' cells only",
+    "warp_lcp.small_levels.*": "blocks of 256 threads, which have a multiprocessor each",
 }
 
 # Instructions that passes may issue a cell, of the finer grid of a transfer, on sm_90; variable:

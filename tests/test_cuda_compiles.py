@@ -35,6 +35,7 @@ from warp_lcp.rows.layout import Alignment
 from warp_lcp.rows.native import sections
 from warp_lcp.rows.pass_form import Form
 from warp_lcp.rows.row_pass import RowPass
+from warp_lcp.rows.sequence import Sequence
 from warp_lcp.rows.vectors import CUDA_BLOCK
 from warp_lcp.solvers.mprgp import MPRGP
 
@@ -70,13 +71,13 @@ def use_every_kernel(reals):
             )
             for solver in METHODS:
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
-            fused = mock.patch.object(StencilLevel, "fuses", False)
-            with fused:  # as on CUDA, with small levels apart and together
-                for precision, cycle in itertools.product(
-                    ("mixed", "double"), (CycleSettings(coarsest_cpu=8), *ONE_LAUNCH)
-                ):
-                    method = wl.ProjectedMultigrid(precision=precision, cycle=cycle)
-                    assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-4))
+            for joins in (True, False):  # as on CUDA, with small levels apart and together
+                on_cuda = mock.patch.multiple(StencilLevel, fuses=False, joins_sweeps=joins)
+                cycles = (CycleSettings(coarsest_cpu=8), *ONE_LAUNCH)
+                with on_cuda:
+                    for precision, cycle in itertools.product(("mixed", "double"), cycles):
+                        method = wl.ProjectedMultigrid(precision=precision, cycle=cycle)
+                        assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-4))
         assert Hierarchy(
             problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1]
         )._small.coarsening.kernel
@@ -395,6 +396,9 @@ def modules_of_every_kernel(reals):
         if form.by_quads:
             assert form.by_quads.kernel  # in place of it on CUDA
             assert form.with_quads(IN_BLOCKS).kernel  # and on large grids
+    for sequence in [made for made in gc.get_objects() if isinstance(made, Sequence)]:
+        for clustered in (False, True):
+            assert sequence.kernel_by_quads(clustered=clustered)  # as CUDA launches it
     from warp._src.context import user_modules
 
     return sorted(
@@ -445,16 +449,27 @@ def lines_of(names):
     return sorted(f"{name} {source_hash(name)[:20]} {wp.__version__}" for name in names)
 
 
+def threads_of(kernel):
+    """Return the threads of a kernel's blocks."""
+    bounds = kernel.options.get("launch_bounds", CUDA_BLOCK)
+    return bounds[0] if isinstance(bounds, tuple) else bounds
+
+
 def compile_for_cuda(name, archs, folder):
     """Compile a module for CUDA, with blocks as large as they are launched."""
     from warp._src.context import user_modules
 
     module = user_modules[name]
-    given = {kernel.options.get("launch_bounds", CUDA_BLOCK) for kernel in module.kernels.values()}
-    bounds = {bound if isinstance(bound, int) else bound[0] for bound in given}
+    bounds = {threads_of(kernel) for kernel in module.kernels.values()}
     module.options["block_dim"], *others = bounds
     assert not others, f"{name}: kernels of blocks of {bounds} threads"
+    if any(kernel.options.get("cluster_dim", 1) > 1 for kernel in module.kernels.values()):
+        archs = [90]  # others have no clusters
     wp.compile_aot_module(name, device=None, arch=archs, module_dir=folder, use_ptx=True)
+    # passes of a launch read what others have written
+    if name.startswith("warp_lcp.small_levels."):
+        for made in Path(folder).glob("*.ptx"):
+            assert "ld.global.nc" not in made.read_text(), name
 
 
 @pytest.mark.parametrize(

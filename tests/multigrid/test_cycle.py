@@ -89,6 +89,7 @@ def test_a_grids_cycle_is_the_plain_loop(shape, gamma, bounded, together, device
         coarsest_cuda=6,
         semicoarsening_threshold=0.0,
         projected_sweeps=PAIRS,
+        projected_sweeps_cuda=PAIRS,
         one_launch_cpu=90 * together,
         one_launch_cuda=90 * together,
     )

@@ -3,6 +3,8 @@
 The inverse of the coarsest one is compared with dense algebra.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -11,7 +13,7 @@ import warp_lcp as wl
 from multigrid.test_hierarchy import level_matrix, masked_hierarchy
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
-from warp_lcp.multigrid.fused_levels import FusedCoarseLevels
+from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, cells_of_one_launch
 from warp_lcp.rows import Rows
 from warp_lcp.rows.sequence import CUDA_THREADS
 
@@ -164,6 +166,18 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
         for a, expected_field in zip(found, made, strict=True):
             np.testing.assert_array_equal(a, expected_field)
         np.testing.assert_allclose(first.x.numpy() * inside, expected, rtol=0, atol=1e-13)
+
+
+def test_clusters_of_blocks_take_larger_levels():
+    def cells(arch, **settings):
+        names = dict.fromkeys(("is_cuda", "is_cuda_like"), True)
+        names |= dict.fromkeys(("is_cpu", "is_cpu_like"), False)
+        device = SimpleNamespace(arch=arch, **names)
+        return cells_of_one_launch(CycleSettings(**settings), device)
+
+    assert (cells(89), cells(90), cells(120)) == (512, 4096, 4096)
+    assert cells(90, one_launch_cuda=0) == 0
+    assert cells(90, one_launch_cluster=0) == 512
 
 
 @pytest.mark.parametrize("faces", FACES)

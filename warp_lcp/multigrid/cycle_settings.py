@@ -67,10 +67,14 @@ class CycleSettings(Smoothing):
             stream through a level are faster.
         one_launch_cuda: the same on a GPU, in one block of threads: 8^3 cells; with 16^3 one
             multiprocessor works longer than launches would take, 2 ms of a solve on an H200.
+        one_launch_cluster: the same on a GPU that has clusters of blocks (compute capability 9.0
+            on), unless `one_launch_cuda` is 0: eight multiprocessors share 16^3 cells.
         semicoarsening_threshold: an axis is coarsened once its mean weight is at least this
             fraction of the strongest axis's mean weight.
-        projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a
-            projected cycle.
+        projected_sweeps: pairs of sweeps, forth and back, that stand for a solve on the coarsest
+            level of a projected cycle.
+        projected_sweeps_cuda: the same on a GPU, where each sweep is a barrier. With 8, 4 and 2
+            pairs 43 problems took the same iterations, one of them one more with a single pair.
     """
 
     gamma: Count = 2
@@ -83,8 +87,10 @@ class CycleSettings(Smoothing):
     coarsest_cuda: Count = 64
     one_launch_cpu: CountOrZero = 0
     one_launch_cuda: CountOrZero = 512
+    one_launch_cluster: CountOrZero = 4096
     semicoarsening_threshold: Part = 0.3
     projected_sweeps: Count = 8
+    projected_sweeps_cuda: Count = 2
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -125,7 +125,9 @@ class DenseInverse:
     def _sweeps(self, *, from_zero: bool) -> Iterator[CycleStage]:
         """Yield projected pairs of sweeps, forth and back: symmetric."""
         level, settings = self.level, self.level.settings
-        for sweep in range(settings.projected_sweeps):
+        on_cpu = self._device.is_cpu
+        pairs = settings.projected_sweeps if on_cpu else settings.projected_sweeps_cuda
+        for sweep in range(pairs):
             yield from level.pair(
                 settings.weights, projected=True, from_zero=from_zero and sweep == 0
             )

@@ -1,4 +1,7 @@
-"""All small levels of a hierarchy in one launch: one block of threads goes through a list of stages."""
+"""All small levels of a hierarchy in one launch.
+
+A block of threads, or a cluster of blocks, goes through a list of stages.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,19 @@ import math
 from collections.abc import Sequence as Listed
 from typing import TYPE_CHECKING, Any
 
+import warp as wp
+
 from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle
 from warp_lcp.rows import Sequence
+from warp_lcp.rows.sequence import has_clusters
 
 if TYPE_CHECKING:
+    from warp_lcp.multigrid.cycle_settings import CycleSettings
     from warp_lcp.multigrid.stencil_level import StencilLevel
 
 
 class FusedCoarseLevels:
-    """Coarsest solver: the last levels of a hierarchy, which one block of a GPU (one thread of a CPU) cycles through.
+    """Coarsest solver: the last levels of a hierarchy, in one launch on a GPU.
 
     The cycle's stages are unrolled into a table on the device. Results are those of one launch a
     stage, to rounding.
@@ -50,6 +57,14 @@ class FusedCoarseLevels:
                 "small_levels.projected" if projected else "small_levels.cycle", stages
             )
         return (self._sequences[key],)
+
+
+def cells_of_one_launch(settings: CycleSettings, device: wp.Device) -> int:
+    """Return the most cells of a level that runs in one launch with those below it; 0: none does."""
+    if device.is_cpu:
+        return settings.one_launch_cpu
+    block, cluster = settings.one_launch_cuda, settings.one_launch_cluster
+    return max(block, cluster) if block and has_clusters(device) else block
 
 
 def first_small(levels: Listed[StencilLevel], cells: int) -> int:

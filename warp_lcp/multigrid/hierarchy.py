@@ -25,7 +25,7 @@ from warp_lcp.multigrid.cycle import (
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.dense_inverse import DenseInverse
-from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, first_small
+from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, cells_of_one_launch, first_small
 from warp_lcp.multigrid.halo_levels import share_changes, whole_counts
 from warp_lcp.multigrid.stencil_level import Pair, StencilLevel
 from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kernel
@@ -113,12 +113,9 @@ class Hierarchy:
     def _coarsest_solver(self) -> CoarsestSolver:
         """Return what solves on the coarsest levels: small ones in one launch, the last one by its dense inverse."""
         self._dense = dense = DenseInverse(self.levels[-1])
-        cells = (
-            self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
-        )
-        self._first_small = first_small(
-            self.levels, 0 if self.finest.stencil.pattern is not None else cells
-        )
+        compact = self.finest.stencil.pattern is not None
+        cells = 0 if compact else cells_of_one_launch(self.settings, self.device)
+        self._first_small = first_small(self.levels, cells)
         if self._first_small < len(self.levels):
             self._small = FusedCoarseLevels(self.levels[self._first_small :], dense.solve)
             return self._small.solve

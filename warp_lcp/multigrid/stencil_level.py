@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
@@ -19,6 +20,10 @@ from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import nothing, zeros
 from warp_lcp.rows.program import Task
 
+# cells up to which a launch on a GPU costs more than work that is done again: by the counts of
+# `benchmarks/gpu_counts.py`, two sweeps in one issue 119 instructions a cell, not 82, and a
+# correction with a sweep 105, not 78
+JOINED_CELLS = 1 << 20
 Pair = tuple[wp.array[Any], wp.array[Any]]
 
 
@@ -196,6 +201,9 @@ class StencilLevel:
         self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False
     ) -> Iterator[Bound | Task]:
         """Yield two sweeps, x to t and back; x is taken for 0 if from_zero."""
+        if from_zero and self.joins_sweeps:
+            yield self._two_sweeps(weights, projected=projected)
+            return
         yield from () if from_zero else self.filling("x")
         yield self.sweeping(self.t, self.x, weights[0], projected=projected, from_zero=from_zero)
         yield from self.filling("t")
@@ -222,6 +230,18 @@ class StencilLevel:
         return into, self.sweeping(
             self.x, between, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING
         )
+
+    @property
+    def joins_sweeps(self) -> bool:
+        """Whether two sweeps from zero are one launch, and a correction and the sweep after it.
+
+        They are on CUDA, where small levels take as long as their launches, unless ghost cells must
+        be filled between sweeps. Compact stencils have too many neighbors.
+        """
+        s = self.stencil
+        small = math.prod(s.padding.counts) <= JOINED_CELLS
+        plain = not any(s.periodic) and s.ghosts is None and s.pattern is None
+        return s.device.is_cuda and small and plain
 
     @property
     def fuses(self) -> bool:
@@ -280,12 +300,50 @@ class StencilLevel:
         if self.fuses and self.stencil.ghosts is not None:
             yield from halo_levels.ascent(self, coarse, projected=projected)
             return
+        if self.joins_sweeps:
+            yield self._correct_and_sweep(coarse, weights[0], projected=projected)
+            yield self.sweeping(self.x, self.t, weights[1], projected=projected)
+            return
         correcting = self.correcting(coarse, self.settings.over_correction, projected=projected)
         if self.fuses:
             yield Leg(passes.ASCEND, (correcting, *self.ring_pair(weights, projected=projected)))
         else:
             yield correcting
             yield from self.pair(weights, projected=projected)
+
+    def _two_sweeps(self, weights: tuple[float, float], *, projected: bool) -> Bound:
+        """Return the pass x = two sweeps of 0."""
+        lower, upper = self._sides(projected)
+        make = lambda: passes.TWO_SWEEPS.bind(  # noqa: E731
+            self.stencil.rows,
+            stencil=self.stencil,
+            b=self.b,
+            lower=lower,
+            upper=upper,
+            y=self.x,
+            first=weights[0],
+            omega=weights[1],
+            projected=projected,
+        )
+        return self._once(("two sweeps", weights, projected), make)
+
+    def _correct_and_sweep(self, coarse: StencilLevel, omega: float, *, projected: bool) -> Bound:
+        """Return the pass t = a sweep of x and the coarse correction of it."""
+        lower, upper = self._sides(projected)
+        make = lambda: passes.CORRECT_AND_SWEEP.bind(  # noqa: E731
+            self._finer_rows(coarse),
+            stencil=self.stencil,
+            x=self.x,
+            b=self.b,
+            lower=lower,
+            upper=upper,
+            y=self.t,
+            coarse=coarse.x,
+            scale=self.settings.over_correction,
+            omega=omega,
+            projected=projected,
+        )
+        return self._once(("correct and sweep", coarse, omega, projected), make)
 
     def coarsened(self, coarse: StencilLevel) -> Iterator[Bound | Task]:
         """Yield the making of the next level."""

@@ -46,8 +46,10 @@ class MultipleSemicoarsening(Hierarchy):
         settings = options.pop("settings", None) or CycleSettings()
         # a launch of all levels starts from x = 0: the finest one stays out of it
         fewer = math.prod(stencil.padding.counts) - 1
-        cpu, cuda = (min(n, fewer) for n in (settings.one_launch_cpu, settings.one_launch_cuda))
-        settings = replace(settings, one_launch_cpu=cpu, one_launch_cuda=cuda)
+        names = ("one_launch_cpu", "one_launch_cuda", "one_launch_cluster")
+        settings = replace(
+            settings, **{name: min(getattr(settings, name), fewer) for name in names}
+        )
         super().__init__(stencil, real, **options, settings=settings)
         # W-cycles save a step in ten and cost two to four times as much
         options["settings"] = replace(settings, gamma=1)

@@ -156,7 +156,8 @@ class Form:
         run.__module__ = area if d.box else variant
         self.name = d.name.replace(".", "_") if self.joins else last
         run.__qualname__ = f"{self.name}_rows"
-        self.run = wp.func_native(self._source(letters, constants, ord(shape[0]), of))(run)
+        self._code = self._source(letters, constants, ord(shape[0]), of)
+        self.run = wp.func_native(self._code)(run)
 
     def _source(
         self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any
@@ -438,6 +439,24 @@ class Form:
             members, _kept=bound, _ctype=self.native.from_buffer_copy(bound.arguments)
         )
         return made
+
+    @functools.cached_property
+    def run_in_turn(self) -> Any:
+        """`run` for launches of several passes: a pass reads what one before it has written.
+
+        Loads by `__ldg` may have values from before the launch.
+        """
+        if not self.quads:
+            return self.run
+
+        def run(
+            L: RowLayout, given: self.fields, slab_: int, row_: int, chunk_: int, count_: int
+        ): ...
+
+        run.__module__ = self.run.module.name
+        run.__qualname__ = f"{self.name}_rows_in_turn"
+        code = f"#define __ldg(q) (*(q))\n{self._code}\n#undef __ldg\n"
+        return wp.func_native(code)(run)
 
     @functools.cached_property
     def kernel(self) -> Any:

@@ -1,20 +1,28 @@
 # mypy: ignore-errors
-"""Passes one after another in one launch of one block of threads on CUDA, which meet at a barrier after each; on the CPU, launches."""
+"""Passes one after another in one launch on CUDA; on the CPU, launches.
+
+A block of threads takes them, or a cluster of blocks. All threads meet at a barrier after each
+pass. A cluster (compute capability 9.0 on) is a few blocks on neighboring multiprocessors that have
+a barrier in hardware. It is taken where a pass has more tasks than a block has threads.
+"""
 
 import functools
+import math
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.layout import RowLayout, make_struct
+from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.pass_form import Form
 from warp_lcp.rows.program import Launch, launch_now, perform
 from warp_lcp.rows.row_pass import Bound
 
-# of the block: with 1024 a thread has 64 registers, and passes spill up to 2 kB of what it holds
-CUDA_THREADS = 512
+CUDA_THREADS = 512  # of a block that inverts a matrix
+THREADS = 256  # of a block that works through passes: with 512 they spill registers
+BLOCKS = 8  # of a cluster: as many as every GPU with clusters has
+CLUSTERED = 90  # the least architecture that has them
 MOST = 5  # forms
 
 
@@ -38,6 +46,10 @@ class Sequence:
         stages: the passes in order, of five forms at most, without sums. Those that are the same
             object are kept once.
 
+    Attributes:
+        tasks: the most of a pass.
+        threads: of the launch.
+
     Raises:
         ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
     """
@@ -54,7 +66,16 @@ class Sequence:
         if summing := [form.declared.name for form in forms if form.declared.sums]:
             raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
         self.device, self._stages, self._forms = stages[0].rows.device, tuple(stages), forms
-        self.kernel, self._Tables, self._structs = _sequence_kernel(name, forms)
+        self.tasks = max(math.prod(threads(stage.layout)) for stage in stages)
+        clustered = has_clusters(self.device) and self.tasks > THREADS
+        self.threads = THREADS * (BLOCKS if clustered else 1)
+        self._name = name
+        self.kernel, self._Tables, self._structs = _sequence_kernel(name, forms, clustered)
+
+    def kernel_by_quads(self, *, clustered: bool) -> Any:
+        """Return the kernel as a GPU launches it, by one block or a cluster of them."""
+        forms = tuple(dict.fromkeys(form.by_quads or form for form in self._forms))
+        return _sequence_kernel(self._name, forms, clustered)[0]
 
     @functools.cached_property
     def tables(self) -> Any:
@@ -80,8 +101,8 @@ class Sequence:
     def launch(self, launch: Launch = launch_now) -> None:
         """Launch all passes, or record their launch."""
         if self.device.is_cuda:
-            inputs = [self.tables, 0, len(self._stages), CUDA_THREADS]
-            launch(self.kernel, CUDA_THREADS, inputs, device=self.device, block_dim=CUDA_THREADS)
+            inputs = [self.tables, 0, len(self._stages), self.threads]
+            launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
             return
         made: dict[int, Any] = {}  # what the team does of a pass that comes again
         for stage in self._stages:
@@ -108,10 +129,29 @@ def meet():
     """Wait for all threads of the block."""
 
 
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && defined(__CUDACC__)
+asm volatile("barrier.cluster.arrive.release;" ::: "memory");
+asm volatile("barrier.cluster.wait.acquire;" ::: "memory");
+#elif defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+"""
+)
+def meet_in_cluster():
+    """Wait for all threads of the cluster, and see what they have written."""
+
+
+def has_clusters(device: wp.Device) -> bool:
+    """Return whether a device launches clusters of blocks."""
+    return bool(device.is_cuda and device.arch >= CLUSTERED)
+
+
 @functools.cache
 def _shared(form: Form | None) -> Any:
     """Return the struct of a pass with its arguments, and the function by which threads share its rows."""
-    run, Fields = (form.run, form.fields) if form else (nothing, Nothing)
+    run, Fields = (form.run_in_turn, form.fields) if form else (nothing, Nothing)
     Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
     pieces = wp.array(dtype=Piece)
 
@@ -127,12 +167,17 @@ def _shared(form: Form | None) -> Any:
 
 
 @functools.cache
-def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
+def _sequence_kernel(name: str, forms: tuple[Form, ...], clustered: bool) -> Any:
     (One, first), (Two, second), (Three, third), (Four, fourth), (Five, fifth) = (
         _shared(form) for form in (*forms, *(None,) * (MOST - len(forms)))
     )
     kinds = [form.declared.name.rpartition(".")[2] for form in forms]
-    variant = f"{'_'.join(kinds)}.{'_'.join(dict.fromkeys(word for form in forms for word in form.words))}"
+    words = [
+        *dict.fromkeys(word for form in forms for word in form.words),
+        *["cluster"] * clustered,
+    ]
+    variant = f"{'_'.join(kinds)}.{'_'.join(words)}"
+    wait = meet_in_cluster if clustered else meet
     structs = (One, Two, Three, Four, Five)
     members = {"order": wp.array(dtype=wp.vec2i)} | {
         n: wp.array(dtype=s) for n, s in zip(TABLES, structs, strict=True)
@@ -140,7 +185,7 @@ def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
     Tables = make_struct(f"{name.replace('.', '_')}_{variant.replace('.', '_')}", members)
 
     def sequence(T: Tables, begin: int, end: int, threads: int):
-        """Every thread of the block passes every barrier: the bounds of the loop are the same for all."""
+        """Every thread passes every barrier: the bounds of the loop are the same for all."""
         t = wp.tid()
         for s in range(begin, end):
             at = T.order[s]
@@ -154,10 +199,11 @@ def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
                 fourth(T.pieces3, at[1], t, threads)
             else:
                 fifth(T.pieces4, at[1], t, threads)
-            meet()
+            wait()
 
     sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
-    kernel = forward_kernel(module=f"warp_lcp.{name}.{variant}", launch_bounds=CUDA_THREADS)(
-        sequence
-    )
+    options = {"cluster_dim": BLOCKS} if clustered else {}
+    module = f"warp_lcp.{name}.{variant}"
+    # without the least number of blocks, 1, ptxas keeps to 128 registers and spills
+    kernel = forward_kernel(module=module, launch_bounds=(THREADS, 1), **options)(sequence)
     return kernel, Tables, structs

@@ -40,6 +40,32 @@ if (from_zero)
 else
     clips(from_x);
 
+// snippet sweep_again: y = a sweep of `value(k, at)` at cell k of a row `at` elements from ours,
+// which is made again for each neighbor; `choose_clip` hands over how values are clipped to the
+// bounds
+const auto diagonal_of = [&](int k, int at) -> T { return unit * (T)(d + at)[k]; };
+const auto sweep_again = [&](auto value, auto clip) {
+    SIMD for (int k = 0; k < n; ++k) {
+        const auto there = [&](int i, int rows, int planes) {
+            return value(i, (int)beside(rows, planes, zm, zp));
+        };
+        const T e = diagonal(k), u = value(k, 0), r = b[k] + around_of(there, k);
+        const T v = u + omega * (quotient(r, e != 0 ? e : (T)1) - u);
+        y[k] = clip(k, 0, e != 0 ? v : (T)0);
+    }
+};
+const auto choose_clip = [&](auto sweeps) {
+    if (!projected)
+        sweeps([](int, int, T v) { return v; });
+    else if (upper)
+        sweeps([&](int k, int at, T v) { return clipped(v, (lower + at)[k], (upper + at)[k]); });
+    else
+        sweeps([&](int k, int at, T v) {
+            const T l = (lower + at)[k];
+            return v < l ? l : v;
+        });
+};
+
 // kernel cycle.out_of_ring: As cycle.sweep, out of a ring of planes, never from zero
 //   compute    S
 //   stencil    F, S
@@ -153,6 +179,62 @@ if (projected) {
     }
     if (n % 2) x[n - 1] += d[n - 1] != 0 ? scale * coarse[n / 2] : (T)0;
 }
+
+// kernel cycle.two_sweeps: y = what two sweeps make of 0, of the weights `first` and `omega`, each
+// clipped to the bounds if projected. A sweep from 0 needs no neighbors, so that it is made again
+// for each of them; on CUDA, where a launch costs more.
+//   compute    S
+//   stencil    F, S
+//   reads      S b, lower?, upper?
+//   writes     S y
+//   numbers    S first, omega; bool projected
+#include "sweep_again"
+const auto sweeps = [&](auto clip) {
+    // the first sweep at a cell of a row `at` elements from ours
+    sweep_again(
+        [&](int k, int at) -> T {
+            const T e = diagonal_of(k, at), v = quotient(first * (b + at)[k], e != 0 ? e : (T)1);
+            return clip(k, at, e != 0 ? v : (T)0);
+        },
+        clip);
+};
+choose_clip(sweeps);
+
+// kernel cycle.correct_and_sweep: y = a sweep of x + scale times the correction of its aggregate,
+// both clipped to the bounds if projected: the correction is made again for each neighbor, on CUDA
+//   compute    S
+//   stencil    F, S
+//   reads      S x, b, lower?, upper?
+//   writes     S y
+//   other      S coarse
+//   numbers    S scale, omega; bool projected
+#include "sweep_again"
+// how far the aggregates of the rows or planes beside ours lie from our own, of `stride` elements
+const auto aside = [](int at, int by, int factor, long long stride) -> int {
+    return (int)stride * (factor < -1 ? ((at + by) >> 1) - (at >> 1) : by);
+};
+const int below_y = aside(P.j, -1, L.fy, L.o2), above_y = aside(P.j, 1, L.fy, L.o2);
+const int below_z = aside(P.k, -1, L.fz, L.o1), above_z = aside(P.k, 1, L.fz, L.o1);
+const auto aggregates = [&](int at) -> int {
+    return at == 0 ? 0 : at == yp ? above_y : at == ym ? below_y : at == zp ? above_z : below_z;
+};
+#ifdef QUADS
+constexpr int odd = 0;  // quads and spans begin with even cells
+#else
+const int odd = P.first & 1;
+#endif
+with_pairs(pairs, [&](auto fx) {
+    const auto sweeps = [&](auto clip) {
+        sweep_again(
+            [&](int k, int at) -> T {
+                const T c = (coarse + aggregates(at))[fx == 2 ? (k + odd) >> 1 : k], v = scale * c,
+                        e = diagonal_of(k, at);
+                return clip(k, at, (x + at)[k] + (e != 0 ? v : (T)0));
+            },
+            clip);
+    };
+    choose_clip(sweeps);
+});
 
 // kernel cycle.bounds: Bounds of a coarse correction: the tightest of its cells' gaps, divided by
 // the over-correction; 0 is always allowed

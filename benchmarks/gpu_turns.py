@@ -1,0 +1,288 @@
+"""Two source trees in turns on a GPU: `python -m benchmarks.gpu_turns --base FOLDER`.
+
+In the source tree:
+
+    git archive COMMIT | tar -x -C out/base    # the other tree, before
+    python -m benchmarks.gpu_turns --base out/base --out benchmarks/results/DEVICE
+
+Workers, a process each, do the same work one after another: this tree, this tree with a cell a
+thread (`WARP_LCP_QUADS=0`), and the other one. Timed are cold solves, solves by methods that take
+grids, and steps of a liquid, of sand and of floating bodies. `turns.json` and the page `turns.md`
+are written after each piece of work, and work that would begin after `--seconds` is left out.
+`--verdict` runs `benchmarks.gpu` after that. `--rehearse` does all of it small, on the CPU in
+CUDA's form (`benchmarks/emulated_cuda.py`).
+"""
+
+import importlib
+import sys
+
+if __name__ == "__main__" and "--rehearse" in sys.argv and "--worker" in sys.argv:
+    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+
+# ruff: isort: split
+
+import argparse
+import json
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+ANSWER = "ANSWER "  # begins the line of a worker that has one
+METHODS = (
+    "ProjectedMultigrid",
+    "MinimumMapNewton",
+    "PrimalDualActiveSet",
+    "MPRGP",
+    "InteriorPoint",
+    "FischerNewton",
+    "AcceleratedProjectedGradient",
+    "ProjectedSOR",
+)
+SCENES = {"liquid": "dam-break", "sand": "column-collapse", "bodies": "floating-bodies"}
+MOST_ITERATIONS = 200  # of a method: some take thousands
+BEFORE, TIMED = 10, 10  # steps until the material moves, and those that are timed
+SOLVES = 3  # timed, of which the least counts
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Cells along an axis of each kind of work."""
+
+    solves: tuple[int, ...] = (128, 256, 512)
+    methods: int = 128
+    steps: tuple[int, ...] = (64, 128, 256)
+    before: int = BEFORE
+    timed: int = TIMED
+
+
+SMALL = Sizes(solves=(16,), methods=8, steps=(16,), before=1, timed=1)
+
+
+def pieces(sizes: Sizes) -> Iterator[tuple[str, str, int]]:
+    """Yield what is timed: its kind, the method or scene, and cells along an axis."""
+    for n in sizes.solves:
+        yield "cold solve", "ProjectedMultigrid", n
+    for n in sizes.steps:
+        for name in SCENES:
+            yield "step", name, n
+    for name in METHODS[1:]:
+        yield "solve", name, sizes.methods
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Return the time of some work on the device [s], and what it returns."""
+    import warp as wp
+
+    wp.synchronize()
+    start = time.perf_counter()
+    found = work()
+    wp.synchronize()
+    return time.perf_counter() - start, found
+
+
+def solve(method: str, n: int, device: str) -> dict[str, float | str]:
+    """Return the least time of a solve from 0 to 1e-6 [ms], its iterations and its status."""
+    import warp_lcp as wl
+    from warp_lcp.benchmarks.problems import splash
+
+    problem = splash(n).lcp("walls", device=device)
+    made = getattr(wl, method)()
+    workspace = made.init(problem)
+    stopping = wl.StoppingCriteria(rtol=1e-6, max_iterations=MOST_ITERATIONS)
+    work = lambda: wl.solve(problem, made, stopping=stopping, workspace=workspace)  # noqa: E731
+    work()  # loads kernels and captures graphs
+    times, results = zip(*(timed(work) for _ in range(SOLVES)), strict=True)
+    last = results[-1]
+    return {"ms": 1e3 * min(times), "iterations": last.iterations, "status": last.status.name}
+
+
+def step(scene: str, n: int, device: str, sizes: Sizes) -> dict[str, float | str]:
+    """Return the mean time of a step of a scene [ms]."""
+    from warp_lcp.scene.scene_file import load_scene
+    from warp_lcp.scene.simulator import simulators
+
+    loaded = load_scene(SCENES[scene], [f"domain.resolution={n}"])
+    kind = simulators()[loaded.scene.simulator]
+    simulation = kind.create(loaded, device=device, folder=Path.cwd())
+
+    def steps(count: int) -> None:
+        for _ in range(count):
+            simulation.step(simulation.stable_dt())
+
+    steps(sizes.before)
+    seconds, _ = timed(lambda: steps(sizes.timed))
+    return {"ms": 1e3 * seconds / sizes.timed}
+
+
+def worker(device: str, sizes: Sizes) -> None:
+    """Do what lines of the standard input ask for, and answer by lines."""
+    for line in sys.stdin:
+        kind, name, n = json.loads(line)
+        try:
+            found = step(name, n, device, sizes) if kind == "step" else solve(name, n, device)
+        except Exception as error:  # what fails is written down, and the next piece of work follows
+            found = {"error": f"{type(error).__name__}: {error}"[:300]}
+        print(f"\n{ANSWER}{json.dumps(found)}", flush=True)
+
+
+class Worker:
+    """A process that does the work from a source tree.
+
+    Args:
+        tree: of the package.
+        quads: value of `WARP_LCP_QUADS`.
+        rehearse: whether it works on the CPU in CUDA's form.
+        device: Warp device.
+    """
+
+    def __init__(self, tree: Path, quads: str, *, rehearse: bool, device: str) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(tree), "WARP_LCP_QUADS": quads}
+        command = [sys.executable, "-P", __file__, "--worker", "--device", device]
+        self._process = subprocess.Popen(
+            [*command, *["--rehearse"] * rehearse],
+            cwd=tree,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def ask(self, piece: tuple[str, str, int]) -> dict[str, Any]:
+        """Return what a piece of work has come to."""
+        asked, answers = self._process.stdin, self._process.stdout
+        assert asked is not None
+        assert answers is not None
+        try:
+            asked.write(f"{json.dumps(piece)}\n")
+            asked.flush()
+        except BrokenPipeError:
+            return {"error": "its process has ended"}
+        for line in answers:
+            if line.startswith(ANSWER):
+                return json.loads(line.removeprefix(ANSWER))
+        return {"error": f"its process has ended with {self._process.wait()}"}
+
+    def end(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+
+
+@dataclass
+class Turns:
+    """All pieces of work by all workers, and what they have come to so far."""
+
+    out: Path
+    names: list[str]
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    def add(self, piece: tuple[str, str, int], found: dict[str, dict[str, Any]]) -> None:
+        """Add a piece of work, and write the files."""
+        kind, name, n = piece
+        self.rows.append({"kind": kind, "name": name, "cells": n, "found": found})
+        self.write()
+
+    def write(self) -> None:
+        """Write what there is as JSON and as a page."""
+        kept = {"workers": self.names, "work": self.rows, "left_out": self.left_out}
+        (self.out / "turns.json").write_text(json.dumps(kept, indent=1) + "\n")
+        (self.out / "turns.md").write_text("\n".join(self.page()) + "\n")
+
+    def page(self) -> Iterator[str]:
+        """Yield the lines of the page."""
+        yield "# Two source trees in turns"
+        yield ""
+        yield "Milliseconds; iterations of solves to 1e-6. Written by `benchmarks/gpu_turns.py`."
+        yield ""
+        yield f"| work | cells | {' | '.join(self.names)} |"
+        yield "|---|---|" + "---|" * len(self.names)
+        for row in self.rows:
+            cells = [shown(row["found"].get(name, {})) for name in self.names]
+            yield f"| {row['kind']}: {row['name']} | {row['cells']} | {' | '.join(cells)} |"
+        if self.left_out:
+            yield ""
+            yield f"Left out, for the time was over: {', '.join(self.left_out)}."
+
+
+def shown(found: dict[str, Any]) -> str:
+    """Return what a piece of work has come to, for the page."""
+    if "ms" not in found:
+        return found.get("error", "")
+    if "iterations" not in found:
+        return f"{found['ms']:.3g}"
+    status = "" if found["status"] == "CONVERGED" else f", {found['status']}"
+    return f"{found['ms']:.3g} in {found['iterations']}{status}"
+
+
+def run(given: argparse.Namespace) -> int:
+    """Time everything in turns; return the exit status."""
+    begun, sizes = time.monotonic(), SMALL if given.rehearse else Sizes()
+    given.out.mkdir(parents=True, exist_ok=True)
+    device = "cpu" if given.rehearse else given.device
+    trees = {"this tree": (ROOT, "1"), "this tree, a cell a thread": (ROOT, "0")}
+    if given.base is not None:
+        trees["other tree"] = given.base.resolve(), "1"
+    workers = {
+        name: Worker(tree, quads, rehearse=given.rehearse, device=device)
+        for name, (tree, quads) in trees.items()
+    }
+    turns = Turns(given.out, list(workers))
+    try:
+        wanted = [piece for piece in pieces(sizes) if given.only in f"{piece[0]}: {piece[1]}"]
+        for turn, piece in enumerate(wanted):
+            if time.monotonic() - begun > given.seconds:
+                turns.left_out.append(" ".join(map(str, piece)))
+                continue
+            order = list(workers)
+            order = order[turn % len(order) :] + order[: turn % len(order)]
+            turns.add(piece, {name: workers[name].ask(piece) for name in order})
+            print(list(turns.page())[-1], flush=True)
+    finally:
+        for one in workers.values():
+            one.end()
+    turns.write()
+    print(f"{given.out}/turns.md and turns.json ({time.monotonic() - begun:.0f} s)", flush=True)
+    return verdict(given) if given.verdict else 0
+
+
+def verdict(given: argparse.Namespace) -> int:
+    """Run `benchmarks.gpu`; return its exit status, 124 where its time is over."""
+    command = [sys.executable, "-m", "benchmarks.gpu", "--out", str(given.out)]
+    command += ["--rehearse"] if given.rehearse else ["--device", given.device]
+    try:
+        done = subprocess.run(command, cwd=ROOT, check=False, timeout=given.verdict)
+    except subprocess.TimeoutExpired:
+        return 124
+    return done.returncode
+
+
+def main() -> int:
+    """Time two trees, or be a worker."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--base", type=Path, help="folder of the other source tree")
+    parser.add_argument("--out", type=Path, default=Path("out/turns"))
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--seconds", type=float, default=300, help="no work begins after these")
+    parser.add_argument(
+        "--verdict", type=float, metavar="SECONDS", help="of `benchmarks.gpu`, at most"
+    )
+    parser.add_argument("--only", default="", help="work whose name has this, as `step: sand`")
+    parser.add_argument("--rehearse", action="store_true", help="small, on the CPU in CUDA's form")
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.worker:
+        worker("cpu" if given.rehearse else given.device, SMALL if given.rehearse else Sizes())
+        return 0
+    return run(given)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
