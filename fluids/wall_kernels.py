@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I16, I32, cell_below
+from warp_lcp.grid.cell_kernel import F32, I16, I32, cell_below, of_axis
 from warp_lcp.grid.cut_cells_kernels import Moving, moving_part, open_face
 
 
@@ -38,31 +38,17 @@ class Walls:
 @wp.func
 def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
     """Return the open fraction of a face among cut cells, and the number of the solid that closes it."""
-    free = S.open_x[k, j, i]
-    wall = S.wall_x[k, j, i]
-    if axis == 1:
-        free = S.open_y[k, j, i]
-        wall = S.wall_y[k, j, i]
-    if axis == 2:
-        free = S.open_z[k, j, i]
-        wall = S.wall_z[k, j, i]
+    free = of_axis(axis, S.open_x, S.open_y, S.open_z, k, j, i)
+    wall = of_axis(axis, S.wall_x, S.wall_y, S.wall_z, k, j, i)
     return free, int(wall)
 
 
 @wp.func
 def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
     """Return the thin solid that crosses a face, 0 if none does, and its distance from the cells below and above [cells]."""
-    number = S.number_x[k, j, i]
-    below = S.below_x[k, j, i]
-    above = S.above_x[k, j, i]
-    if axis == 1:
-        number = S.number_y[k, j, i]
-        below = S.below_y[k, j, i]
-        above = S.above_y[k, j, i]
-    if axis == 2:
-        number = S.number_z[k, j, i]
-        below = S.below_z[k, j, i]
-        above = S.above_z[k, j, i]
+    number = of_axis(axis, S.number_x, S.number_y, S.number_z, k, j, i)
+    below = of_axis(axis, S.below_x, S.below_y, S.below_z, k, j, i)
+    above = of_axis(axis, S.above_x, S.above_y, S.above_z, k, j, i)
     return int(number), below, above
 
 
@@ -185,6 +171,20 @@ def wall_way(S: Walls, k: int, j: int, i: int):
             wp.where(S.planes == 2, float(2 * (n >> 2) - 1), 0.0),
         )
     return -mean * wp.normalize(slope)
+
+
+@wp.func
+def cell_center(S: Walls, k: int, j: int, i: int):
+    """Return the center of a cell [m], z = 0 in 2-D."""
+    o = S.origin
+    half = wp.float64(0.5)
+    x = wp.vec3d(
+        wp.float64(i + o[0]) - half, wp.float64(j + o[1]) - half, wp.float64(k + o[2]) - half
+    )
+    x = x * S.spacing
+    if S.planes == 1:
+        x[2] = wp.float64(0.0)
+    return x
 
 
 @wp.func
