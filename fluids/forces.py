@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids import forces_kernels as kernels
+from warp_lcp.fluids.thin_forces_kernels import thin_pressure_kernel
 from warp_lcp.fluids.wall_kernels import Walls
 from warp_lcp.grid.cell_kernel import scan
 from warp_lcp.grid.solids import Geometry
@@ -241,6 +242,9 @@ class SolidForces:
                 kernels.pressure_kernel, window, self.references, [*kernel_args, *self._kick, scale]
             )
         )
+        if sums.grid.barriers is not None:
+            thin = [simulation.boundary.touch, projection.pressure, *self._kick, scale]
+            self.add(sums.take(thin_pressure_kernel, window, self.references, thin))
 
     @staticmethod
     def push(bodies: RigidBodies, impulses: np.ndarray) -> None:

@@ -65,6 +65,12 @@ def pressure_kernel(
                 b = j + wp.where(axis == 1, high, 0)
                 a = i + wp.where(axis == 0, high, 0)
                 owner, own, covered, mover, moved = closed_on(S, axis, c, b, a)
+                if S.number_x:
+                    crossed, _below, _above = crossing_on(S, axis, c, b, a)
+                    if crossed > 0:  # `thin_pressure_kernel` has it
+                        own = 0.0
+                        covered = 0.0
+                        moved = 0.0
                 stopped = u[c, b, a]
                 if axis == 1:
                     stopped = v[c, b, a]

@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I16, I32, cell_below
+from warp_lcp.grid.cell_kernel import F32, I16, I32, cell_below, of_axis
 from warp_lcp.grid.cut_cells_kernels import Moving, moving_part, open_face
 
 
@@ -203,6 +203,20 @@ def wall_way(S: Walls, k: int, j: int, i: int):
             wp.where(S.planes == 2, float(2 * (n >> 2) - 1), 0.0),
         )
     return -mean * wp.normalize(slope)
+
+
+@wp.func
+def cell_center(S: Walls, k: int, j: int, i: int):
+    """Return the center of a cell [m], z = 0 in 2-D."""
+    o = S.origin
+    half = wp.float64(0.5)
+    x = wp.vec3d(
+        wp.float64(i + o[0]) - half, wp.float64(j + o[1]) - half, wp.float64(k + o[2]) - half
+    )
+    x = x * S.spacing
+    if S.planes == 1:
+        x[2] = wp.float64(0.0)
+    return x
 
 
 @wp.func

@@ -91,3 +91,27 @@ def test_a_shaken_box_keeps_its_sand(thickness: float) -> None:
     pose = simulation.boundary.cut.solids[0].motion.pose(simulation.time)
     own = (simulation.particles.position.numpy() - pose.translation)[:, :2]
     assert own.min() > low - 1e-3 * CELL and own.max() < high + 1e-3 * CELL
+
+
+@pytest.mark.slow
+def test_a_hopper_with_thin_sides_discharges_as_one_with_thick_sides() -> None:
+    """Its neck is 8 cells wide: gaps between thin walls are whole numbers of cells."""
+    cells, foot, neck, angle = 48, 0.4, 8, 30.0
+    cell, slope = 1.0 / cells, np.tan(np.radians(angle))
+
+    def discharged(thickness: float) -> int:
+        sides = []
+        for sign in (-1.0, 1.0):
+            x = 0.5 + 0.5 * sign * neck * cell
+            ends = sorted([x, x + sign * thickness * cell])
+            place = {"rotate": -sign * angle, "about": [x, foot], "friction": 0.3}
+            sides.append(box([ends[0], foot], [ends[1], foot + 0.75], **place))
+        sand = []
+        for y in np.arange(foot, foot + 0.5, 0.5 * cell):
+            half = 0.5 * neck * cell + (y - foot + 0.25 * cell) * slope
+            sand.append(box([0.5 - half, y], [0.5 + half, y + 0.5 * cell]))
+        domain = {"size": [1.0, 1.0], "resolution": cells}
+        simulation, _ = simulate(0.5, sand, sides, domain=domain)
+        return int(np.count_nonzero(simulation.particles.position.numpy()[:, 1] < foot))
+
+    assert discharged(0.6) == pytest.approx(discharged(3.05), rel=0.03)

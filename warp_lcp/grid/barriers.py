@@ -16,8 +16,10 @@ from typing import no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid import barriers_kernels as kernels
-from warp_lcp.grid.barriers_kernels import CENTERS
+from warp_lcp.grid import barrier_faces_kernels as faces_kernels
+from warp_lcp.grid import barrier_transfer_kernels as transfer_kernels
+from warp_lcp.grid import barrier_velocity_kernels as velocity_kernels
+from warp_lcp.grid.barrier_geometry import CENTERS, REACH, Barrier
 from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particle_loops import MARGIN
@@ -26,15 +28,16 @@ from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rows.program import copy
 
-# cells: corners of cells lie close enough in what is thicker, at any angle, to close its faces
-BARRIER = {2: 1.5, 3: 1.75}
+# Cells. The level set and velocities are continued two layers into what is thicker and cuts cells;
+# in thinner solids they would reach the layers of the other side.
+BARRIER = 3.0
 PARTS = {2: 6, 3: 3}  # points of a cell an axis, for the share of its kernel that its center sees
 PARTS_MOVING = {2: 4, 3: 2}  # the same, at each step
 COST = 256  # of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
 
-@list_kernel("warp_lcp.grid.barriers_bring")
+@list_kernel("warp_lcp.grid.barriers.bring")
 @no_type_check
 def bring_kernel(i, start: POINTS, aim: POINTS, position: POINTS):
     """Bring a particle to its aim, if it has one that is not its start."""
@@ -71,7 +74,7 @@ class Barriers:
         self.number, self._share, self._scratch = grid.faces(wp.int16), grid.field(), grid.faces()
         self.below, self.above = grid.faces(), grid.faces()
         self._share.fill_(1.0)
-        self._barrier = kernels.Barrier()
+        self._barrier = Barrier()
         self._barrier.shapes, self._barrier.groups, self._barrier.near = (
             walls.shapes,
             walls.groups,
@@ -102,13 +105,14 @@ class Barriers:
         before, self._window = self._window or now, now  # what is no longer near is marked so
         low, high = [*map(min, now.low, before.low)], [*map(max, now.high, before.high)]
         self._all = Window.of(low, high, grid.device)
-        self._all.launch(kernels.near_kernel, [barrier, self.near])
+        self._all.launch(faces_kernels.near_kernel, [barrier, self.near])
         for axis, apart in enumerate(self.apart):
             self._all.launch(
-                kernels.apart_kernel, [barrier, CENTERS if axis == grid.dimension else axis, apart]
+                faces_kernels.apart_kernel,
+                [barrier, CENTERS if axis == grid.dimension else axis, apart],
             )
         parts = (PARTS_MOVING if self.walls.moves else PARTS)[grid.dimension]
-        self._all.launch(kernels.share_kernel, [barrier, parts, self._share])
+        self._all.launch(faces_kernels.share_kernel, [barrier, parts, self._share])
 
     def _around(self) -> Window:
         """Return the cells near the solids, those of the ring among them."""
@@ -120,9 +124,7 @@ class Barriers:
         last = np.clip(
             np.floor(high / grid.spacing) - np.array(grid.origin), -1, np.array(grid.counts)
         ).astype(int)
-        return grid.window(
-            first.tolist(), last.tolist(), grow=int(np.ceil(kernels.REACH)) + 1, shift=1
-        )
+        return grid.window(first.tolist(), last.tolist(), grow=int(np.ceil(REACH)) + 1, shift=1)
 
     def cross(self) -> None:
         """Close the faces that the solids cross, after the cut cells have been placed."""
@@ -132,16 +134,19 @@ class Barriers:
         ):
             gaps = self.below[axis], self.above[axis]
             if cut.velocity is not None:
-                self._all.launch(kernels.forget_kernel, [number, cut.velocity[axis]])
+                self._all.launch(faces_kernels.forget_kernel, [number, cut.velocity[axis]])
             self._all.launch(
-                kernels.cross_kernel, [barrier, axis, self.apart[-1], open_, wall, number, *gaps]
+                faces_kernels.cross_kernel,
+                [barrier, axis, self.apart[-1], open_, wall, number, *gaps],
             )
         inner = self._all.common(self.grid.domain)
         if inner is not None:
-            inner.launch(kernels.solid_kernel, [barrier, *(*cut.open, *cut.open[:1])[:3], cut.base])
-        self.grid.everywhere.launch(kernels.calm_kernel, [self.near, cut.base, self.calm])
+            inner.launch(
+                faces_kernels.solid_kernel, [barrier, *(*cut.open, *cut.open[:1])[:3], cut.base]
+            )
+        self.grid.everywhere.launch(faces_kernels.calm_kernel, [self.near, cut.base, self.calm])
         if cut.capacity is not None:
-            self._all.launch(kernels.capacity_kernel, [self._share, cut.capacity])
+            self._all.launch(faces_kernels.capacity_kernel, [self._share, cut.capacity])
 
     def set_velocity(self) -> None:
         """Set the velocity of the crossed faces, after those of the cut cells."""
@@ -150,7 +155,7 @@ class Barriers:
             zip(self.number, cut.velocity or (), strict=False)
         ):
             self._all.launch(
-                kernels.wall_velocity_kernel,
+                faces_kernels.wall_velocity_kernel,
                 [self._barrier, axis, number, cut.turn, cut.shift, velocity],
             )
 
@@ -165,7 +170,7 @@ class Barriers:
         for axis, (number, below, above) in enumerate(
             zip(self.number, self.below, self.above, strict=True)
         ):
-            self._all.launch(kernels.whole_kernel, [axis, number, below, above, index])
+            self._all.launch(faces_kernels.whole_kernel, [axis, number, below, above, index])
 
     def notes(self) -> list[str]:
         """Return a warning for each solid beside which a gap is too narrow for the grid."""
@@ -173,7 +178,7 @@ class Barriers:
         gaps = wp.zeros(len(cut.names), dtype=wp.int32, device=self.grid.device)
         if inner is not None:
             for axis, (number, open_) in enumerate(zip(self.number, cut.open, strict=True)):
-                inner.launch(kernels.gap_kernel, [self._barrier, axis, open_, number, gaps])
+                inner.launch(faces_kernels.gap_kernel, [self._barrier, axis, open_, number, gaps])
         cell = f"a cell of {self.grid.spacing:.4g} m"
         return [
             f"{name}: a gap beside it is narrower than {cell} and lets nothing through ({count} "
@@ -195,7 +200,7 @@ class Barriers:
     ) -> None:
         """Average velocities again on faces near the solids; arguments as of `warp_lcp.grid.transfer.particles_to_faces`."""
         window.launch(
-            kernels.gather_kernel,
+            transfer_kernels.gather_kernel,
             [self._barrier, axis, offsets, position, velocity, gradient, field, weight],
         )
 
@@ -217,14 +222,20 @@ class Barriers:
         """
         given = [self._barrier, axis, field, saved, flip, before, position, velocity, gradient]
         launch_list(
-            kernels.interpolate_kernel, len(position), given, device=self.grid.device, cost=COST
+            transfer_kernels.interpolate_kernel,
+            len(position),
+            given,
+            device=self.grid.device,
+            cost=COST,
         )
 
     def density(
         self, window: Window, offsets: wp.array, position: wp.array, density: wp.array, each: float
     ) -> None:
         """Add up particles again in cells near the solids, `each` of them."""
-        window.launch(kernels.density_kernel, [self._barrier, each, offsets, position, density])
+        window.launch(
+            transfer_kernels.density_kernel, [self._barrier, each, offsets, position, density]
+        )
 
     def carry(self, velocity: Faces, dt: float, start: wp.array) -> None:
         """Find where particles near the solids go by what they see of the velocity, before the solids move.
@@ -240,17 +251,12 @@ class Barriers:
             )
         aim = self._aim[: len(start)]
         copy(aim, start)
-        given = [
-            self._barrier,
-            self.cut.distance,
-            *three_components(velocity),
-            dt,
-            self._low,
-            self._high,
-            start,
-            aim,
-        ]
-        launch_list(kernels.carry_kernel, len(start), given, device=self.grid.device, cost=COST)
+        ends = [self._low, self._high, wp.vec3(*self.walls.least), wp.vec3(*self.walls.most)]
+        fields = three_components(velocity)
+        given = [self._barrier, self.cut.distance, *fields, dt, *ends, start, aim]
+        launch_list(
+            transfer_kernels.carry_kernel, len(start), given, device=self.grid.device, cost=COST
+        )
 
     def bring(self, start: wp.array, position: wp.array) -> None:
         """Bring particles to where `carry` has found.
@@ -285,7 +291,7 @@ class Barriers:
             contact: uint8, `released` where material leaves its wall.
             released: see there.
         """
-        components, marks = kernels.Components(), kernels.Marks()
+        components, marks = velocity_kernels.Components(), velocity_kernels.Marks()
         for name, field, mark in zip("uvw", velocity, known, strict=False):
             setattr(components, name, field)
             setattr(marks, name, mark)
@@ -304,8 +310,8 @@ class Barriers:
                 released,
                 result,
             ]
-            window.launch(kernels.constrain_kernel, given)
+            window.launch(velocity_kernels.constrain_kernel, given)
         for number, result, field, mark in zip(
             self.number, self._scratch, velocity, known, strict=True
         ):
-            window.launch(kernels.take_kernel, [number, result, field, mark])
+            window.launch(velocity_kernels.take_kernel, [number, result, field, mark])

@@ -56,6 +56,35 @@ def cell_below(axis: int, k: int, j: int, i: int):
 
 
 @wp.func
+def next_to(axis: int, step: int, k: int, j: int, i: int):
+    """Return the cell that is `step` cells further along an axis."""
+    return (
+        k + wp.where(axis == 2, step, 0),
+        j + wp.where(axis == 1, step, 0),
+        i + wp.where(axis == 0, step, 0),
+    )
+
+
+@wp.func
+def of_axis(axis: int, x: Any, y: Any, z: Any, k: int, j: int, i: int):
+    """Return the value at a face of the component along an axis; z is null in 2-D."""
+    value = x[k, j, i]
+    if axis == 1:
+        value = y[k, j, i]
+    if axis == 2:
+        value = z[k, j, i]
+    return value
+
+
+@wp.func
+def spline(d: float):
+    """Return the quadratic B-spline at a distance in cells."""
+    a = wp.abs(d)
+    outer = wp.max(1.5 - a, 0.0)
+    return wp.where(a < 0.5, 0.75 - a * a, 0.5 * outer * outer)
+
+
+@wp.func
 def interpolated(field: F32, planes: int, x: float, y: float, z: float):
     """Return what lies between a field's elements, at coordinates that are brought within the array; in 2-D those of the plane k = 1."""
     cx = wp.clamp(x, 0.0, float(field.shape[2]) - 1.001)

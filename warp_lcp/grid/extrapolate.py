@@ -6,8 +6,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.barriers_kernels import fill_layer_kernel
-from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel, next_to
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.rows import KernelFile
@@ -27,6 +26,36 @@ LAYER = KERNELS["warp_lcp.grid.extrapolate.fill_layer"]
 def weighted_kernel(k, j, i, least: float, weight: F32, known: I8):
     """Mark the faces that particles gave more weight than `least`."""
     known[k, j, i] = wp.where(weight[k, j, i] > least, wp.int8(1), wp.int8(0))
+
+
+@cell_kernel("warp_lcp.grid.barriers.fill")
+@typing.no_type_check
+def fill_side_kernel(k, j, i, layer: int, fill: int, apart: U8, known: I8, field: F32):
+    """Fill faces marked `fill` from neighbors known up to `layer` that no solid stands between, and mark them layer + 1."""
+    if int(known[k, j, i]) == fill:
+        total = float(0.0)
+        count = float(0.0)
+        for n in range(6):
+            d = n >> 1
+            side = 2 * (n & 1) - 1
+            c, b, a = next_to(d, side, k, j, i)
+            if (
+                c >= 0
+                and b >= 0
+                and a >= 0
+                and c < known.shape[0]
+                and b < known.shape[1]
+                and a < known.shape[2]
+            ):
+                mark = int(known[c, b, a])
+                if mark > 0 and mark <= layer:
+                    bits = int(apart[wp.max(c, k), wp.max(b, j), wp.max(a, i)])
+                    if (bits >> d) & 1 == 0:
+                        total += field[c, b, a]
+                        count += 1.0
+        if count > 0.0:
+            field[k, j, i] = total / count
+            known[k, j, i] = wp.int8(layer + 1)
 
 
 def complete(
@@ -101,6 +130,6 @@ def extrapolate(
         if apart is None:
             window.run(LAYER, known=known, field=field, layer=layer, fill=fill)
         else:
-            window.launch(fill_layer_kernel, [layer, fill, apart, known, field])
+            window.launch(fill_side_kernel, [layer, fill, apart, known, field])
         if join is not None:
             join(known, field)

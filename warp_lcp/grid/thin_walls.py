@@ -25,7 +25,7 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rows.program import copy
 
-THIN = 2.5  # cells: what is thinner is met as its exact shape
+THIN = 3.0  # cells: what is thinner is met as its exact shape
 STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
 # cells by which shapes are larger than they are, so that there is no crack between those that touch
 SKIN = 1e-4
@@ -80,12 +80,15 @@ class ThinWalls:
         grid: the grid; any part of the domain's.
         solids: of the scene; numbers of walls are 1 + s.
         thin: which of them these are.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there, for
+            good or to the other end of an axis.
 
     Attributes:
         enabled: whether scenes have them: not yet on ranks, so they are asked for.
         numbers: of these solids.
         moves: whether one of them moves.
+        least: smallest coordinates of particles [m], -inf where they may leave.
+        most: largest coordinates, likewise.
     """
 
     enabled: ClassVar[bool] = os.environ.get("WARP_LCP_THIN_WALLS") == "1"
@@ -137,7 +140,7 @@ class ThinWalls:
                 if axis < grid.dimension and not open_sides >> (2 * axis + 1) & 1
                 else np.inf
             )
-        self._margin, self._low, self._high = wp.float64(margin), wp.vec3d(*low), wp.vec3d(*high)
+        self._margin, self.least, self.most = wp.float64(margin), low, high
         self._start = wp.empty(0, dtype=wp.vec3, device=grid.device)
         self.place(0.0)
         self.place(0.0)
@@ -200,7 +203,7 @@ class ThinWalls:
         launch_list(
             kernels.stop_kernel,
             len(position),
-            [*given, self._low, self._high],
+            [*given, wp.vec3d(*self.least), wp.vec3d(*self.most)],
             device=self.grid.device,
             cost=COST,
         )

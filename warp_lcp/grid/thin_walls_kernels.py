@@ -11,6 +11,7 @@ from warp_lcp.grid.cell_kernel import POINTS, list_kernel
 
 MODULE = "warp_lcp.grid.thin_walls"
 BOX, SPHERE, CAPSULE, MESH = 0, 1, 2, 3
+PUSHES = 4  # times that a particle is put off the solids that it starts in, each of them in turn
 SLIDES = 12  # walls that a particle slides along in a step, one after another
 ROUNDS = 8  # how often a path is looked at again among solids of different motions
 ROOM = 0.25  # of the distance that particles keep, that they have in corners at least
@@ -285,12 +286,19 @@ def free_way(
     its way is looked at; where no more can be done it stops at the end of the last one that was
     free.
     """
-    x, met = clear_of(shapes, first, end, start, margin, planes, True)
-    for _again in range(3):
-        x, _more = clear_of(shapes, first, end, x, margin, planes, True)
+    # loops whose counts are variables are not unrolled: a twelfth of the code
+    pushes = int(PUSHES)
+    slides = int(SLIDES)
+    halvings = int(HALVINGS)
+    x = start
+    met = bool(False)
+    for _push in range(pushes):
+        x, more = clear_of(shapes, first, end, x, margin, planes, True)
+        if more:
+            met = True
     target = aim
     going = bool(True)
-    for _slide in range(SLIDES):
+    for _slide in range(slides):
         if going:
             t, normal, which = first_hit(shapes, first, end, x, target, -1)
             n = in_plane(normal, planes)
@@ -308,9 +316,9 @@ def free_way(
                     # the corner of two walls: as far as a place that rounding does not take into
                     # one of them
                     s = wp.max(t - margin / wp.max(wp.length(way), _TINY), _ZERO)
-                    for _half in range(HALVINGS):
+                    for half in range(halvings):
                         if not has_room(shapes, first, end, x + s * way, room):
-                            s = wp.where(_half == HALVINGS - 1, _ZERO, wp.float64(0.5) * s)
+                            s = wp.where(half == HALVINGS - 1, _ZERO, wp.float64(0.5) * s)
                     x = x + s * way
                     going = False
                 else:

@@ -414,13 +414,13 @@ class CutBoundary:
         """Find where particles go by what they see of the velocity among thin solids, before those move."""
         if self.thin is not None:
             self.thin.remember(position)
-            if self.barriers is not None and not self._endless:
+            if self.barriers is not None:
                 self.barriers.carry(fields, dt, self.thin.start_of(position))
 
     def _stop_at_thin_walls(self, position: wp.array, *, still: bool) -> None:
         """Have particles go where that was, and stop them at thin solids, which have moved unless `still`."""
         if self.thin is not None:
-            if self.barriers is not None and not self._endless:
+            if self.barriers is not None:
                 self.barriers.bring(self.thin.start_of(position), position)
             self.thin.stop(position, still=still)
 

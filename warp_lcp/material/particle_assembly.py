@@ -154,8 +154,9 @@ def make_boundary(
             raise ValueError(
                 'wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion'
             )
+        passed = sides | side_bits(periodic_sides(scene.endless))
         thin, crossing = (
-            make_thin_walls(scene, grid, placed, sides, crossing=c) for c in (False, True)
+            make_thin_walls(scene, grid, placed, passed, crossing=c) for c in (False, True)
         )
         numbers = crossing.numbers if crossing is not None else ()
         cut = CutCells(
@@ -200,7 +201,7 @@ def make_thin_walls(
         scene: the scene.
         grid: its grid.
         placed: its solids.
-        open_sides: of `warp_lcp.grid.sides.side_bits`.
+        open_sides: of `warp_lcp.grid.sides.side_bits`, those of axes without an end among them.
         crossing: only those that are too thin to cut cells, but for rigid bodies, which the
             pressure pushes by the cells that they cut.
     """
@@ -208,7 +209,7 @@ def make_thin_walls(
         return None
     least = dict.fromkeys((False, True), THIN) | {True: max(THIN, scene.time.cfl + STRIDE_ROOM)}
     if crossing:
-        least = dict.fromkeys(least, BARRIER[grid.dimension])
+        least = dict.fromkeys(least, BARRIER)
     thin = [
         is_thin(solid.geometry, least[solid.motion is not None] * grid.spacing, grid.device)
         and not (solid.motion is None and fills_cells(solid.geometry, grid, DEEP))

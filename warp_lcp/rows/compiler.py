@@ -15,14 +15,16 @@ HEADER_FLAGS = "-DWP_NO_BFLOAT16= -fpch-instantiate-templates"
 # LLVM inlines the functions of a module before it optimizes any, instead of optimizing a kernel
 # again at each level of calls: a fifth less time for code of the same size.
 INLINE_FIRST = "-mllvm=-enable-module-inliner"
-# Not so in these modules: sums of the first four would be rounded in another order; the last one
-# has large functions that are called from many places, and would be four times as long.
+# Not so in these modules: sums of the first four would be rounded in another order; the others have
+# large functions that are called from many places, and would be four times as long.
 INLINE_LATER = (
     "fluids.surface_tension",
     "fluids.viscosity",
     "warp_lcp.interior_point.",
     "warp_lcp.nonsmooth_map.",
     "warp_lcp.grid.mesh_crossings",
+    "warp_lcp.grid.barriers",
+    "warp_lcp.grid.thin_walls",
 )
 # Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
 LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE

@@ -1,0 +1,277 @@
+# mypy: ignore-errors
+"""Kernel of the pressure's force on thin solids, by the vector area of the wall between cells."""
+
+import warp as wp
+
+from warp_lcp.fluids.wall_kernels import Walls, cell_center, crossing_on, fields_on, put
+from warp_lcp.grid.cell_kernel import F64, INTS, U8, cell_kernel, next_to
+
+OPEN = -1.0  # the distance to a wall along an edge that none crosses
+MIDWAY = 0.5  # cells: the distance to other walls, which close a face between two cells
+PASSES = 4  # over the corners of a cube, to find which are connected
+
+_OPEN, _MIDWAY = wp.constant(OPEN), wp.constant(MIDWAY)
+Distances = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
+Numbers = wp.types.matrix(shape=(8, 3), dtype=wp.int32)
+
+
+@wp.struct
+class Cube:
+    """The cube, in 2-D the square, between the centers of neighboring cells.
+
+    Bit `a` of a corner's number says whether it is the far one along axis a.
+    """
+
+    distance: Distances  # from a corner to the wall on the edge along an axis [cells], OPEN without
+    number: Numbers  # of the thin solid there, 0: another wall
+    sides: wp.vec3i  # in which direction the far corners lie, 1 or -1
+    planes: int
+
+
+@wp.func
+def edge_of(S: Walls, axis: int, side: int, k: int, j: int, i: int):
+    """Return the distance from a cell's center to the wall before the next center, and its number."""
+    c, b, a = next_to(axis, wp.where(side > 0, 1, 0), k, j, i)
+    distance = _OPEN
+    crossed, below, above = crossing_on(S, axis, c, b, a)
+    if crossed > 0:
+        distance = wp.where(side > 0, below, above)
+    else:
+        free, _wall = fields_on(S, axis, c, b, a)
+        if free == 0.0:
+            distance = _MIDWAY
+    return distance, crossed
+
+
+@wp.func
+def cube_at(S: Walls, octant: int, k: int, j: int, i: int):
+    """Return the cube between a cell's center, its corner 0, and those in an octant around it."""
+    cube = Cube()
+    cube.planes = S.planes
+    cube.sides = wp.vec3i(
+        1 - 2 * (octant & 1), 1 - 2 * ((octant >> 1) & 1), 1 - 2 * ((octant >> 2) & 1)
+    )
+    for n in range(4 * S.planes):
+        a = i + wp.where(n & 1 != 0, cube.sides[0], 0)
+        b = j + wp.where(n & 2 != 0, cube.sides[1], 0)
+        c = k + wp.where(n & 4 != 0, cube.sides[2], 0)
+        for axis in range(S.planes + 1):
+            side = wp.where((n >> axis) & 1 != 0, -cube.sides[axis], cube.sides[axis])
+            distance, number = edge_of(S, axis, side, c, b, a)
+            cube.distance[n, axis] = distance
+            cube.number[n, axis] = number
+    return cube
+
+
+@wp.func
+def connected(cube: Cube):
+    """Return the corners that edges without a wall connect with corner 0, a bit each."""
+    found = int(1)
+    for _pass in range(PASSES):
+        for n in range(4 * cube.planes):
+            if (found >> n) & 1 != 0:
+                for axis in range(cube.planes + 1):
+                    if cube.distance[n, axis] == _OPEN:
+                        found = found | (1 << (n ^ (1 << axis)))
+    return found
+
+
+@wp.func
+def open_length(cube: Cube, found: int, first: int, axis: int):
+    """Return how much of an edge belongs to the connected corners [cells]."""
+    second = first ^ (1 << axis)
+    length = float(0.0)
+    if (found >> first) & 1 != 0:
+        length = wp.where(cube.distance[first, axis] == _OPEN, 1.0, cube.distance[first, axis])
+    if (found >> second) & 1 != 0 and cube.distance[second, axis] != _OPEN:
+        length += cube.distance[second, axis]
+    return length
+
+
+@wp.func
+def arc_area(count: int, a: float, b: float, alike: bool):
+    """Return the part of a square around `count` corners in a row, with walls at a and b beyond.
+
+    One solid is taken to be straight between them; two meet at a right angle.
+    """
+    share = wp.where(alike, 0.5, 1.0)
+    area = 0.5 * (a + b)
+    if count == 1:
+        area = share * a * b
+    if count == 3:
+        area = 1.0 - share * (1.0 - a) * (1.0 - b)
+    return area
+
+
+@wp.func
+def lean(S: Walls, cube: Cube, at: wp.vec3i, corner: int, axis: int, other: int):
+    """Return how much farther the wall along an axis is from the next center away from the square.
+
+    `at` is the cell of corner 0. It is 0 for a wall along the other axis of the square, and -1
+    where there is none.
+    """
+    c, b, a = next_to(0, wp.where(corner & 1 != 0, cube.sides[0], 0), at[2], at[1], at[0])
+    c, b, a = next_to(1, wp.where(corner & 2 != 0, cube.sides[1], 0), c, b, a)
+    c, b, a = next_to(2, wp.where(corner & 4 != 0, cube.sides[2], 0), c, b, a)
+    away = wp.where((corner >> other) & 1 != 0, cube.sides[other], -cube.sides[other])
+    side = wp.where((corner >> axis) & 1 != 0, -cube.sides[axis], cube.sides[axis])
+    result = float(-1.0)
+    beyond = wp.vec3i(a, b, c)
+    beyond[other] = beyond[other] + away
+    if beyond[other] >= 0 and beyond[other] < S.open_x.shape[2 - other]:
+        wall, _number = edge_of(S, other, away, c, b, a)
+        if wall == _OPEN:
+            distance, _number = edge_of(S, axis, side, beyond[2], beyond[1], beyond[0])
+            if distance != _OPEN:
+                result = wp.max(distance - cube.distance[corner, axis], 0.0)
+    return result
+
+
+@wp.func
+def corner_area(a: float, b: float, lean_a: float, lean_b: float):
+    """Return the area between a center and walls at a and b along two axes, continued to a corner.
+
+    Walls x = a - lean_a y and y = b - lean_b x that meet beyond both are two sides of a corner.
+    Else, and where one is not known, a straight wall joins a and b.
+    """
+    area = 0.5 * a * b
+    scale = 1.0 - lean_a * lean_b
+    if lean_a >= 0.0 and lean_b >= 0.0 and scale > 0.0:
+        x = (a - lean_a * b) / scale
+        y = (b - lean_b * a) / scale
+        if x >= 0.0 and y >= 0.0:
+            area = wp.max(area, 0.5 * (a * y + b * x))
+    return area
+
+
+@wp.func
+def open_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, first: int, along: int, other: int):
+    """Return how much of a square of the cube belongs to the connected corners [cells^2].
+
+    Walls on its edges divide its corners, taken around it, into arcs.
+    """
+    area = float(0.0)
+    walls = int(0)
+    for n in range(4):
+        here = first ^ wp.where(n == 1 or n == 2, 1 << along, 0) ^ wp.where(n > 1, 1 << other, 0)
+        back = wp.where(n & 1 != 0, along, other)  # axis of the edge to the corner before
+        if cube.distance[here, back] != _OPEN:
+            walls += 1
+            count = int(1)
+            corner = int(here)
+            ahead = wp.where((n + 1) & 1 != 0, along, other)
+            for m in range(3):
+                if count == m + 1 and cube.distance[corner, ahead] == _OPEN:
+                    corner = corner ^ (1 << ahead)
+                    ahead = wp.where((n + m) & 1 != 0, along, other)
+                    count += 1
+            if (found >> here) & 1 != 0:
+                number = cube.number[here, back]
+                alike = number > 0 and number == cube.number[corner, ahead]
+                a = cube.distance[here, back]
+                b = cube.distance[corner, ahead]
+                if count > 3:
+                    area += 1.0
+                elif count == 1 and alike:
+                    lean_a = lean(S, cube, at, here, back, ahead)
+                    area += corner_area(a, b, lean_a, lean(S, cube, at, here, ahead, back))
+                else:
+                    area += arc_area(count, a, b, alike)
+    if walls == 0 and (found >> first) & 1 != 0:
+        area = 1.0
+    return area
+
+
+@wp.func
+def wall_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, axis: int):
+    """Return the part along an axis of the vector area of the wall around the connected corners.
+
+    It points into the wall [cells, 3-D: cells^2]. With the open parts of the cube's sides it closes
+    the surface of what the wall leaves of the cube, and so has the opposite of their sum.
+    """
+    along = (axis + 1) % (cube.planes + 1)
+    near = float(0.0)
+    far = float(0.0)
+    if cube.planes == 1:
+        near = open_length(cube, found, 0, along)
+        far = open_length(cube, found, 1 << axis, along)
+    else:
+        near = open_area(S, cube, at, found, 0, along, (axis + 2) % 3)
+        far = open_area(S, cube, at, found, 1 << axis, along, (axis + 2) % 3)
+    return float(cube.sides[axis]) * (near - far)
+
+
+@wp.func
+def shared_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, crossed: int):
+    """Return the vector area that the wall on corner 0's edge along an axis has a share in.
+
+    Each part belongs to the walls on edges along its own axis or, without those, to all.
+    """
+    counts = wp.vec3i()
+    for n in range(4 * cube.planes):
+        if (found >> n) & 1 != 0:
+            for axis in range(cube.planes + 1):
+                if cube.distance[n, axis] != _OPEN:
+                    counts[axis] = counts[axis] + 1
+    total = counts[0] + counts[1] + counts[2]
+    area = wp.vec3()
+    for axis in range(cube.planes + 1):
+        if axis == crossed or counts[axis] == 0:
+            sharing = wp.where(counts[axis] == 0, total, counts[axis])
+            area[axis] = wall_area(S, cube, at, found, axis) / float(sharing)
+    return area
+
+
+@cell_kernel("fluids.thin_forces")
+def thin_pressure_kernel(
+    k,
+    j,
+    first,
+    end,
+    S: Walls,
+    references: wp.array(dtype=wp.vec3d),
+    counts: INTS,
+    offsets: INTS,
+    owners: INTS,
+    values: wp.array2d(dtype=wp.float64),
+    touch: U8,
+    x: F64,
+    kick_x: float,
+    kick_y: float,
+    kick_z: float,
+    scale: wp.float64,
+):
+    """Count where thin solids cross the edges from a row's cells, or write the impulses there.
+
+    An edge joins the centers of two cells. x is continued along it, at the gradient of rest, to the
+    wall, and acts on the wall's vector area in the cubes around the edge: `scale` x per face.
+    """
+    row = k * x.shape[1] + j
+    begin = int(0)
+    if values:
+        begin = offsets[row]
+    e = int(begin)
+    kick = wp.vec3(kick_x, kick_y, kick_z)
+    for i in range(first, end):
+        if x[k, j, i] != wp.float64(0.0) and touch[k, j, i] != wp.uint8(0):
+            for n in range(2 * (S.planes + 1)):
+                axis = n >> 1
+                side = 2 * (n & 1) - 1
+                distance, solid = edge_of(S, axis, side, k, j, i)
+                if solid > 0:
+                    if values:
+                        area = wp.vec3()
+                        for octant in range(4 * S.planes):
+                            if ((octant >> axis) & 1 != 0) == (side < 0):
+                                cube = cube_at(S, octant, k, j, i)
+                                area += shared_area(
+                                    S, cube, wp.vec3i(i, j, k), connected(cube), axis
+                                )
+                        more = float(side) * distance * kick[axis]
+                        place = cell_center(S, k, j, i)
+                        way = wp.float64(float(side) * distance) * S.spacing
+                        place[axis] = place[axis] + way
+                        force = scale * (x[k, j, i] + wp.float64(more)) * wp.vec3d(area)
+                        put(e, solid, force, place - references[solid], owners, values)
+                    e += 1
+    counts[row] = e - begin

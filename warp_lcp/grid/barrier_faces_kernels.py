@@ -1,0 +1,208 @@
+# mypy: ignore-errors
+"""Kernels of faces and cells beside thin solids: what these cross and how much of a kernel is seen."""
+
+import warp as wp
+
+from warp_lcp.grid.barrier_geometry import (
+    CENTERS,
+    REACH,
+    SHIFTS,
+    TURNS,
+    Barrier,
+    nearest_wall,
+    place_of,
+    sees,
+    wall_between,
+)
+from warp_lcp.grid.cell_kernel import (
+    F32,
+    I8,
+    I16,
+    I32,
+    INTS,
+    U8,
+    cell_below,
+    cell_kernel,
+    next_to,
+    spline,
+)
+from warp_lcp.operators.grid_poisson import AIR, SOLID
+
+MODULE = "warp_lcp.grid.barriers.faces"
+MOVING = "warp_lcp.grid.barriers.moving"
+WHOLE = "warp_lcp.grid.barriers.whole"
+
+_AIR, _SOLID = wp.constant(wp.int8(AIR)), wp.constant(wp.int8(SOLID))
+
+
+@cell_kernel(MODULE)
+def near_kernel(k, j, i, B: Barrier, near: U8):
+    """Mark the cells that a thin solid is near."""
+    found, _n, _d = nearest_wall(B, place_of(B, CENTERS, k, j, i), REACH * B.dx)
+    near[k, j, i] = wp.where(found > 0, wp.uint8(1), wp.uint8(0))
+
+
+@cell_kernel(MODULE)
+def apart_kernel(k, j, i, B: Barrier, axis: int, apart: U8):
+    """Set bit d where a solid stands between a place of a field and the one before it along axis d."""
+    bits = int(0)
+    if B.near[k, j, i] != wp.uint8(0):
+        x = place_of(B, axis, k, j, i)
+        for d in range(B.planes + 1):
+            c, b, a = next_to(d, -1, k, j, i)
+            y = place_of(B, axis, c, b, a)
+            if not sees(B, x, y):
+                bits = bits | (1 << d)
+    apart[k, j, i] = wp.uint8(bits)
+
+
+@cell_kernel(MODULE)
+def cross_kernel(
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    apart: U8,
+    open: F32,
+    wall: I16,
+    number: I16,
+    below: F32,
+    above: F32,
+):
+    """Close the lower faces between cells whose centers a solid stands between; the domain's stay its own.
+
+    `below` and `above` are the distances to it from the centers of the cells below and above a
+    face, in cells.
+    """
+    crossed = int(0)
+    if (int(apart[k, j, i]) >> axis) & 1 != 0:
+        if wall[k, j, i] != wp.int16(0):
+            x = place_of(B, CENTERS, k, j, i)
+            c, b, a = next_to(axis, -1, k, j, i)
+            y = place_of(B, CENTERS, c, b, a)
+            found, t = wall_between(B, x, y)
+            crossed = found
+            above[k, j, i] = wp.min(t, 1.0)
+            # which rounding may let miss an end that lies on the surface
+            _found, t = wall_between(B, y, x)
+            below[k, j, i] = wp.min(t, 1.0)
+            if open[k, j, i] > 0.0:
+                wall[k, j, i] = wp.int16(crossed)
+            open[k, j, i] = 0.0
+    number[k, j, i] = wp.int16(crossed)
+
+
+@cell_kernel(MODULE)
+def solid_kernel(k, j, i, B: Barrier, ax: F32, ay: F32, az: F32, base: I8):
+    """A cell whose faces are all closed is SOLID."""
+    if B.near[k, j, i] != wp.uint8(0) and base[k, j, i] == _AIR:
+        open = ax[k, j, i] + ax[k, j, i + 1] + ay[k, j, i] + ay[k, j + 1, i]
+        if B.planes == 2:
+            open += az[k, j, i] + az[k + 1, j, i]
+        if open == 0.0:
+            base[k, j, i] = _SOLID
+
+
+@cell_kernel(MODULE)
+def calm_kernel(k, j, i, near: U8, base: I8, calm: I8):
+    """Copy the base of cells; SOLID where a thin solid is near."""
+    calm[k, j, i] = wp.where(near[k, j, i] != wp.uint8(0), _SOLID, base[k, j, i])
+
+
+@wp.func
+def beside(B: Barrier, x: wp.vec3, y: wp.vec3, way: wp.vec3):
+    """Return whether a way from x to y beside the straight one is free, by `way` aside."""
+    free = bool(False)
+    if sees(B, x, x + way):
+        if sees(B, x + way, y + way):
+            free = sees(B, y + way, y)
+    return free
+
+
+@cell_kernel(MODULE, ordered=True)
+def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INTS):
+    """Count the crossed faces of each solid that have a gap: a free way beside their centers, where the next face is closed as well."""
+    if number[k, j, i] > wp.int16(0):
+        y = place_of(B, CENTERS, k, j, i)
+        c, b, a = cell_below(axis, k, j, i)
+        x = place_of(B, CENTERS, c, b, a)
+        found = int(0)
+        ways = int(4)  # a variable, so that the loop is not unrolled
+        for d in range(B.planes + 1):
+            if d != axis:
+                for n in range(ways):
+                    side = 2 * (n & 1) - 1
+                    way = wp.vec3()
+                    way[d] = B.dx * float(side) * wp.where(n < 2, 0.2, 0.4)
+                    if beside(B, x, y, way):
+                        c, b, a = next_to(d, side, k, j, i)
+                        if open[c, b, a] == 0.0:
+                            found = 1
+        if found > 0:
+            wp.atomic_add(gaps, int(number[k, j, i]), 1)
+
+
+@cell_kernel(MODULE)
+def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
+    """Find the share of a cell's kernel that its center sees, by points of equal distance: `parts` a cell and axis."""
+    result = float(1.0)
+    if B.near[k, j, i] != wp.uint8(0):
+        x = place_of(B, CENTERS, k, j, i)
+        seen = float(0.0)
+        all = float(0.0)
+        step = 1.0 / float(parts)
+        layers = wp.where(B.planes == 2, 3 * parts, 1)
+        for c in range(layers):
+            z = float(0.0)
+            if B.planes == 2:
+                z = (float(c) + 0.5) * step - 1.5
+            for b in range(3 * parts):
+                y = (float(b) + 0.5) * step - 1.5
+                for a in range(3 * parts):
+                    way = wp.vec3((float(a) + 0.5) * step - 1.5, y, z)
+                    w = spline(way[0]) * spline(y)
+                    if B.planes == 2:
+                        w *= spline(z)
+                    all += w
+                    if sees(B, x, x + B.dx * way):
+                        seen += w
+        result = seen / all
+    share[k, j, i] = result
+
+
+@cell_kernel(MODULE)
+def capacity_kernel(k, j, i, share: F32, capacity: F32):
+    """Reduce the open share of a cell's kernel to what its center sees of it."""
+    capacity[k, j, i] = capacity[k, j, i] * share[k, j, i]
+
+
+@cell_kernel(MOVING)
+def forget_kernel(k, j, i, number: I16, velocity: F32):
+    """Forget the velocity of solids on faces that they cross no more."""
+    if number[k, j, i] > wp.int16(0):
+        velocity[k, j, i] = 0.0
+
+
+@cell_kernel(MOVING)
+def wall_velocity_kernel(
+    k, j, i, B: Barrier, axis: int, number: I16, turn: TURNS, shift: SHIFTS, velocity: F32
+):
+    """Fill the velocity of the solids on the faces that they cross."""
+    solid = int(number[k, j, i])
+    if solid > 0:
+        v = turn[solid] * place_of(B, axis, k, j, i) + shift[solid]
+        velocity[k, j, i] = v[axis]
+
+
+@cell_kernel(WHOLE, ordered=True)
+def whole_kernel(k, j, i, axis: int, number: I16, below: F32, above: F32, index: I32):
+    """Give the open cell nearer to a solid that crosses its face to that solid."""
+    if number[k, j, i] > wp.int16(0):
+        c, b, a = cell_below(axis, k, j, i)
+        if above[k, j, i] <= below[k, j, i]:
+            c = k
+            b = j
+            a = i
+        if index[c, b, a] < 0:
+            index[c, b, a] = int(number[k, j, i])

@@ -1,0 +1,91 @@
+# mypy: ignore-errors
+"""What thin solids hold apart: lines of sight between places of the grid, and the nearest solid."""
+
+import warp as wp
+
+from warp_lcp.grid.cell_kernel import U8
+from warp_lcp.grid.thin_walls_kernels import GROUPS, MISS, SHAPES, away, hit, into_group
+
+CENTERS = 3  # the `axis` of a field at cell centers
+# cells from a cell's center to a solid that may be between a particle in the cell and a face that
+# it touches, or a kernel's end
+REACH = 2.8
+# cells: points within it of a surface lie on it, and in the solid; particles keep a larger distance
+SURFACE = 1.0e-6
+
+_MISS = wp.constant(wp.float64(MISS))
+TURNS, SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Barrier:
+    """Thin solids and the grid that they stand in."""
+
+    shapes: SHAPES
+    groups: GROUPS
+    near: U8  # whether one is within REACH of a cell's center
+    planes: int
+    dx: float
+    origin: wp.vec3i  # cells of a larger grid before the first one of this
+
+
+@wp.func
+def place_of(B: Barrier, axis: int, k: int, j: int, i: int):
+    """Return the center [m] of a lower face or, with CENTERS, of a cell; z = 0 in 2-D."""
+    x = (float(i + B.origin[0]) - wp.where(axis == 0, 1.0, 0.5)) * B.dx
+    y = (float(j + B.origin[1]) - wp.where(axis == 1, 1.0, 0.5)) * B.dx
+    z = float(0.0)
+    if B.planes == 2:
+        z = (float(k + B.origin[2]) - wp.where(axis == 2, 1.0, 0.5)) * B.dx
+    return wp.vec3(x, y, z)
+
+
+@wp.func
+def wall_between(B: Barrier, x: wp.vec3, y: wp.vec3):
+    """Return the number of the first solid on the way from x to y, or that one of them lies in, 0: none; and where on the way it is."""
+    t = _MISS
+    found = int(0)
+    for g in range(B.groups.shape[0]):
+        group = B.groups[g]
+        a = into_group(group.turn, group.shift, wp.vec3d(x))
+        b = into_group(group.turn, group.shift, wp.vec3d(y))
+        for s in range(group.first, group.end):
+            at, _n = hit(B.shapes[s], a, b)
+            if at < t:
+                t = at
+                found = B.shapes[s].solid
+            elif found == 0:
+                on = wp.float64(SURFACE * B.dx)
+                d, _m = away(B.shapes[s], b, on)
+                e, _m = away(B.shapes[s], a, on)
+                if wp.min(d, e) < on:
+                    found = B.shapes[s].solid
+                    t = wp.where(e < on, wp.float64(0.0), wp.float64(1.0))
+    return found, float(t)
+
+
+@wp.func
+def sees(B: Barrier, x: wp.vec3, y: wp.vec3):
+    """Return whether no solid stands between two points."""
+    found, _t = wall_between(B, x, y)
+    return found == 0
+
+
+@wp.func
+def nearest_wall(B: Barrier, x: wp.vec3, reach: float):
+    """Return the solid nearest to a point, 0 if none is within `reach` [m], the direction away from it and the distance [m]."""
+    least = wp.float64(reach)
+    found = int(0)
+    normal = wp.vec3()
+    for g in range(B.groups.shape[0]):
+        group = B.groups[g]
+        p = into_group(group.turn, group.shift, wp.vec3d(x))
+        for s in range(group.first, group.end):
+            d, n = away(B.shapes[s], p, least)
+            if d < least:
+                least = d
+                found = B.shapes[s].solid
+                normal = wp.vec3(group.turn * n)
+    if B.planes == 1:
+        normal = wp.normalize(wp.vec3(normal[0], normal[1], 0.0))
+    return found, normal, float(least)

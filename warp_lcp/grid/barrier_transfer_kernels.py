@@ -1,0 +1,241 @@
+# mypy: ignore-errors
+"""Kernels of particles beside thin solids: density, velocities to and from faces, and paths."""
+
+import warp as wp
+
+from warp_lcp.grid.barrier_geometry import CENTERS, Barrier, place_of, sees
+from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, U8, cell_kernel, list_kernel, spline
+
+MODULE = "warp_lcp.grid.barriers.transfer"
+# the least weight of a face that a particle's own cell has, as in `warp_lcp.grid.transfer`
+EDGE = 1.0e-5
+TINY_WEIGHT = 1.0e-9
+FREE = 2.5  # cells from solids that cut cells, beyond which a particle's way is not theirs
+
+VEC8 = wp.types.vector(length=8, dtype=wp.float32)
+
+
+@cell_kernel(MODULE)
+def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: POINTS, density: F32):
+    """Add up the particles around a cell that its center sees."""
+    if B.near[k, j, i] != wp.uint8(0):
+        center = place_of(B, CENTERS, k, j, i)
+        total = float(0.0)
+        for c in range(wp.max(k - B.planes + 1, 0), wp.min(k + B.planes, density.shape[0])):
+            for b in range(wp.max(j - 1, 0), wp.min(j + 2, density.shape[1])):
+                row = (c * density.shape[1] + b) * density.shape[2]
+                for p in range(
+                    offsets[row + wp.max(i - 1, 0)], offsets[row + wp.min(i + 2, density.shape[2])]
+                ):
+                    way = (position[p] - center) / B.dx
+                    w = spline(way[0]) * spline(way[1])
+                    if B.planes == 2:
+                        w *= spline(way[2])
+                    if w > 0.0:
+                        if sees(B, center, position[p]):
+                            total += w
+        density[k, j, i] = each * total
+
+
+@wp.func
+def tent(B: Barrier, axis: int, way: wp.vec3):
+    """Return the weight of a face at a distance [cells] from a particle; its cell's own faces have some."""
+    w = float(1.0)
+    for d in range(B.planes + 1):
+        part = 1.0 - wp.abs(way[d])
+        if d == axis and part > -EDGE:
+            part = wp.max(part, EDGE)
+        w *= wp.max(part, 0.0)
+    return w
+
+
+@cell_kernel(MODULE)
+def gather_kernel(
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    offsets: INTS,
+    position: POINTS,
+    velocity: POINTS,
+    gradient: POINTS,
+    field: F32,
+    weight: F32,
+):
+    """Average the velocities of the particles around a face that it sees."""
+    if B.near[k, j, i] != wp.uint8(0):
+        face = place_of(B, axis, k, j, i)
+        momentum = float(0.0)
+        sum = float(0.0)
+        low = wp.vec3i(wp.max(i - 1, 0), wp.max(j - 1, 0), wp.max(k - B.planes + 1, 0))
+        for c in range(low[2], wp.min(k + B.planes, field.shape[0])):
+            for b in range(low[1], wp.min(j + 2, field.shape[1])):
+                row = (c * field.shape[1] + b) * field.shape[2]
+                for p in range(offsets[row + low[0]], offsets[row + wp.min(i + 2, field.shape[2])]):
+                    way = face - position[p]
+                    w = tent(B, axis, way / B.dx)
+                    if w > 0.0:
+                        if sees(B, position[p], face):
+                            v = velocity[p][axis]
+                            if gradient:
+                                v += wp.dot(gradient[p], way)
+                            momentum += w * v
+                            sum += w
+        weight[k, j, i] = sum
+        field[k, j, i] = wp.where(sum > TINY_WEIGHT, momentum / wp.max(sum, TINY_WEIGHT), 0.0)
+
+
+@wp.func
+def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
+    """Return what a point sees of the faces of a component around it, their gradient [1/m], and the weight of those that it sees.
+
+    Those that it does not see have the mean of the others.
+    """
+    g = x / B.dx + wp.vec3(
+        1.0 - float(B.origin[0]), 1.0 - float(B.origin[1]), 1.0 - float(B.origin[2])
+    )
+    for d in range(3):
+        if d != axis:
+            g[d] = g[d] - 0.5
+    i = int(wp.floor(g[0]))
+    j = int(wp.floor(g[1]))
+    k = int(1)
+    if B.planes == 2:
+        k = int(wp.floor(g[2]))
+    f = g - wp.vec3(float(i), float(j), float(k))
+    values = VEC8()
+    there = VEC8()
+    sum = float(0.0)
+    total = float(0.0)
+    corners = 4 * B.planes
+    for n in range(corners):
+        a = n & 1
+        b = (n >> 1) & 1
+        c = n >> 2
+        w = wp.where(a == 1, f[0], 1.0 - f[0]) * wp.where(b == 1, f[1], 1.0 - f[1])
+        if B.planes == 2:
+            w *= wp.where(c == 1, f[2], 1.0 - f[2])
+        if sees(B, x, place_of(B, axis, k + c, j + b, i + a)):
+            v = field[k + c, j + b, i + a]
+            values[n] = v
+            there[n] = 1.0
+            sum += wp.max(w, 1.0e-6)
+            total += wp.max(w, 1.0e-6) * v
+    mean = total / wp.max(sum, 1.0e-30)
+    value = float(0.0)
+    slope = wp.vec3()
+    for n in range(corners):
+        a = n & 1
+        b = (n >> 1) & 1
+        c = n >> 2
+        v = values[n]
+        if there[n] == 0.0:
+            v = mean
+        wx = wp.where(a == 1, f[0], 1.0 - f[0])
+        wy = wp.where(b == 1, f[1], 1.0 - f[1])
+        wz = float(1.0)
+        if B.planes == 2:
+            wz = wp.where(c == 1, f[2], 1.0 - f[2])
+        value += wx * wy * wz * v
+        slope[0] += wp.where(a == 1, 1.0, -1.0) * wy * wz * v
+        slope[1] += wp.where(b == 1, 1.0, -1.0) * wx * wz * v
+        if B.planes == 2:
+            slope[2] += wp.where(c == 1, 1.0, -1.0) * wx * wy * v
+    return value, slope / B.dx, sum
+
+
+@wp.func
+def cell_at(B: Barrier, x: wp.vec3, shape: wp.vec3i):
+    """Return the stored cell (k, j, i) of a point [m]; the nearest one of the grid of a point outside."""
+    i = wp.clamp(int(wp.floor(x[0] / B.dx)) + 1 - B.origin[0], 0, shape[2] - 1)
+    j = wp.clamp(int(wp.floor(x[1] / B.dx)) + 1 - B.origin[1], 0, shape[1] - 1)
+    k = int(1)
+    if B.planes == 2:
+        k = wp.clamp(int(wp.floor(x[2] / B.dx)) + 1 - B.origin[2], 0, shape[0] - 1)
+    return k, j, i
+
+
+@wp.func
+def shape_of(field: U8):
+    """Return the shape of a field."""
+    return wp.vec3i(field.shape[0], field.shape[1], field.shape[2])
+
+
+@list_kernel(MODULE)
+def interpolate_kernel(
+    i,
+    B: Barrier,
+    axis: int,
+    field: F32,
+    saved: F32,
+    flip: float,
+    before: POINTS,
+    position: POINTS,
+    velocity: POINTS,
+    gradient: POINTS,
+):
+    """Give particles near thin solids what they see of the velocity of faces, see `warp_lcp.grid.transfer`."""
+    x = position[i]
+    c, b, a = cell_at(B, x, shape_of(B.near))
+    if B.near[c, b, a] != wp.uint8(0):
+        value, slope, sum = seen(B, axis, x, field)
+        v = velocity[i]
+        if sum > 0.0:
+            if flip > 0.0:
+                old, _slope, _sum = seen(B, axis, x, saved)
+                value += flip * (before[i][axis] - old)
+            v[axis] = value
+            velocity[i] = v
+            if gradient:
+                gradient[i] = slope
+
+
+@wp.func
+def velocity_at(B: Barrier, u: F32, v: F32, w: F32, x: wp.vec3):
+    """Return what a point sees of the velocity [m/s]; 0 along an axis of which it sees no face."""
+    a, _a, _sa = seen(B, 0, x, u)
+    b, _b, _sb = seen(B, 1, x, v)
+    c = float(0.0)
+    if B.planes == 2:
+        c, _c, _sc = seen(B, 2, x, w)
+    return wp.vec3(a, b, c)
+
+
+@list_kernel(MODULE)
+def carry_kernel(
+    i,
+    B: Barrier,
+    distance: F32,
+    u: F32,
+    v: F32,
+    w: F32,
+    dt: float,
+    low: wp.vec3,
+    high: wp.vec3,
+    least: wp.vec3,
+    most: wp.vec3,
+    start: POINTS,
+    position: POINTS,
+):
+    """Move particles that start near thin solids, and far from others, by the velocity that they see.
+
+    It is that of half their way, if this is between `low` and `high`: the domain. They stop at
+    `least` and `most`, which are those or, where sides let them pass, infinite.
+    """
+    x = start[i]
+    c, b, a = cell_at(B, x, shape_of(B.near))
+    if B.near[c, b, a] != wp.uint8(0):
+        if distance[c, b, a] > FREE:
+            first = velocity_at(B, u, v, w, x)
+            y = x + 0.5 * dt * first
+            inside = bool(True)
+            for d in range(B.planes + 1):
+                if y[d] < low[d] or y[d] > high[d]:
+                    inside = False
+            way = first
+            if inside:
+                if sees(B, x, y):
+                    way = velocity_at(B, u, v, w, y)
+            y = x + dt * way
+            position[i] = wp.max(wp.min(y, most), least)

@@ -1,0 +1,115 @@
+# mypy: ignore-errors
+"""Kernels of velocities beside thin solids: on the faces that these cross, and continued."""
+
+import warp as wp
+
+from warp_lcp.grid.barrier_geometry import (
+    CENTERS,
+    SHIFTS,
+    TURNS,
+    Barrier,
+    nearest_wall,
+    place_of,
+    sees,
+)
+from warp_lcp.grid.cell_kernel import F32, I8, I16, U8, cell_kernel, next_to, of_axis
+
+MODULE = "warp_lcp.grid.barriers.velocity"
+
+
+@wp.struct
+class Components:
+    """A field of faces a component; w is null in 2-D."""
+
+    u: F32
+    v: F32
+    w: F32
+
+
+@wp.struct
+class Marks:
+    """Marks of faces."""
+
+    u: I8
+    v: I8
+    w: I8
+
+
+@wp.func
+def mean_around(B: Barrier, axis: int, other: int, k: int, j: int, i: int, field: F32, known: I8):
+    """Return the mean of the known faces of another component around a face that it sees, 0 if there are none."""
+    x = place_of(B, axis, k, j, i)
+    total = float(0.0)
+    count = float(0.0)
+    around = int(4)  # a variable, so that the loop is not unrolled
+    for n in range(around):
+        below = n & 1
+        above = n >> 1
+        c, b, a = next_to(axis, -below, k, j, i)
+        c, b, a = next_to(other, above, c, b, a)
+        if known[c, b, a] > wp.int8(0):
+            if sees(B, x, place_of(B, other, c, b, a)):
+                total += field[c, b, a]
+                count += 1.0
+    return total / wp.max(count, 1.0)
+
+
+@cell_kernel(MODULE)
+def constrain_kernel(
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    number: I16,
+    U: Components,
+    K: Marks,
+    turn: TURNS,
+    shift: SHIFTS,
+    kind: I8,
+    contact: U8,
+    fluid: int,
+    released: int,
+    result: F32,
+):
+    """Write what crossed faces become: without the velocity into the wall that they are beside, or any relative to it along its normal.
+
+    They lie on one side of the wall, and only what is there sees them.
+    """
+    if number[k, j, i] > wp.int16(0):
+        own = of_axis(axis, U.u, U.v, U.w, k, j, i)
+        mark = of_axis(axis, K.u, K.v, K.w, k, j, i)
+        x = place_of(B, axis, k, j, i)
+        solid, n, _d = nearest_wall(B, x, 1.5 * B.dx)
+        value = own
+        if solid > 0:
+            moving = turn[solid] * x + shift[solid]
+            if mark <= wp.int8(0):
+                value = moving[axis]
+            else:
+                c, b, a = next_to(axis, -1, k, j, i)
+                if sees(B, x, place_of(B, CENTERS, k, j, i)):
+                    c = k
+                    b = j
+                    a = i
+                held = int(kind[c, b, a]) == fluid and int(contact[c, b, a]) != released
+                speed = wp.vec3()
+                if axis != 0:
+                    speed[0] = mean_around(B, axis, 0, k, j, i, U.u, K.u)
+                if axis != 1:
+                    speed[1] = mean_around(B, axis, 1, k, j, i, U.v, K.v)
+                if axis != 2 and B.planes == 2:
+                    speed[2] = mean_around(B, axis, 2, k, j, i, U.w, K.w)
+                speed[axis] = own
+                relative = wp.dot(n, speed - moving)
+                if held or relative < 0.0:
+                    value = own - relative * n[axis]
+        result[k, j, i] = value
+
+
+@cell_kernel(MODULE)
+def take_kernel(k, j, i, number: I16, result: F32, field: F32, known: I8):
+    """Take the results of `constrain_kernel`; the faces are of no more use to those that solids cut."""
+    if number[k, j, i] > wp.int16(0):
+        field[k, j, i] = result[k, j, i]
+        known[k, j, i] = wp.int8(0)
