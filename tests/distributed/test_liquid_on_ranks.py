@@ -47,6 +47,8 @@ SANDS = (
     "trickling sand",
     "endless sand",
     "endless sand, stirred",
+    "funnel",
+    "endless shelf",
 )
 # What is left of the residual is as large as the rounding of the solve: it is compared with what it
 # is a small part of.
@@ -126,6 +128,11 @@ ONE_RANK = (
     "reseeded",
     "thick and thin",
     "banded",
+    "cup",
+    "bottle",
+    "tub",
+    "sunken sheet",
+    "thick cup",
 )
 
 

@@ -506,10 +506,16 @@ def carry_kernel(
     dt: float,
     low: wp.vec3,
     high: wp.vec3,
+    least: wp.vec3,
+    most: wp.vec3,
     start: POINTS,
     position: POINTS,
 ):
-    """Move particles that start near thin solids, and far from others, by the velocity that they see, with that of half their way."""
+    """Move particles that start near thin solids, and far from others, by the velocity that they see.
+
+    That of half their way, if this lies between `low` and `high`, where velocities are known.
+    They may not leave the room between `least` and `most`.
+    """
     x = start[i]
     c, b, a = cell_at(B, x, shape_of(B.near))
     if B.near[c, b, a] != wp.uint8(0):
@@ -525,11 +531,9 @@ def carry_kernel(
                 if sees(B, x, y):
                     way = velocity_at(B, u, v, w, y)
             y = x + dt * way
-            position[i] = wp.vec3(
-                wp.clamp(y[0], low[0], high[0]),
-                wp.clamp(y[1], low[1], high[1]),
-                wp.clamp(y[2], low[2], high[2]),
-            )
+            for d in range(B.planes + 1):
+                y[d] = wp.clamp(y[d], least[d], most[d])
+            position[i] = y
 
 
 @wp.func

@@ -390,15 +390,10 @@ class CutBoundary:
     def placed(self) -> list[wp.array]:
         """Return the fields of the placed solids."""
         capacity = [] if self.capacity is None else [self.capacity]
-        return [
-            self.base,
-            self.touch,
-            self.cut.distance,
-            *self.cut.nearest,
-            *self.open,
-            *self.cut.wall,
-            *capacity,
-        ]
+        apart = [] if self.barriers is None else self.barriers.placed()
+        cut = self.cut
+        fields = [self.base, self.touch, cut.distance, *cut.nearest, *self.open, *cut.wall]
+        return [*fields, *capacity, *apart]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""
@@ -414,13 +409,13 @@ class CutBoundary:
         """Find where particles go by what they see of the velocity among thin solids, before those move."""
         if self.thin is not None:
             self.thin.remember(position)
-            if self.barriers is not None and not self._endless:
+            if self.barriers is not None:
                 self.barriers.carry(fields, dt, self.thin.start_of(position))
 
     def _stop_at_thin_walls(self, position: wp.array, *, still: bool) -> None:
         """Have particles go where that was, and stop them at thin solids, which have moved unless `still`."""
         if self.thin is not None:
-            if self.barriers is not None and not self._endless:
+            if self.barriers is not None:
                 self.barriers.bring(self.thin.start_of(position), position)
             self.thin.stop(position, still=still)
 
