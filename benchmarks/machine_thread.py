@@ -22,10 +22,9 @@ PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
 MOST = 200_000  # instructions of a lane
 PREDICATE = re.compile(r"U?P(\d|T)$")
-IGNORED = frozenset(
-    "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL RED REDG "
-    "ATOMG ATOM".split()  # noqa: SIM905
-)
+NO_VALUE = "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL"
+ATOMIC = "RED REDG ATOMG ATOM"
+IGNORED = frozenset(f"{NO_VALUE} {ATOMIC}".split())
 COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: true of NaN
     "LT": lambda a, b: a < b,
     "EQ": lambda a, b: a == b,

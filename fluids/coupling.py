@@ -10,6 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
+from warp_lcp.fluids.carried_liquid import CarriedLiquid
 from warp_lcp.fluids.forces import walls_of
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.material.boundary import CutBoundary
@@ -60,6 +61,9 @@ class BodyCoupling:
             grid.part.owned,
         )
         self._scale, self._share = density * grid.cell_volume, share
+        barriers, self.carried = boundary.barriers, None
+        if barriers is not None and not set(barriers.walls.numbers).isdisjoint(bodies.numbers):
+            self.carried = CarriedLiquid(grid, barriers, bodies, density)
         self.width = 3 if grid.dimension == 2 else 6
         low, high = np.array(self._solved.low) - 1, np.array(self._solved.high) + 1
         self.columns = BlockColumns(
@@ -107,7 +111,7 @@ class BodyCoupling:
         """
         self._center.host[:] = self.bodies.bodies.position
         self._center.send()
-        block = self.boundary.cut.moving_block()
+        block = self._block()
         window = None if block is None else self.grid.window(*block).common(self._solved)
         if window is None:
             self.columns.count.zero_()
@@ -185,7 +189,10 @@ class BodyCoupling:
                 self._flat = x.flatten()
             self._gathering.run(self._flat, variant=self.columns.rows.ptr)
             products = self.columns.summed()
-        self.bodies.bodies.apply_impulses(self._scale * products.reshape(-1, self.width))
+        impulses = self._scale * products.reshape(-1, self.width)
+        if self.carried is not None:
+            impulses = self.carried.share(impulses)
+        self.bodies.bodies.apply_impulses(impulses)
 
     def _launch_gather(self, x: wp.array) -> None:
         self.columns.gather(x, launch=launch)
@@ -200,7 +207,7 @@ class BodyCoupling:
                 liquid).
             known: int8, > 0 where the velocity has been extrapolated.
         """
-        block = self.boundary.cut.moving_block()
+        block = self._block()
         if block is not None:
             self._enclosing.move_to(self.grid.window(*block, grow=1))
             self._holding.run(velocity, known)
@@ -211,9 +218,36 @@ class BodyCoupling:
         for fields in zip(self.boundary.open, self.boundary.velocity, known, velocity, strict=True):
             self._enclosing.launch(kernels.enclosed_kernel, list(fields))
 
+    def take_along(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
+        """Share the momentum of liquid beside thin bodies with them.
+
+        Before the pressure acts; collective.
+
+        Args:
+            velocity: u* of each component [m/s].
+            kind: int8 of AIR, FLUID, SOLID.
+        """
+        if self.carried is not None:
+            self.carried.take(velocity, kind)
+
+    def _block(self) -> tuple[list[int], list[int]] | None:
+        """Return the first and last cell (x, y, z) beside moving solids; None: there is none."""
+        block = self.boundary.cut.moving_block()
+        if self.carried is None or self.boundary.barriers is None:
+            return block
+        near = self.boundary.barriers.reach.common(self.grid.domain)
+        if near is None:
+            return block
+        low, high = [*near.low[::-1]], [n - 1 for n in near.high[::-1]]
+        if block is not None:
+            low, high = [*map(min, low, block[0])], [*map(max, high, block[1])]
+        return low, high
+
     def _weights(self) -> np.ndarray:
         """Return rho dx^d M^-1 of all bodies, block diagonal."""
         inverses = self.bodies.bodies.inverse_masses(self.grid.dimension)
+        if self.carried is not None:
+            inverses = self.carried.inverse_masses(inverses)
         n = np.arange(len(inverses))
         blocks = np.zeros((len(n), self.width, len(n), self.width))
         blocks[n, :, n] = self._share * self._scale * inverses

@@ -86,11 +86,6 @@ def pressure_kernel(
                                 more = 0.5 * float(side) * stopped
                             if S.number_x:
                                 share *= reach_across(S, axis, k, j, i)
-                                crossed, below, above = crossing_on(S, axis, c, b, a)
-                                # Extrapolate with the hydrostatic gradient to the solid.
-                                if crossed > 0:
-                                    gap = wp.where(high == 1, below, above)
-                                    more = float(side) * gap * wp.vec3(kick_x, kick_y, kick_z)[axis]
                             force = wp.vec3d()
                             force[axis] = (
                                 scale

@@ -105,6 +105,11 @@ class LiquidSimulation(ParticleSimulation):
         if self.tension is not None:
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")
+            if grid.barriers is not None and scene.surface_tension.contact_angle != 90.0:
+                thin = ", ".join(grid.barriers.names)
+                self._notes.append(
+                    f"surface_tension.contact_angle is 90 on {thin}, thinner than a cell"
+                )
             if scene.time.dt_min > longest:
                 self._notes.append(
                     f"time.dt_min = {scene.time.dt_min:g} s is longer, and steps would be "
@@ -208,6 +213,9 @@ class LiquidSimulation(ParticleSimulation):
         if self.grid.device.is_cuda and self.surface.density is not None:
             # Counted here, to be read back together with the solve.
             self.monitor_density(window, self.surface.density)
+        if self.projection.coupling is not None:
+            with self.watch.stage("bodies"):
+                self.projection.coupling.take_along(self.velocity, self.projection.kind)
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
         projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.fluids import surface_tension_kernels as kernels
 from warp_lcp.fluids.pressure import LiquidBoundary
+from warp_lcp.fluids.surface_tension_barriers import curvature_kernel, jump_kernel
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
@@ -82,6 +83,9 @@ class SurfaceTension:
     value at an angle of 30 degrees, on any grid. So kappa is computed twice in a step, first
     without this term. Beside walls particles represent only the open part of a cell's kernel, see
     `whole_share`.
+
+    Thin solids, which hold apart what is on their two sides, see `warp_lcp.grid.barriers`, are met
+    at 90 degrees.
 
     Args:
         grid: the grid.
@@ -210,6 +214,9 @@ class SurfaceTension:
             kind=kind,
             scale=self._scale,
         )
+        if (barriers := grid.barriers) is not None:
+            near = [barriers.near, barriers.apart[-1], planes]
+            window.launch(jump_kernel, [*near, self._scale, kind, bend, self.jump])
         self.grid.part.fill(self.jump)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, self._faces(kind), jump=self.jump, field=field, axis=axis)
@@ -237,6 +244,10 @@ class SurfaceTension:
             bend=self._bend,
             limit=self._most,
         )
+        if (barriers := self.grid.barriers) is not None:
+            s, near = self._shares, [barriers.near, barriers.apart[-1], self.grid.planes]
+            shares = [s.once, s.twice, s.linear, s.cubic]
+            window.launch(curvature_kernel, [*near, *shares, self._most, self._bend])
         self.grid.part.fill(self._bend)
         self._continue(self._bend, 0, 0.0)
 
@@ -315,6 +326,8 @@ class SurfaceTension:
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
+            if self.grid.barriers is not None:
+                self.grid.barriers.smooth(window, source, out)
             # A pass reads one layer of ghost cells, the extension into walls three.
             if done % 2 == 0 or done == passes:
                 self.grid.part.fill(out)

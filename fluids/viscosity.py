@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.fluids import viscosity_barriers as thin
 from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
@@ -167,6 +168,7 @@ class Viscosity:
             phi is not None,
             bool(boundary.velocity),
             thickest is not None,
+            thin=grid.barriers is not None,
         )
         self._thickest = thickest or 1.0
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
@@ -178,6 +180,10 @@ class Viscosity:
         size = grid.dimension * grid.size
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
         self._distance, self._slip, self.before = grid.faces(), grid.faces(), grid.faces()
+        held_apart, none = grid.barriers is not None, [None] * grid.dimension
+        self._thin: list[wp.array | None] = grid.faces() if held_apart else [*none]
+        self._thin_speed: list[wp.array | None] = grid.faces() if held_apart else [*none]
+        self._thin_owner = grid.faces(wp.int16) if held_apart else []
         self.relative = [] if thickest is None else grid.faces()
         self.change = self.multigrid.components(self._change)
         self._pull: WallPull | None = None  # built at the first use
@@ -359,11 +365,44 @@ class Viscosity:
             if self._bodies is not None:  # the bodies are unknowns of the step
                 motions[self._bodies.bodies.numbers] = self._bodies.velocities()
             pulled -= np.einsum("sij,sj->si", drags, motions)
+        if self.grid.barriers is not None:
+            pulled += self._pull_of_thin(velocity, points)
         impulses = np.zeros((len(points), 6))
         impulses[:, slice(None) if self.grid.dimension == 3 else PLANAR] = (
             self._density * self.grid.cell_volume * pulled
         )
         return impulses
+
+    def _pull_of_thin(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
+        """Return what faces beside thin solids lose to these, in units of a cell's mass.
+
+        Args:
+            velocity: that the step has made [m/s].
+            points: about which moments are taken [m], shape (solids, 3).
+
+        Returns:
+            [m/s] and [m^2/s], shape (solids, 3 or 6).
+        """
+        grid, inner = self.grid, self._inner
+        cells = tuple(slice(low, high) for low, high in zip(inner.low, inner.high, strict=True))
+        six = np.zeros((len(points), 6))
+        for axis, u in enumerate(velocity):
+            weight, speed = self._thin[axis], self._thin_speed[axis]
+            assert weight is not None and speed is not None, "there are thin solids"
+            found = weight.numpy()[cells]
+            at = np.argwhere(found > 0.0)
+            here = tuple(at.T)
+            push = np.zeros((len(at), 3))
+            lost = u.numpy()[cells].astype(np.float64)[here] - speed.numpy()[cells][here]
+            push[:, axis] = found[here] * lost
+            place = (at + np.array(inner.low))[:, ::-1] + np.array(grid.origin) - 0.5
+            place[:, axis] -= 0.5
+            x = place * grid.spacing
+            if grid.dimension == 2:
+                x[:, 2] = 0.0
+            owner = self._thin_owner[axis].numpy()[cells][here]
+            np.add.at(six, owner, np.hstack([push, np.cross(x - points[owner], push)]))
+        return six if grid.dimension == 3 else six[:, PLANAR]
 
     def push_bodies(self) -> None:
         """Apply the impulses of the last step to the bodies, if any."""
@@ -434,6 +473,9 @@ class Viscosity:
                 planes=planes,
                 walls=self._walls,
             )
+        if self.grid.barriers is not None:
+            for axis, number in enumerate(self.grid.barriers.number):
+                near.launch(thin.crossed_kernel, [number, self._slips, distance[axis], slip[axis]])
         (vx, vy, vz), (dx, dy, dz) = three_components(fine.volume), three_components(distance)
         (hx, hy, hz), (mx, my, mz) = three_components(slip), three_components(self.relative)
         self._above.run(
@@ -461,6 +503,8 @@ class Viscosity:
             planes=planes,
             scale=self._tau,
         )
+        if self.grid.barriers is not None:
+            self._hold_apart(kind, contact)
         for axis in range(self.grid.dimension):
             self._above.run(
                 passes.diagonal,
@@ -471,8 +515,28 @@ class Viscosity:
                 kind=kind,
                 contact=contact,
                 planes=planes,
+                thin=self._thin[axis],
             )
         self.multigrid.set_up()
+
+    def _hold_apart(self, kind: wp.array, contact: wp.array) -> None:
+        """Launch what cuts links at thin solids, and ties them to these."""
+        grid, fine, barriers = self.grid, self._fine, self.grid.barriers
+        assert isinstance(self.boundary, CutBoundary), "thin solids are among cut cells"
+        cut = self.boundary.cut
+        cells, solids = [kind, contact, self._tau], [self._slips, cut.turn, cut.shift]
+        placed = [wp.vec3i(*grid.origin), grid.planes, grid.spacing]
+        for axis in range(grid.dimension):
+            own, relative = barriers.apart[axis], self.relative[axis] if self.relative else None
+            pulls = [self._thin[axis], self._thin_speed[axis], self._thin_owner[axis]]
+            for turn, other in enumerate(n for n in range(grid.dimension) if n != axis):
+                number = barriers.number[other]
+                links = [axis, other, own, number, fine.volume[axis], relative, *cells]
+                given = [*links, *solids, *placed, int(turn == 0)]
+                self._above.launch(thin.pull_kernel, [*given, *pulls])
+        for (a, b), edge in fine.edges.items():
+            self._above.launch(thin.part_kernel, [a, b, barriers.apart[a], barriers.apart[b], edge])
+        self._above.launch(thin.mix_kernel, [barriers.near, fine.cell, fine.mixed])
 
     def _motion(self, axis: int) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
         """Return the solids of a component's faces, with their rotations and shifts.
@@ -546,6 +610,8 @@ class Viscosity:
                 turn=turn,
                 shift=shift,
                 change=self.change[axis] if changed else None,
+                thin=self._thin[axis],
+                thin_speed=self._thin_speed[axis],
                 r=residual[axis],
             )
 

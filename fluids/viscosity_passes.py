@@ -30,6 +30,7 @@ def viscous_passes(
     ghost: bool = False,
     moving: bool = False,
     varies: bool = False,
+    thin: bool = False,
 ) -> SimpleNamespace:
     """Return the kernels of the viscous solve for a dimension.
 
@@ -41,6 +42,7 @@ def viscous_passes(
         ghost: whether the free surface lies between cells.
         moving: whether solids have velocities.
         varies: whether viscosities differ.
+        thin: whether there are solids thinner than cells.
     """
     area, deep = f"fluids.viscosity_{dimension}d", dimension == 3
     walls, flags = (
@@ -62,8 +64,8 @@ def viscous_passes(
     return SimpleNamespace(
         distance=near("distance"),
         weights=near("weights", "_varies" * varies, VARIES=varies),
-        diagonal=near("diagonal"),
-        force=near("force"),
+        diagonal=near("diagonal", "_thin" * thin, THIN=thin),
+        force=near("force", "_thin" * thin, THIN=thin),
         links=near("links"),
         cover=near("cover"),
         add=plain("add"),

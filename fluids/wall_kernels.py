@@ -42,14 +42,8 @@ class Walls:
 @wp.func
 def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
     """Return the open fraction of a face of cut cells, and the closing solid."""
-    free = S.open_x[k, j, i]
-    wall = S.wall_x[k, j, i]
-    if axis == 1:
-        free = S.open_y[k, j, i]
-        wall = S.wall_y[k, j, i]
-    if axis == 2:
-        free = S.open_z[k, j, i]
-        wall = S.wall_z[k, j, i]
+    free = of_axis(axis, S.open_x, S.open_y, S.open_z, k, j, i)
+    wall = of_axis(axis, S.wall_x, S.wall_y, S.wall_z, k, j, i)
     return free, int(wall)
 
 
@@ -59,17 +53,9 @@ def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
 
     0 without one. The distances are those from the cells below and above [cells].
     """
-    number = S.number_x[k, j, i]
-    below = S.below_x[k, j, i]
-    above = S.above_x[k, j, i]
-    if axis == 1:
-        number = S.number_y[k, j, i]
-        below = S.below_y[k, j, i]
-        above = S.above_y[k, j, i]
-    if axis == 2:
-        number = S.number_z[k, j, i]
-        below = S.below_z[k, j, i]
-        above = S.above_z[k, j, i]
+    number = of_axis(axis, S.number_x, S.number_y, S.number_z, k, j, i)
+    below = of_axis(axis, S.below_x, S.below_y, S.below_z, k, j, i)
+    above = of_axis(axis, S.above_x, S.above_y, S.above_z, k, j, i)
     return int(number), below, above
 
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.scene.table import validate
 
@@ -420,7 +419,6 @@ def made(tables: Tables) -> Any:
 
 def main() -> None:
     """Run draws and print them."""
-    ThinWalls.enabled = True
     seed, count, names = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
     kinds = [name for name in KINDS if name in names] or list(KINDS)
     models = [name for name in ("fluids", "granular") if name in names] or ["fluids", "granular"]

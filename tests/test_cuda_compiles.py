@@ -362,6 +362,7 @@ def modules_of_every_kernel(reals):
         pressure_passes(*variant)
     for dimension, *walls in itertools.product((2, 3), *((False, True),) * 4):
         viscous_passes(dimension, *walls)
+        viscous_passes(dimension, True, *walls[1:], thin=True)
     for axis in (0, 1, 2, CENTERS):
         carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):

@@ -203,9 +203,10 @@ for (int i = first; i < last; ++i) {
 // kernel fluids.viscosity.diagonal: The diagonal of a component's rows, 0 where there is no
 // unknown; what walls add to it; and for faces in a wall whether it holds, else -1
 //   compute    float32
-//   box        float32 diagonal, drag, held, d, h, cell, xb, xc?, volume; int8 kind; uint8 contact
+//   box        float32 diagonal, drag, held, d, h, cell, xb, xc?, volume, thin?; int8 kind;
+//              uint8 contact
 //   numbers    int axis, planes
-//   constants  FLUID, RELEASED, CLOSE, THETA, ALONG, CUT
+//   constants  FLUID, RELEASED, CLOSE, THETA, ALONG, CUT, THIN
 #include "viscous_walls"
 const int nx = given.d.shape[2] - 2, ny = given.d.shape[1] - 2, nz = given.d.shape[0] - 2;
 for (int i = first; i < last; ++i) {
@@ -241,6 +242,7 @@ for (int i = first; i < last; ++i) {
         side(i + sc, xc[i + sc]);
         side(i - sc, xc[i]);
     }
+    if (THIN) wall += thin[THIN ? i : 0];
     drag[i] = wall;
     diagonal[i] = free + wall;
 }
@@ -250,10 +252,11 @@ for (int i = first; i < last; ++i) {
 //   compute    float32
 //   whole      float32 turn?, shift?
 //   box        float32 r, diagonal, u, ub, uc?, d, h, db, dc?, cell, mixed, xb, xc?, volume,
-//              change?, own?, solid_b?, solid_c?; int8 kind; uint8 contact; int16 wall?; int8 base
+//              change?, own?, solid_b?, solid_c?, thin?, thin_speed?; int8 kind; uint8 contact;
+//              int16 wall?; int8 base
 //   numbers    int axis, planes, before_x, before_y, before_z; float32 dx
 //   sums       residual, taken, given_by_walls, stiff
-//   constants  FLUID, SOLID, RELEASED, CLOSE, THETA, ALONG, CUT, MOVING
+//   constants  FLUID, SOLID, RELEASED, CLOSE, THETA, ALONG, CUT, MOVING, THIN
 #include "viscous_walls"
 double lost = 0, driven = 0, square = 0, large = 0;
 const auto wall_speed = [&](const float* of, long long i) {
@@ -319,6 +322,11 @@ for (int i = first; i < last; ++i) {
         side(i + sc, xc[i + sc], last_other, 1);
         side(i - sc, xc[i], last_other, -1);
         mix(uc, dc, solid_c, xc, sc);
+    }
+    if (THIN) {  // solids thinner than cells between this face and the next ones across
+        const double w = thin_speed[THIN ? i : 0], weight = thin[THIN ? i : 0];
+        force += weight * (w - here);
+        power += weight * (w - here) * w;
     }
     const double rest = force - (change ? (double)volume[i] * change[i] : 0.0);
     r[i] = (float)rest;

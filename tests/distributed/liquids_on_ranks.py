@@ -135,6 +135,55 @@ PLUNGER = box(
     motion={"kind": "translation", "velocity": [0.3, 0.2, 0.0]},
 )
 THICK = {"viscosity": {"value": 20.0}, "wall": "sticky", "solid": [BALL]}
+
+
+def walled(low, high, *, lid=False, **more):
+    """Return walls of 0.3 cells around an inside."""
+    width, solids = 0.3 / 32, []
+    for axis in range(len(low)):
+        for upper in range(2):
+            least, most = [value - width for value in low], [value + width for value in high]
+            if upper:
+                least[axis] = high[axis]
+            else:
+                most[axis] = low[axis]
+            if axis != 1 or lid or not upper:
+                solids.append(box(least, most, **more))
+    return solids
+
+
+SHAKING = {"kind": "sinusoid", "period": 0.3, "amplitude": [0.06, 0.02]}
+CUP = {  # at the cuts
+    "solid": walled([0.31, 0.1], [0.63, 0.4]),
+    "liquid": [box([0.31, 0.1], [0.63, 0.33])],
+    "solver": {"precision": "double"},
+}
+BOTTLE = {
+    "solid": walled([0.31, 0.11], [0.63, 0.4], lid=True, motion=SHAKING),
+    "liquid": [box([0.31, 0.11], [0.63, 0.27])],
+    "solver": {"precision": "double"},
+    "output": {"forces": True},
+}
+TUB = {
+    "solid": walled([0.31, 0.1, 0.1], [0.63, 0.4, 0.4]),
+    "liquid": [box([0.31, 0.1, 0.1], [0.63, 0.33, 0.4])],
+    "particles": {"transfer": "flip"},
+    "solver": {"precision": "double"},
+}
+SHEET = box([0.25, 0.2], [0.6, 0.2095], density=800.0)  # a rigid one, in the water and out of it
+SUNKEN = {"solid": [SHEET], "solver": {"precision": "double"}}
+THICK_CUP = {"viscosity": {"value": 5.0}, "wall": "sticky", "surface_tension": {"coefficient": 0.5}}
+FUNNEL = {
+    "solid": [
+        {"shape": "capsule", "from": [0.0, 0.45], "to": [0.43, 0.2], "radius": 0.01},
+        {"shape": "capsule", "from": [1.0, 0.45], "to": [0.6, 0.2], "radius": 0.01},
+    ],
+    "sand": [box([0.3, 0.27], [0.7, 0.45])],
+}
+SHELF = {
+    "solid": [box([0.0, 0.1], [1.0, 0.108])],
+    "sand": [box([0.6, 0.11], [1.0, 0.3], velocity=[1.0, 0.0])],
+}
 SCENES = {
     "flat": FLAT,
     "flip": DEEP
@@ -190,6 +239,11 @@ SCENES = {
     "thick floating": DEEP | FLOATING | {"viscosity": {"value": 5.0}, "resolution": 24},
     "unilateral rafts": FLAT
     | {"solid": RAFTS, "pressure": {"model": "unilateral"}, "solver": {"precision": "double"}},
+    "cup": FLAT | CUP,
+    "bottle": FLAT | BOTTLE,
+    "tub": DEEP | TUB,
+    "sunken sheet": FLAT | SUNKEN,
+    "thick cup": FLAT | CUP | THICK_CUP,
     "full": FLAT
     | {
         "liquid": [box([0.0, 0.0], [1.0, 0.5])],
@@ -209,6 +263,8 @@ SCENES |= {
     "endless sand, stirred": COLUMN | ROUND,
     "bodies in sand": COLUMN | {"solid": SUNK, "density_correction": {}},
     "ball on sand": HEAP | {"solid": DROPPED, "density_correction": {"every": 2}},
+    "funnel": HEAP | FUNNEL,
+    "endless shelf": HEAP | SLOPE | SHELF,
     "trickling sand": HEAP
     | TRICKLING
     | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},

@@ -48,6 +48,8 @@ SANDS = (
     "trickling sand",
     "endless sand",
     "endless sand, stirred",
+    "funnel",
+    "endless shelf",
 )
 # The remaining residual is as small as the rounding of the solve. It is compared with the quantity
 # of which it is a small part.
@@ -130,6 +132,11 @@ ONE_RANK = (
     "reseeded",
     "thick and thin",
     "banded",
+    "cup",
+    "bottle",
+    "tub",
+    "sunken sheet",
+    "thick cup",
 )
 
 

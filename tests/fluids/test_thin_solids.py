@@ -8,7 +8,6 @@ import pytest
 
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -16,11 +15,6 @@ CELLS = 16
 CELL = 1.0 / CELLS
 SHAKEN = {"kind": "sinusoid", "period": 0.4, "amplitude": [0.12, 0.03]}
 TURNED = {"kind": "rotation", "rate": 360.0, "center": [0.5, 0.5]}
-
-
-@pytest.fixture(autouse=True)
-def thin_walls(monkeypatch):
-    monkeypatch.setattr(ThinWalls, "enabled", True)
 
 
 def bottle(

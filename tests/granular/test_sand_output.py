@@ -106,15 +106,18 @@ def test_scenes_schema_and_check_know_sand() -> None:
 
 
 def test_a_solid_that_no_cell_feels_is_told() -> None:
-    """Warning about a solid that covers no cell.
-
-    Particles stop at it, but the stresses know only whole cells.
-    """
-    plate = box([0.2, 0.19], [0.8, 0.21])
-    simulation = create(
-        scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.3], [1.0, 0.5])], solid=[plate])
-    )
-    assert any("solid[0] (box) contains no center of a cell" in note for note in simulation.notes())
+    """Of whole cells it holds nothing; with cut cells it is a wall, and nothing is said."""
+    plate, sand = box([0.2, 0.19], [0.8, 0.21]), [box([0.0, 0.3], [1.0, 0.5])]
+    for solids, told in (("voxel", True), ("cut-cell", False)):
+        simulation = create(
+            scene(size=[1.0, 0.5], resolution=16, sand=sand, solid=[plate], solids=solids)
+        )
+        assert (
+            any(
+                "solid[0] (box) contains no center of a cell" in note for note in simulation.notes()
+            )
+            == told
+        )
 
 
 def test_the_frame_before_the_first_step_shows_the_start() -> None:

@@ -9,15 +9,9 @@ import pytest
 from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.grid.thin_walls import ThinWalls
 
 CELLS = 24
 CELL = 1.0 / CELLS
-
-
-@pytest.fixture(autouse=True)
-def thin_walls(monkeypatch):
-    monkeypatch.setattr(ThinWalls, "enabled", True)
 
 
 def simulate(

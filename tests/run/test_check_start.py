@@ -314,12 +314,19 @@ def test_sand_says_where_solids_stay_whole_cells(
     assert [reason in note for note in notes] == ([] if reason is None else [True])
 
 
-def test_thin_meshes_are_said_to_let_their_own_material_pass(tmp_path: Path) -> None:
+def test_thin_meshes_of_whole_cells_are_said_to_let_their_own_material_pass(tmp_path: Path) -> None:
+    """With cut cells they hold, and nothing is said."""
     solid = {"shape": "mesh", "file": "builtin:torus", "scale": 0.2, "translate": [0.5, 0.6]}
     for simulator, word in (("fluids", "liquid"), ("granular", "sand")):
-        scene = written(
-            tmp_path / f"{simulator}.toml", [LIQUID], simulator=simulator, solid=[solid]
-        )
-        assert any(
-            f": {word} may pass there" in note for note in start(load_scene(scene), "cpu").notes()
-        )
+        for solids, passes in (("voxel", True), ("cut-cell", False)):
+            file = tmp_path / f"{simulator}-{solids}.toml"
+            scene = written(
+                file, [LIQUID], simulator=simulator, domain={"solids": solids}, solid=[solid]
+            )
+            assert (
+                any(
+                    f": {word} may pass there" in note
+                    for note in start(load_scene(scene), "cpu").notes()
+                )
+                == passes
+            )

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import warp_lcp as wl
+from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.material.particle_assembly import make_thin_walls
 from warp_lcp.material.particle_scene import ParticleScene
 
 if TYPE_CHECKING:
@@ -25,7 +27,8 @@ def boundary_of_part(
     """Return the solids that meet a rank's part, and the domain's walls where it has them; collective.
 
     Each rank measures its part and takes what lies beyond its cuts from the ranks that have
-    measured more of it. If no rank has cut cells all have whole ones.
+    measured more of it. Solids thinner than cells are exact shapes: every rank knows all of them,
+    and finds the same faces closed. If no rank has cut cells or such solids all have whole ones.
 
     Args:
         scene: says whether solids cut cells, the domain's wall separates, sides are open, and cells
@@ -45,11 +48,17 @@ def boundary_of_part(
     sides = PeriodicSides(grid, scene.endless) if scene.endless else None
     shapes: list[Geometry] = []
     if domain.solids == "cut-cell":
-        cut = CutCells(grid, solids, open_sides=ends, **walls)
-        if ranks.any(not cut.whole_cells):
-            boundary: Boundary = CutBoundary(grid, cut, sides=sides)
+        open_sides = side_bits(domain.open)
+        thin = make_thin_walls(scene, grid, solids, open_sides, crossing=False)
+        crossing = make_thin_walls(scene, grid, solids, open_sides, crossing=True)
+        numbers = crossing.numbers if crossing is not None else ()
+        cut = CutCells(grid, solids, open_sides=ends, left_out=numbers, **walls)
+        if thin is not None or ranks.any(not cut.whole_cells):
+            barriers = Barriers(grid, crossing, cut) if crossing is not None else None
+            grid.divide(barriers)
+            boundary: Boundary = CutBoundary(grid, cut, sides=sides, thin=thin, barriers=barriers)
             _check_open(part, boundary)
-            return boundary, list(cut.notes)
+            return boundary, [*cut.notes, *(barriers.notes() if barriers is not None else ())]
         shapes = [solid.geometry for solid in solids]
     notes = start_notes(solids, grid)
     voxels = voxelize(grid, solids, open_sides=with_periodic(ends, sides), **walls)

@@ -19,6 +19,7 @@ import warp as wp
 from warp_lcp.grid import barrier_faces_kernels as faces_kernels
 from warp_lcp.grid import barrier_transfer_kernels as transfer_kernels
 from warp_lcp.grid import barrier_velocity_kernels as velocity_kernels
+from warp_lcp.grid.barrier_fields import binomial_kernel, shift_kernel
 from warp_lcp.grid.barrier_geometry import CENTERS, REACH, Barrier
 from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
 from warp_lcp.grid.cut_cells import CutCells
@@ -85,8 +86,8 @@ class Barriers:
             grid.spacing,
             wp.vec3i(*grid.origin),
         )
-        margin = MARGIN * grid.spacing
-        self._low, self._high = wp.vec3(margin, margin, margin), wp.vec3(*(grid.extent - margin))
+        margin = np.full(3, MARGIN * grid.spacing)
+        self._sides = wp.vec3(*margin), wp.vec3(*(grid.extent - margin))
         self.calm = grid.field(wp.int8)
         self._window: Window | None = None
         self._aim = wp.empty(0, dtype=wp.vec3, device=grid.device)
@@ -172,9 +173,24 @@ class Barriers:
         ):
             self._all.launch(faces_kernels.whole_kernel, [axis, number, below, above, index])
 
+    def placed(self) -> list[wp.array]:
+        """Return the fields of the placed solids; on ranks, others know those beyond the box."""
+        return [self.near, *self.apart, *self.number, *self.below, *self.above, self.calm]
+
+    @property
+    def reach(self) -> Window:
+        """Cells near the solids, where these are and were."""
+        return self._all
+
+    @property
+    def names(self) -> list[str]:
+        """Return what messages call the solids."""
+        return [self.cut.names[number] for number in self.walls.numbers]
+
     def notes(self) -> list[str]:
-        """Return a warning for each solid beside which a gap is too narrow for the grid."""
-        cut, inner = self.cut, self._all.common(self.grid.domain)
+        """Return a warning for each solid beside which a gap is too narrow; collective."""
+        cut, part = self.cut, self.grid.part
+        inner = self._all.common(part.owned)
         gaps = wp.zeros(len(cut.names), dtype=wp.int32, device=self.grid.device)
         if inner is not None:
             for axis, (number, open_) in enumerate(zip(self.number, cut.open, strict=True)):
@@ -183,7 +199,7 @@ class Barriers:
         return [
             f"{name}: a gap beside it is narrower than {cell} and lets nothing through ({count} "
             "faces of cells)"
-            for name, count in zip(cut.names, gaps.numpy().tolist(), strict=True)
+            for name, count in zip(cut.names, part.ranks.sum(gaps.numpy()).tolist(), strict=True)
             if count
         ]
 
@@ -237,6 +253,35 @@ class Barriers:
             transfer_kernels.density_kernel, [self._barrier, each, offsets, position, density]
         )
 
+    def smooth(self, window: Window, source: wp.array, out: wp.array) -> None:
+        """Make a binomial pass again in cells near the solids, by what is on their side of these.
+
+        Args:
+            window: cells of the pass.
+            source: float32 field.
+            out: what the pass has made of it (updated).
+        """
+        given = [self.near, self.apart[-1], self.grid.planes, source, out]
+        window.launch(binomial_kernel, given)
+
+    def shift(
+        self,
+        window: Window,
+        variance: float,
+        limit: float,
+        capacity: wp.array,
+        phi: wp.array,
+        known: wp.array,
+        out: wp.array,
+    ) -> None:
+        """Bring a smooth distance back to the cells' centers again in cells near the solids.
+
+        Args as of `warp_lcp.grid.level_set_kernels.wall_shift_kernel`, but:
+            window: cells of the pass.
+        """
+        given = [self.near, self.apart[-1], self.grid.planes, variance, limit]
+        window.launch(shift_kernel, [*given, capacity, phi, known, out])
+
     def carry(self, velocity: Faces, dt: float, start: wp.array) -> None:
         """Find where particles near the solids go by what they see of the velocity, before the solids move.
 
@@ -245,13 +290,15 @@ class Barriers:
             dt: time step [s].
             start: where they are [m], shape (n,).
         """
+        if len(start) == 0:  # of a rank without material
+            return
         if len(self._aim) < len(start):
             self._aim = wp.empty(
                 len(start) + len(start) // 4, dtype=wp.vec3, device=self.grid.device
             )
         aim = self._aim[: len(start)]
         copy(aim, start)
-        ends = [self._low, self._high, wp.vec3(*self.walls.least), wp.vec3(*self.walls.most)]
+        ends = [*self._sides, wp.vec3(*self.walls.least), wp.vec3(*self.walls.most)]
         fields = three_components(velocity)
         given = [self._barrier, self.cut.distance, *fields, dt, *ends, start, aim]
         launch_list(
@@ -265,6 +312,8 @@ class Barriers:
             start: as there.
             position: where others come to [m], shape (n,) (updated).
         """
+        if len(position) == 0:
+            return
         launch_list(
             bring_kernel,
             len(position),

@@ -150,6 +150,9 @@ class LevelSet:
                 kernels.wall_shift_kernel,
                 [self._spread**2, self.limit, smooth, self.phi, self._known, shifted],
             )
+            if grid.barriers is not None:
+                given = (self._spread**2, self.limit, smooth, self.phi, self._known, shifted)
+                grid.barriers.shift(window, *given)
             window.run(COPY, source=shifted, field=self.phi)
         apart = grid.barriers.apart[-1] if grid.barriers is not None else None
         extrapolate(window, self._known, self.phi, kernels.EXTENDED, apart=apart)
@@ -209,6 +212,8 @@ class LevelSet:
         """Return the source after the binomial passes; in one of two scratch fields."""
         for _ in range(self.smoothing):
             window.run(kernels.BINOMIAL, planes=self.grid.planes, source=source, out=first)
+            if self.grid.barriers is not None:
+                self.grid.barriers.smooth(window, source, first)
             source, first, second = first, second, first
         return source
 

@@ -8,10 +8,9 @@ surface stops there and slides on, at the true surface and on its own side.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from itertools import pairwise
-from typing import Any, ClassVar
+from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -26,6 +25,7 @@ from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rows.program import copy
 
 THIN = 3.0  # cells: what is thinner is met as its exact shape
+SHEET = 1.0  # cells: rigid bodies of at least that cut cells
 STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
 # cells by which shapes are larger than they are, so that there is no crack between those that touch
 SKIN = 1e-4
@@ -57,6 +57,18 @@ def _is_thin(shape: Geometry, thickness: float, device: wp.Device) -> bool:
     return bool(2.0 * least * shape.placement.scale < thickness)
 
 
+def is_sheet(geometry: Geometry, thickness: float, dimension: int) -> bool:
+    """Return whether all parts of a solid are meshes, or boxes thinner than `thickness` [m] along one axis only."""
+    return all(_is_sheet(part, thickness, dimension) for part in parts_of(geometry))
+
+
+def _is_sheet(shape: Geometry, thickness: float, dimension: int) -> bool:
+    if not isinstance(shape, Box):
+        return isinstance(shape, TriangleMesh)
+    sides = 2.0 * shape.half_extents()[:dimension] * shape.placement.scale
+    return bool(np.count_nonzero(sides < thickness) <= 1)
+
+
 def fills_cells(geometry: Geometry, grid: StaggeredGrid, error: float) -> bool:
     """Return whether a solid is made of boxes whose sides lie on those of cells, but for an `error` [cells]."""
     return all(_fills_cells(part, grid, error) for part in parts_of(geometry))
@@ -82,16 +94,14 @@ class ThinWalls:
         thin: which of them these are.
         open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there, for
             good or to the other end of an axis.
+        endless: axes whose sides are the same: solids near one stand beyond the other, too.
 
     Attributes:
-        enabled: whether scenes have them: not yet on ranks, so they are asked for.
         numbers: of these solids.
         moves: whether one of them moves.
         least: smallest coordinates of particles [m], -inf where they may leave.
         most: largest coordinates, likewise.
     """
-
-    enabled: ClassVar[bool] = os.environ.get("WARP_LCP_THIN_WALLS") == "1"
 
     def __init__(
         self,
@@ -99,6 +109,7 @@ class ThinWalls:
         solids: Sequence[PlacedSolid],
         thin: Sequence[bool],
         open_sides: int,
+        endless: Sequence[int] = (),
     ) -> None:
         self.grid = grid
         self.numbers = [number for number, is_one in enumerate(thin, start=1) if is_one]
@@ -112,7 +123,6 @@ class ThinWalls:
                 groups.append((solid.motion, of))
             of += [(number, part) for part in parts_of(solid.geometry)]
         self._motions = Motions([motion for motion, _ in groups if motion is not None])
-        self._moving = [place for place, (motion, _) in enumerate(groups) if motion is not None]
         shapes = [
             _shape(number, part, grid.device, SKIN * grid.spacing)
             for _, of in groups
@@ -122,11 +132,18 @@ class ThinWalls:
         self._geometries = [part for _, of in groups for _, part in of]
         ends = np.cumsum([0, *(len(of) for _, of in groups)])
         self._groups = []
-        for first, end in pairwise(ends):
-            group = kernels.ThinGroup()
-            group.first, group.end = int(first), int(end)
-            group.turn = group.turn_before = wp.mat33d(np.eye(3))
-            self._groups.append(group)
+        self._moving: list[tuple[int, int, np.ndarray]] = []
+        moving = 0
+        for (motion, _), (first, end) in zip(groups, pairwise(ends), strict=True):
+            for image in _images(grid, endless):
+                group = kernels.ThinGroup()
+                group.first, group.end = int(first), int(end)
+                group.turn = group.turn_before = wp.mat33d(np.eye(3))
+                group.shift = group.shift_before = wp.vec3d(*image)
+                if motion is not None:
+                    self._moving.append((len(self._groups), moving, image))
+                self._groups.append(group)
+            moving += motion is not None
         self.shapes = wp.array(shapes, dtype=kernels.ThinShape, device=grid.device)
         self.groups = wp.array(self._groups, dtype=kernels.ThinGroup, device=grid.device)
         margin = MARGIN * grid.spacing
@@ -150,12 +167,11 @@ class ThinWalls:
         if not self._moving:
             return
         rotations, translations = self._motions.poses([time])
-        for place, rotation, translation in zip(
-            self._moving, rotations[0], translations[0], strict=True
-        ):
+        for place, motion, image in self._moving:
             group = self._groups[place]
             group.turn_before, group.shift_before = group.turn, group.shift
-            group.turn, group.shift = wp.mat33d(rotation), wp.vec3d(*translation)
+            group.turn = wp.mat33d(rotations[0, motion])
+            group.shift = wp.vec3d(*(translations[0, motion] + image))
         self.groups.assign(self._groups)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -174,15 +190,17 @@ class ThinWalls:
 
     def remember(self, position: wp.array) -> None:
         """Keep the places of particles [m], shape (n,), from which they are about to be moved."""
-        if len(self._start) < len(position):
-            self._start = wp.empty(
-                len(position) + len(position) // 4, dtype=wp.vec3, device=self.grid.device
-            )
-        copy(self._start[: len(position)], position)
+        count = len(position)
+        if count == 0:  # of a rank without material
+            return
+        if len(self._start) < count:
+            room = count + count // 4
+            self._start = wp.empty(room, dtype=wp.vec3, device=self.grid.device)
+        copy(self._start[:count], position)
 
     def start_of(self, position: wp.array) -> wp.array:
         """Return where particles were when they were remembered [m], shape (n,)."""
-        return self._start[: len(position)]
+        return self._start[: len(position)] if len(position) else position
 
     def stop(self, position: wp.array, *, still: bool) -> None:
         """Put particles that have passed a thin solid since `remember` back to its surface, and on along it.
@@ -191,6 +209,8 @@ class ThinWalls:
             position: [m], shape (n,) (updated).
             still: whether the solids have not moved since then.
         """
+        if len(position) == 0:
+            return
         given = [
             self.start_of(position),
             position,
@@ -221,23 +241,25 @@ class ThinWalls:
             cost=COST,
         )
         result = room.numpy() >= float(self._margin)
-        meshes = [
-            place
-            for place, geometry in enumerate(self._geometries)
-            if isinstance(geometry, TriangleMesh)
-        ]
-        for place in meshes:
-            group = next(g for g in self._groups if g.first <= place < g.end)
+        for group in self._groups:
             turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
-            own = wp.array(
-                ((np.asarray(points) - shift) @ turn).astype(np.float32),
-                dtype=wp.vec3,
-                device=self.grid.device,
+            meshes = (
+                geometry
+                for geometry in self._geometries[group.first : group.end]
+                if isinstance(geometry, TriangleMesh)
             )
-            distance = wp.empty(len(points), dtype=wp.float32, device=self.grid.device)
-            self._geometries[place].signed_distance(own, distance)
-            result &= distance.numpy() > 0.0
+            for mesh in meshes:
+                own = ((np.asarray(points) - shift) @ turn).astype(np.float32)
+                distance = wp.empty(len(points), dtype=wp.float32, device=self.grid.device)
+                mesh.signed_distance(wp.array(own, dtype=wp.vec3, device=distance.device), distance)
+                result &= distance.numpy() > 0.0
         return np.asarray(result)
+
+
+def _images(grid: StaggeredGrid, endless: Sequence[int]) -> list[np.ndarray]:
+    """Return where a solid of a domain stands again along axes without an end [m], (3,) each."""
+    steps = [(0, -1, 1) if axis in endless else (0,) for axis in range(3)]
+    return [grid.extent * np.array(step) for step in product(*steps)]
 
 
 def _alike(one: Motion | None, other: Motion | None) -> bool:

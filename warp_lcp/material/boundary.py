@@ -390,15 +390,10 @@ class CutBoundary:
     def placed(self) -> list[wp.array]:
         """Return the fields of the placed solids."""
         capacity = [] if self.capacity is None else [self.capacity]
-        return [
-            self.base,
-            self.touch,
-            self.cut.distance,
-            *self.cut.nearest,
-            *self.open,
-            *self.cut.wall,
-            *capacity,
-        ]
+        apart = [] if self.barriers is None else self.barriers.placed()
+        cut = self.cut
+        fields = [self.base, self.touch, cut.distance, *cut.nearest, *self.open, *cut.wall]
+        return [*fields, *capacity, *apart]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""

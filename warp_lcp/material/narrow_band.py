@@ -427,7 +427,9 @@ class NarrowBand:
     def _shore(self, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
         """Launch the depth of what is no deeper than a cell, from which `_relax` finds that of others."""
         planes, most = self.grid.planes, self.width + BEYOND
-        inputs = [planes, most, kind, phi, contact, self._keep, self.boundary.distance, self._now]
+        thin = self.grid.barriers.near if self.grid.barriers is not None else None
+        fields = [phi, contact, self._keep, self.boundary.distance, thin, self._now]
+        inputs = [planes, most, kind, *fields]
         self.grid.everywhere.launch(kernels.shore_kernel, inputs)
 
     def _launch_depth(self, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:

@@ -46,6 +46,7 @@ def shore_kernel(
     contact: U8,
     keep: I8,
     distance: F32,
+    thin: U8,
     depth: F32,
 ):
     """Depth is -phi in air, 0 where particles stay for another reason, and yet unknown elsewhere, solids included."""
@@ -58,6 +59,9 @@ def shore_kernel(
                 value = 0.0
         if distance:
             if solid_inside(distance, k, j, i, planes):
+                value = 0.0
+        if thin:
+            if thin[k, j, i] != wp.uint8(0):
                 value = 0.0
     elif kind[k, j, i] != _SOLID:
         value = -0.5

@@ -18,7 +18,15 @@ from warp_lcp.grid.sides import PeriodicSides, open_sides_of, periodic_sides, si
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
-from warp_lcp.grid.thin_walls import STRIDE_ROOM, THIN, ThinWalls, fills_cells, is_thin
+from warp_lcp.grid.thin_walls import (
+    SHEET,
+    STRIDE_ROOM,
+    THIN,
+    ThinWalls,
+    fills_cells,
+    is_sheet,
+    is_thin,
+)
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.coverage import Coverage
@@ -201,22 +209,27 @@ def make_thin_walls(
         scene: the scene.
         grid: its grid.
         placed: its solids.
-        open_sides: of `warp_lcp.grid.sides.side_bits`, those of axes without an end among them.
-        crossing: only those that are too thin to cut cells, but for rigid bodies, which the
-            pressure pushes by the cells that they cut.
+        open_sides: of `warp_lcp.grid.sides.side_bits`; those of periodic axes are added.
+        crossing: only those that are too thin to cut cells; of rigid bodies those that are sheets:
+            the pressure pushes others by the cells that they cut.
     """
-    if not ThinWalls.enabled:
+    walls = {False: THIN, True: max(THIN, scene.time.cfl + STRIDE_ROOM)}  # by whether they move
+
+    def suits(solid: PlacedSolid) -> bool:
+        shape, dx, is_body = solid.geometry, grid.spacing, isinstance(solid.motion, BodyMotion)
+        if crossing and is_body and not is_sheet(shape, SHEET * dx, grid.dimension):
+            return False
+        most = walls[solid.motion is not None]
+        if crossing:
+            most = SHEET if is_body else BARRIER
+        fills = solid.motion is None and fills_cells(shape, grid, DEEP)
+        return is_thin(shape, most * dx, grid.device) and not fills
+
+    thin = [suits(solid) for solid in placed]
+    if not any(thin):
         return None
-    least = dict.fromkeys((False, True), THIN) | {True: max(THIN, scene.time.cfl + STRIDE_ROOM)}
-    if crossing:
-        least = dict.fromkeys(least, BARRIER)
-    thin = [
-        is_thin(solid.geometry, least[solid.motion is not None] * grid.spacing, grid.device)
-        and not (solid.motion is None and fills_cells(solid.geometry, grid, DEEP))
-        and not (crossing and isinstance(solid.motion, BodyMotion))
-        for solid in placed
-    ]
-    return ThinWalls(grid, placed, thin, open_sides) if any(thin) else None
+    ends = side_bits(periodic_sides(scene.endless))
+    return ThinWalls(grid, placed, thin, open_sides | ends, scene.endless)
 
 
 @dataclass(frozen=True)

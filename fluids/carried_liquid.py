@@ -1,0 +1,113 @@
+"""Liquid beside thin rigid bodies that moves with them: up to the centers of cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.barriers import Barriers
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rigid.body import PLANAR
+
+
+class CarriedLiquid:
+    """What thin rigid bodies take along of the liquid beside them.
+
+    The pressure acts on such a body at cells' centers, a cell apart. What lies between them and the
+    body, of the mass m of each face f along its normal n, has the body's velocity V there, n . V_f.
+    With the unit motions c_f of the body's point at the face, the matrix G = sum of m c c' and the
+    sum g of m c u* of the liquid's velocities u*,
+
+        V = V* + H (I + g - G V)
+
+    after impulses I, where H is the inverse of the body's mass: it has the inverse mass
+    W = (1 + H G)^-1 H, and of impulses I it gets I - G W I.
+
+    Args:
+        grid: the grid.
+        barriers: thin solids, with bodies among them.
+        bodies: the bodies.
+        density: of the liquid [kg/m^3].
+
+    Attributes:
+        mass: G of each body, shape (n, k, k), k = 3 in 2-D (vx, vy, wz), 6 in 3-D.
+        momentum: g, shape (n, k).
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, barriers: Barriers, bodies: RigidBodies, density: float
+    ) -> None:
+        self.grid, self.barriers, self.bodies = grid, barriers, bodies
+        self._each = density * grid.cell_volume
+        width, count = (3 if grid.dimension == 2 else 6), len(bodies.bodies)
+        self.mass, self.momentum = np.zeros((count, width, width)), np.zeros((count, width))
+        self._body = np.full(1 + max(bodies.numbers), -1)
+        self._body[bodies.numbers] = np.arange(count)
+
+    def take(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
+        """Find the liquid, and share its momentum with the bodies; collective.
+
+        Args:
+            velocity: u* of each component [m/s].
+            kind: int8 of AIR, FLUID, SOLID.
+        """
+        self._find(velocity, kind)
+        inverse = self.bodies.bodies.inverse_masses(self.grid.dimension)
+        before = np.array([body.velocities(self.grid.dimension) for body in self.bodies.bodies])
+        free = before + np.einsum("nij,nj->ni", inverse, self.momentum)
+        after = np.linalg.solve(self._joined(inverse), free[..., None])[..., 0]
+        lost = np.einsum("nij,nj->ni", self.mass, after)
+        self.bodies.bodies.apply_impulses(self.momentum - lost)
+
+    def inverse_masses(self, inverse: np.ndarray) -> np.ndarray:
+        """Return W, given H, of shape (n, k, k)."""
+        joined = np.linalg.solve(self._joined(inverse), inverse)
+        return np.asarray(0.5 * (joined + joined.swapaxes(-1, -2)))
+
+    def share(self, impulses: np.ndarray) -> np.ndarray:
+        """Return what the bodies get of impulses, shape (n, k)."""
+        inverse = self.bodies.bodies.inverse_masses(self.grid.dimension)
+        changed = np.einsum("nij,nj->ni", self.inverse_masses(inverse), impulses)
+        return np.asarray(impulses - np.einsum("nij,nj->ni", self.mass, changed))
+
+    def _joined(self, inverse: np.ndarray) -> np.ndarray:
+        return np.asarray(np.eye(inverse.shape[-1]) + inverse @ self.mass)
+
+    def _find(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
+        """Sum up G and g over the faces of this process, and then over all."""
+        grid, part, barriers = self.grid, self.grid.part, self.barriers
+        near = barriers.reach.common(grid.domain)
+        window = None if near is None else near.common(part.faces(near))
+        mass, momentum = np.zeros((len(self.mass), 6, 6)), np.zeros((len(self.mass), 6))
+        for axis in range(grid.dimension) if window is not None else ():
+            low, high = window.low, window.high
+            cells = tuple(slice(first, end) for first, end in zip(low, high, strict=True))
+            number = barriers.number[axis].numpy()[cells]
+            known = np.minimum(number, len(self._body) - 1)
+            body = np.where(number < len(self._body), self._body[known], -1)
+            at = np.argwhere(body >= 0)
+            step = np.eye(3, dtype=int)[2 - axis]
+            under, here, over = (tuple((at + low + n * step).T) for n in (-1, 0, 1))
+            u, wet = velocity[axis].numpy(), kind.numpy() == FLUID
+            below = np.where(wet[under], barriers.below[axis].numpy()[here], 0.0)
+            above = np.where(wet[here], barriers.above[axis].numpy()[here], 0.0)
+            # velocities of the next faces: particles may not see this one
+            moved = below * u[under] + above * u[over]
+            place = (np.array(here).T[:, ::-1] + np.array(grid.origin) - 0.5) * grid.spacing
+            place[:, axis] -= 0.5 * grid.spacing
+            if grid.dimension == 2:
+                place[:, 2] = 0.0
+            owner = body[tuple(at.T)]
+            normal = np.eye(3)[axis]
+            lever = place - np.array([b.position for b in self.bodies.bodies])[owner]
+            unit = np.hstack([np.broadcast_to(normal, lever.shape), np.cross(lever, normal)])
+            m = self._each * (below + above)
+            np.add.at(mass, owner, m[:, None, None] * unit[:, :, None] * unit[:, None, :])
+            np.add.at(momentum, owner, (self._each * moved)[:, None] * unit)
+        mass, momentum = part.ranks.sum(mass), part.ranks.sum(momentum)
+        planar = slice(None) if grid.dimension == 3 else PLANAR
+        self.mass, self.momentum = mass[:, planar][:, :, planar], momentum[:, planar]

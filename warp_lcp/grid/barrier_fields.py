@@ -1,0 +1,148 @@
+# mypy: ignore-errors
+"""Fields at cell centers on one side of thin solids: what is free to go where, and smoothing."""
+
+import warp as wp
+
+from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
+from warp_lcp.grid.level_set_kernels import slope_beside
+
+MODULE = "warp_lcp.grid.barrier_fields"
+
+
+@wp.func
+def free_path(apart: U8, k: int, j: int, i: int, dk: int, dj: int, di: int):
+    """Return whether no thin solid stands between a cell and one at most a cell away on each axis.
+
+    Some way of steps along the axes must be free: the cells around are then on one side of what
+    is longer than a cell.
+    """
+    found = bool(False)
+    for n in range(6):  # orders of the axes
+        c = int(k)
+        b = int(j)
+        a = int(i)
+        free = bool(True)
+        for step in range(3):
+            d = ((n >> 1) + wp.where((n & 1) == 1, 3 - step, step)) % 3
+            to_c = c + wp.where(d == 2, dk, 0)
+            to_b = b + wp.where(d == 1, dj, 0)
+            to_a = a + wp.where(d == 0, di, 0)
+            if to_c != c or to_b != b or to_a != a:
+                bits = int(apart[wp.max(c, to_c), wp.max(b, to_b), wp.max(a, to_a)])
+                if (bits >> d) & 1 == 1:
+                    free = False
+            c = to_c
+            b = to_b
+            a = to_a
+        if free:
+            found = True
+    return found
+
+
+@wp.func
+def stand_in(apart: U8, k: int, j: int, i: int, way: wp.vec3i):
+    """Return the step to the cell that stands for the one a step `way` (z, y, x) from a cell.
+
+    That one itself if it is on the same side of thin solids; else what is left of the step without
+    one of its axes, or two, which mirrors what is beside the cell; else no step.
+    """
+    result = way
+    free = free_path(apart, k, j, i, way[0], way[1], way[2])
+    for without in range(1, 7):  # of the axes, one a bit: 1, 2, 4, and then 3, 5, 6
+        if not free:
+            bits = int(without)
+            if without == 3:
+                bits = 4
+            if without == 4:
+                bits = 3
+            shorter = wp.vec3i(
+                wp.where((bits & 4) != 0, 0, way[0]),
+                wp.where((bits & 2) != 0, 0, way[1]),
+                wp.where((bits & 1) != 0, 0, way[2]),
+            )
+            if free_path(apart, k, j, i, shorter[0], shorter[1], shorter[2]):
+                free = True
+                result = shorter
+    if not free:
+        result = wp.vec3i(0, 0, 0)
+    return result
+
+
+@wp.func
+def has_neighbors(field: U8, planes: int, k: int, j: int, i: int):
+    """Return whether all cells around a stored one are stored."""
+    result = i > 0 and j > 0 and i + 1 < field.shape[2] and j + 1 < field.shape[1]
+    if planes == 2 and (k == 0 or k + 1 == field.shape[0]):
+        result = False
+    return result
+
+
+@cell_kernel(MODULE)
+def binomial_kernel(k, j, i, near: U8, apart: U8, planes: int, source: F32, out: F32):
+    """Make a binomial pass (1, 2, 1)/4 again near thin solids: others stand for cells beyond."""
+    if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
+        total = float(0.0)
+        for n in range(wp.where(planes == 2, 27, 9)):
+            di = n % 3 - 1
+            dj = (n // 3) % 3 - 1
+            dk = int(0)
+            if planes == 2:
+                dk = n // 9 - 1
+            w = wp.where(di == 0, 0.5, 0.25) * wp.where(dj == 0, 0.5, 0.25)
+            if planes == 2:
+                w *= wp.where(dk == 0, 0.5, 0.25)
+            step = stand_in(apart, k, j, i, wp.vec3i(dk, dj, di))
+            total += w * source[k + step[0], j + step[1], i + step[2]]
+        out[k, j, i] = total
+
+
+@cell_kernel(MODULE)
+def shift_kernel(
+    k,
+    j,
+    i,
+    near: U8,
+    apart: U8,
+    planes: int,
+    variance: float,
+    limit: float,
+    capacity: F32,
+    phi: F32,
+    known: I8,
+    out: F32,
+):
+    """Bring phi back to a cell's center again by what is on its side of thin solids.
+
+    See `warp_lcp.grid.level_set_kernels.wall_shift_kernel`.
+    """
+    one = wp.int8(1)
+    if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
+        here = phi[k, j, i]
+        value = here
+        c = capacity[k, j, i]
+        if known[k, j, i] == one and c < 0.999 and wp.abs(here) < 0.98 * limit:
+            grad = wp.vec3()
+            s = wp.vec3()
+            for d in range(planes + 1):
+                dk = wp.where(d == 2, 1, 0)
+                dj = wp.where(d == 1, 1, 0)
+                di = wp.where(d == 0, 1, 0)
+                low = ((int(apart[k, j, i]) >> d) & 1) == 0
+                high = ((int(apart[k + dk, j + dj, i + di]) >> d) & 1) == 0
+                below = c
+                above = c
+                if low:
+                    below = capacity[k - dk, j - dj, i - di]
+                if high:
+                    above = capacity[k + dk, j + dj, i + di]
+                s[d] = 0.5 * (above - below)
+                low = low and known[k - dk, j - dj, i - di] == one
+                high = high and known[k + dk, j + dj, i + di] == one
+                lower = phi[k - dk, j - dj, i - di]
+                upper = phi[k + dk, j + dj, i + di]
+                grad[d] = slope_beside(here, lower, upper, low, high)
+            grad = grad / wp.max(wp.length(grad), 1.0)
+            s = s * (variance / wp.max(c, 1.0e-3))
+            s = s / wp.max(wp.length(s), 1.0)
+            value = wp.clamp(here - wp.dot(s, grad), -limit, limit)
+        out[k, j, i] = value
