@@ -83,9 +83,9 @@ class CarriedLiquid:
         near = barriers.reach.common(grid.domain)
         window = None if near is None else near.common(part.faces(near))
         mass, momentum = np.zeros((len(self.mass), 6, 6)), np.zeros((len(self.mass), 6))
+        low, high = ((), ()) if window is None else (window.low, window.high)
+        cells = tuple(map(slice, low, high))
         for axis in range(grid.dimension) if window is not None else ():
-            low, high = window.low, window.high
-            cells = tuple(slice(first, end) for first, end in zip(low, high, strict=True))
             number = barriers.number[axis].numpy()[cells]
             known = np.minimum(number, len(self._body) - 1)
             body = np.where(number < len(self._body), self._body[known], -1)

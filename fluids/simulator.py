@@ -105,7 +105,9 @@ class LiquidSimulation(ParticleSimulation):
         if self.tension is not None:
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")
-            if grid.barriers is not None and scene.surface_tension.contact_angle != 90.0:
+            settings = scene.surface_tension
+            angle = 90.0 if settings is None else settings.contact_angle
+            if grid.barriers is not None and angle != 90.0:
                 thin = ", ".join(grid.barriers.names)
                 self._notes.append(
                     f"surface_tension.contact_angle is 90 on {thin}, thinner than a cell"

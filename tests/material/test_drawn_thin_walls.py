@@ -3,15 +3,9 @@
 import pytest
 
 from drawn_thin_walls import KINDS, drawn, run
-from warp_lcp.grid.thin_walls import ThinWalls
 
 SEEDS = range(6)
 LOAD = {2: 0.02, 3: 0.06}  # in 3-D a bottle is 7 cells wide: its particles are off by 4 %
-
-
-@pytest.fixture(autouse=True)
-def thin_walls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ThinWalls, "enabled", True)
 
 
 def check(seed: int, kind: str, simulator: str, dimension: int) -> None:

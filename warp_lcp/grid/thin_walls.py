@@ -131,7 +131,7 @@ class ThinWalls:
         # whose meshes are on the device
         self._geometries = [part for _, of in groups for _, part in of]
         ends = np.cumsum([0, *(len(of) for _, of in groups)])
-        self._groups = []
+        self._groups = list[kernels.ThinGroup]()
         self._moving: list[tuple[int, int, np.ndarray]] = []
         moving = 0
         for (motion, _), (first, end) in zip(groups, pairwise(ends), strict=True):
