@@ -26,7 +26,7 @@ MIDST = 3  # iterations after which a method has allocated all of its buffers
 
 
 @dataclass
-class Case:
+class SolverCase:
     """Solve that is measured repeatedly."""
 
     form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`

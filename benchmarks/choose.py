@@ -18,7 +18,7 @@ from pathlib import Path
 import warp_lcp as wl
 from warp_lcp.benchmarks.choose_problems import KINDS, RARE, draw
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Record, Results, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.recommend import Recommendation, memory_of
 from warp_lcp.rules import RULES, method_for, steps_allowed
@@ -37,7 +37,7 @@ DEFAULT = "default"  # `wl.solve` without a method: the method of the rule, then
 
 
 @dataclass
-class Trial:
+class ChoiceTrial:
     """Solves of one problem by one method."""
 
     seconds: list[float] = field(default_factory=list)
@@ -68,7 +68,7 @@ def measure(options: Options, out: Path) -> Results:
     )
 
 
-def problem_record(name: str, problem: wl.LCP, device: str) -> Record:
+def problem_record(name: str, problem: wl.LCP, device: str) -> BenchmarkRecord:
     """Return times and outcomes of all methods on a problem, and the applicable rule."""
     advice = wl.recommend(problem, accuracy=RTOL)
     trials = try_methods(problem, advice, device)
@@ -92,7 +92,7 @@ def problem_record(name: str, problem: wl.LCP, device: str) -> Record:
         "iterations": {method: trial.iterations for method, trial in trials.items()},
         "budgets": budget_choices(problem, advice),
     }
-    return Record(name, figures, facts)
+    return BenchmarkRecord(name, figures, facts)
 
 
 def rule_number(advice: Recommendation) -> int:
@@ -100,7 +100,7 @@ def rule_number(advice: Recommendation) -> int:
     return 1 + next(i for i, rule in enumerate(RULES) if advice.reasons[0] == f"{rule.reason}.")
 
 
-def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[str, Trial]:
+def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[str, ChoiceTrial]:
     """Return the trials by method: one each, then ROUNDS interleaved samples.
 
     Only methods near the fastest get interleaved samples.
@@ -120,7 +120,7 @@ def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[st
 
     solvers = {name: solver(name) for name in t.able}
     solvers[DEFAULT] = lambda: wl.solve(problem)
-    trials = {name: Trial() for name in solvers}
+    trials = {name: ChoiceTrial() for name in solvers}
     for name, solve in solvers.items():
         sample(trials[name], solve, device)
     solved = [trial.best for trial in trials.values() if trial.solved]
@@ -139,7 +139,7 @@ def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[st
     return trials
 
 
-def sample(trial: Trial, solve: Callable[[], wl.SolveResult], device: str) -> None:
+def sample(trial: ChoiceTrial, solve: Callable[[], wl.SolveResult], device: str) -> None:
     """Add one cold solve to a trial."""
     wl.release_workspace()
     now = clock(device)
@@ -171,7 +171,7 @@ def budget_choices(problem: wl.LCP, advice: Recommendation) -> dict[str, str]:
     }
 
 
-def solved_by(record: Record) -> dict[str, float]:
+def solved_by(record: BenchmarkRecord) -> dict[str, float]:
     """Return the seconds of the methods that solved a problem, the default excluded."""
     status: Mapping[str, str] = record.facts["status"]
     names = (
@@ -180,7 +180,7 @@ def solved_by(record: Record) -> dict[str, float]:
     return {name: record.figures[name].value for name in names}
 
 
-def over_best(record: Record, name: str) -> float | None:
+def over_best(record: BenchmarkRecord, name: str) -> float | None:
     """Return a method's time over that of the best method; None if it failed."""
     solved, status = solved_by(record), record.facts["status"]
     if status.get(name) != wl.SolveStatus.CONVERGED.name:
@@ -189,7 +189,7 @@ def over_best(record: Record, name: str) -> float | None:
     return seconds / min([*solved.values(), seconds])
 
 
-def is_right(record: Record, name: str) -> bool:
+def is_right(record: BenchmarkRecord, name: str) -> bool:
     """Return whether a method solved a problem nearly as fast as the best method."""
     ratio = over_best(record, name)
     if ratio is None:
@@ -198,7 +198,7 @@ def is_right(record: Record, name: str) -> bool:
     return ratio <= SLOWER or seconds - seconds / ratio <= NEGLIGIBLE
 
 
-def rule_row(number: int, records: Sequence[Record]) -> list[str]:
+def rule_row(number: int, records: Sequence[BenchmarkRecord]) -> list[str]:
     """Return the table row of a rule.
 
     The columns are problems, solved, time over the best, the best methods, the gain of the
@@ -243,7 +243,7 @@ RULE_COLUMNS = [
 ]
 
 
-def rule_table(records: Sequence[Record]) -> Table:
+def rule_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return a row for each rule."""
     rows = [rule_row(number, records) for number in range(1, len(RULES) + 1)]
     remark = (
@@ -254,10 +254,10 @@ def rule_table(records: Sequence[Record]) -> Table:
         "first alternative that solves them. By default: rule's method and alternatives, no limit "
         "of time."
     )
-    return Table("Rules", RULE_COLUMNS, rows, remark)
+    return RecordTable("Rules", RULE_COLUMNS, rows, remark)
 
 
-def kind_table(records: Sequence[Record]) -> Table:
+def kind_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return a row for each kind of problem."""
     rows = []
     for kind in dict.fromkeys(r.facts["kind"] for r in records):
@@ -280,10 +280,10 @@ def kind_table(records: Sequence[Record]) -> Table:
         f"Near the best: within {SLOWER:g} times the fastest method's time or "
         f"{1e3 * NEGLIGIBLE:g} ms, the choice included."
     )
-    return Table("Kinds of problems", columns, rows, remark)
+    return RecordTable("Kinds of problems", columns, rows, remark)
 
 
-def budget_table(records: Sequence[Record]) -> Table:
+def budget_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return a row for each step budget.
 
     The row says how often the recommended method solves within the budget, and how often any method
@@ -305,7 +305,7 @@ def budget_table(records: Sequence[Record]) -> Table:
         "Solved: the method that `wl.recommend` names for the budget has solved the problem "
         "within its steps."
     )
-    return Table(
+    return RecordTable(
         "Budgets",
         ["budget", "problems", "solved", "solved by any method, in any memory"],
         rows,
@@ -313,7 +313,7 @@ def budget_table(records: Sequence[Record]) -> Table:
     )
 
 
-def _summary(records: Sequence[Record]) -> str:
+def _summary(records: Sequence[BenchmarkRecord]) -> str:
     right = sum(is_right(r, DEFAULT) for r in records)
     rules = sorted({r.facts["rule"] for r in records})
     return f"default near the best on {right} of {len(records)}, rules {', '.join(map(str, rules))}"

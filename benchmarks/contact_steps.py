@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from warp_lcp.benchmarks.harness.record import Record, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.contacts import SIMULATOR
 from warp_lcp.rigid.bodies import RigidBodies
@@ -81,7 +81,7 @@ def overlap(bodies: RigidBodies) -> float:
     return float((radius[i] + radius[j] - np.linalg.norm(at[i] - at[j], axis=1)).max(initial=0.0))
 
 
-def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
+def steps_of_spheres(options: Options) -> tuple[list[BenchmarkRecord], RecordTable]:
     """Return the cost of steps by each method, by interleaved timing.
 
     All methods take the same step from the same state. The result of the last method is kept.
@@ -121,11 +121,13 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
     return _reported(samples)
 
 
-def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], Table]:
+def _reported(
+    found: dict[str, dict[str, list[float]]],
+) -> tuple[list[BenchmarkRecord], RecordTable]:
     units = {"seconds": "s", "solve_seconds": "s", "overlap": "m"}
     records, rows = [], []
     for method, figures in found.items():
-        record = Record(
+        record = BenchmarkRecord(
             f"{SPHERES} spheres in a box: {method}",
             {n: Figure.of(v, units.get(n, "")) for n, v in figures.items()},
             {"method": method},
@@ -153,7 +155,7 @@ def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], T
         f"{TOLERANCE:g}, in "
         "boxes of friction or the circular cone."
     )
-    return records, Table(
+    return records, RecordTable(
         f"{SPHERES} spheres in a box",
         [*columns, "share of a step", "share of a solve"],
         rows,

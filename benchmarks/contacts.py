@@ -12,7 +12,13 @@ from typing import Any
 import warp_lcp as wl
 from warp_lcp.benchmarks.contact_steps import steps_of_spheres
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    Chart,
+    RecordLines,
+    RecordTable,
+    Results,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery.contact_models import (
     BoxedModel,
@@ -62,7 +68,7 @@ def measure(options: Options, out: Path) -> Results:
     Then solve the heavy box at growing mass ratios by PGS and NNCG.
     """
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
-    solves: list[Record] = []
+    solves: list[BenchmarkRecord] = []
     charts: list[Chart] = []
     for name in SCENES:
         system = next_step(name, options.device).system
@@ -72,7 +78,7 @@ def measure(options: Options, out: Path) -> Results:
             "sweeps, linear iterations, pivots or factorizations",
             "residual / residual at x = 0",
         )
-        charts += [Lines(name, system.name, steps, unit, curves)] if name in DRAWN else []
+        charts += [RecordLines(name, system.name, steps, unit, curves)] if name in DRAWN else []
     equal = _equal(options)
     piles, pile = steps_of_spheres(options)
     return Results(
@@ -103,7 +109,7 @@ Curve = tuple[list[float], list[float]]
 
 
 def _scene(
-    name: str, system: ContactSystem, options: Options, solves: list[Record]
+    name: str, system: ContactSystem, options: Options, solves: list[BenchmarkRecord]
 ) -> dict[str, Curve]:
     """Solve a scene by all methods.
 
@@ -127,7 +133,7 @@ def _scene(
                 result = wl.solve(problem, method, stopping=unhindered(most))
             except ValueError as error:
                 solves.append(
-                    Record(f"{name}: {label}", {}, facts | {"status": f"refused: {error}"})
+                    BenchmarkRecord(f"{name}: {label}", {}, facts | {"status": f"refused: {error}"})
                 )
                 continue
             first = result.history[0].residual
@@ -151,12 +157,12 @@ def _scene(
                         f"seconds_to_{level:.0e}": Figure(reached[1], "s"),
                     }
             solves.append(
-                Record(f"{name}: {label}", figures, facts | {"status": result.status.name})
+                BenchmarkRecord(f"{name}: {label}", figures, facts | {"status": result.status.name})
             )
     return curves
 
 
-def _equal(options: Options) -> list[Record]:
+def _equal(options: Options) -> list[BenchmarkRecord]:
     """Compare PGS and NNCG after equal sweeps.
 
     They run on the stacks, and on the heavy box at all mass ratios.
@@ -189,11 +195,11 @@ def _equal(options: Options) -> list[Record]:
                 f"NNCG_{n}": Figure(nncg),
                 f"ratio_{n}": Figure(pgs / nncg if nncg > 0 else 1.0),
             }
-        records.append(Record(f"equal sweeps: {name}", figures, {"case": name}))
+        records.append(BenchmarkRecord(f"equal sweeps: {name}", figures, {"case": name}))
     return records
 
 
-def _finding(records: list[Record]) -> Table:
+def _finding(records: list[BenchmarkRecord]) -> RecordTable:
     """Count the scenes where NNCG behaves as the book says and PGS has not converged."""
     rows = []
     for n in EQUAL:
@@ -207,7 +213,7 @@ def _finding(records: list[Record]) -> Table:
         "Cases in which PGS has not converged to rounding itself by then. Residuals of the "
         "boxed model, relative to that at x = 0."
     )
-    return Table(
+    return RecordTable(
         f"NNCG at least {TARGET:g} x below PGS at equal sweeps",
         ["sweeps", "cases", "missed by"],
         rows,
@@ -215,15 +221,15 @@ def _finding(records: list[Record]) -> Table:
     )
 
 
-def _equal_table(records: list[Record]) -> Table:
+def _equal_table(records: list[BenchmarkRecord]) -> RecordTable:
     names = [f"{label}_{n}" for n in EQUAL for label in ("PGS", "NNCG", "ratio")]
     rows = [[r.facts["case"], *(f"{r.value(name):.2g}" for name in names)] for r in records]
-    return Table(
+    return RecordTable(
         "PGS and NNCG at equal sweeps", ["case", *(name.replace("_", " ") for name in names)], rows
     )
 
 
-def _tables(solves: list[Record]) -> list[Table]:
+def _tables(solves: list[BenchmarkRecord]) -> list[RecordTable]:
     """Return a table for each scene."""
     columns = [
         "method",
@@ -263,5 +269,7 @@ def _tables(solves: list[Record]) -> list[Table]:
             "are products with A: of Lemke pivots, of "
             "Newton factorizations, of staggering pivots."
         )
-        tables.append(Table(name, columns, rows, remark if name == next(iter(SCENES)) else ""))
+        tables.append(
+            RecordTable(name, columns, rows, remark if name == next(iter(SCENES)) else "")
+        )
     return tables

@@ -17,7 +17,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.contacts import next_step, unhindered
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table, shown
+from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results, shown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.gallery.contact_models import BoxedModel
@@ -67,10 +67,12 @@ def measure(options: Options, out: Path) -> Results:
         {r.name: 1e3 * (r.value("seconds") or 0) for r in records[1:]},
         logarithmic=True,
     )
-    return Results(records, [Table("Work", ["work", "ms", "iterations"], rows, remark)], [chart])
+    return Results(
+        records, [RecordTable("Work", ["work", "ms", "iterations"], rows, remark)], [chart]
+    )
 
 
-def _solves(n: int, options: Options) -> list[Record]:
+def _solves(n: int, options: Options) -> list[BenchmarkRecord]:
     """Time solves of a splash with separating walls, and sweeps of PGS."""
     problem, device = splash(n).lcp("walls", device=options.device), options.device
     work: dict[str, Callable[[], object]] = {}
@@ -89,7 +91,7 @@ def _solves(n: int, options: Options) -> list[Record]:
     for name, seconds in in_turns(work, options.repeat).items():
         if name == "PGS":
             records.append(
-                Record(
+                BenchmarkRecord(
                     f"{n}^3: a sweep of PGS",
                     {"seconds": Figure.least([t / SWEEPS for t in seconds], "s")},
                 )
@@ -99,11 +101,13 @@ def _solves(n: int, options: Options) -> list[Record]:
             "seconds": Figure.least(seconds, "s"),
             "iterations": Figure(results[name].iterations),
         }
-        records.append(Record(f"{n}^3: {name}", figures, {"status": results[name].status.name}))
+        records.append(
+            BenchmarkRecord(f"{n}^3: {name}", figures, {"status": results[name].status.name})
+        )
     return records
 
 
-def _kernels(n: int, options: Options) -> list[Record]:
+def _kernels(n: int, options: Options) -> list[BenchmarkRecord]:
     """Time the product with the Laplacian of a full box and a multigrid cycle."""
     box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device=options.device)
     x, y = (wp.ones(box.layout.size, dtype=wp.float32, device=options.device) for _ in range(2))
@@ -121,12 +125,12 @@ def _kernels(n: int, options: Options) -> list[Record]:
 
     taken = in_turns({"product": product, "multigrid cycle": cycle}, options.repeat)
     return [
-        Record(f"{n}^3: {name}", {"seconds": Figure.least(times, "s")})
+        BenchmarkRecord(f"{n}^3: {name}", {"seconds": Figure.least(times, "s")})
         for name, times in taken.items()
     ]
 
 
-def _step(name: str, cells: int, options: Options) -> Record:
+def _step(name: str, cells: int, options: Options) -> BenchmarkRecord:
     """Time the steps of a built-in scene."""
     scene = load_scene(name, [f"domain.resolution={cells}"])
     simulation = simulators()[scene.scene.simulator].create(
@@ -138,10 +142,10 @@ def _step(name: str, cells: int, options: Options) -> Record:
         simulation.step(simulation.stable_dt())
         wp.synchronize_device(options.device)
         seconds += [time.perf_counter() - begun] if step >= BEFORE else []
-    return Record(f"a step of {name}, {cells} cells", {"seconds": Figure.of(seconds, "s")})
+    return BenchmarkRecord(f"a step of {name}, {cells} cells", {"seconds": Figure.of(seconds, "s")})
 
 
-def _contacts(options: Options) -> Record:
+def _contacts(options: Options) -> BenchmarkRecord:
     """Time sweeps of PGS over the contacts of a wall of boxes."""
     problem = (
         BoxedModel().problem(next_step(CONTACTS, options.device).system).lcp(device=options.device)
@@ -154,7 +158,7 @@ def _contacts(options: Options) -> Record:
         wp.synchronize_device(options.device)
 
     taken = in_turns({"sweep": sweep}, options.repeat)["sweep"]
-    return Record(
+    return BenchmarkRecord(
         f"contacts of {CONTACTS}: a sweep of PGS",
         {"seconds": Figure.least([t / CONTACT_SWEEPS for t in taken], "s")},
     )

@@ -14,7 +14,13 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.benchmarks.harness.machine import forget_peak, machine, resident_bytes
-from warp_lcp.benchmarks.harness.record import Record, Results, Table, Target, table_of_targets
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    RecordTable,
+    RecordTarget,
+    Results,
+    table_of_targets,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from warp_lcp.fluids import SIMULATOR, LiquidScene
 from warp_lcp.simulation import NoStopwatch
@@ -52,7 +58,7 @@ def measure(options: Options, out: Path) -> Results:
             "memory": Figure(growth, "MB"),
             "checkpoint": Figure(state, "MB"),
         }
-        records.append(Record(f"{n}^3", figures, {"covered": cells}))
+        records.append(BenchmarkRecord(f"{n}^3", figures, {"covered": cells}))
     options.say("a flight")
     flight = _flight()
     records.append(flight)
@@ -68,7 +74,7 @@ def measure(options: Options, out: Path) -> Results:
     )
     heads = ["domain", "a step", "over the first", "memory", "checkpoint", "cells covered"]
     tables = [
-        Table("A step and its memory", heads, rows, remark),
+        RecordTable("A step and its memory", heads, rows, remark),
         _flight_table(flight),
         _targets(records),
     ]
@@ -137,7 +143,7 @@ class Shares(NoStopwatch):
         self.seconds[name] += time.perf_counter() - begun
 
 
-def _flight() -> Record:
+def _flight() -> BenchmarkRecord:
     """Return the cost of grid rebuilds during a ball's flight.
 
     The ball flies over a solid in an unbounded domain.
@@ -176,16 +182,18 @@ def _flight() -> Record:
         "steps": Figure(simulation.step_count - STEPS),
         "step": Figure(1e3 * whole / (simulation.step_count - STEPS), "ms"),
     }
-    return Record("a ball's flight", figures, {"covered": max(grid.size for grid in grids)})
+    return BenchmarkRecord(
+        "a ball's flight", figures, {"covered": max(grid.size for grid in grids)}
+    )
 
 
-def _flight_table(record: Record) -> Table:
+def _flight_table(record: BenchmarkRecord) -> RecordTable:
     remark = (
         "A ball of .4 m flies 4 m and falls onto a solid and the floor, cells of 2 cm, a "
         "domain without far ends."
     )
     heads = ["", "laying grids, share of a step", "grids", "steps", "a step", "most cells covered"]
-    return Table(
+    return RecordTable(
         "Laying grids",
         heads,
         [[record.name, *(str(f) for f in record.figures.values()), str(record.facts["covered"])]],
@@ -193,23 +201,27 @@ def _flight_table(record: Record) -> Table:
     )
 
 
-def _targets(records: list[Record]) -> Table:
+def _targets(records: list[BenchmarkRecord]) -> RecordTable:
     by_name = {record.name: record for record in records}
     times = {n: by_name[f"{n}^3"].figures["ratio"] for n in TIME_LIMITS if f"{n}^3" in by_name}
     targets = [
-        Target(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x")
+        RecordTarget(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x")
         for n, ratio in times.items()
     ]
     if "192^3" in by_name:
         growth = (
             by_name["192^3"].figures["memory"].value / by_name[f"{SIDE}^3"].figures["memory"].value
         )
-        targets.append(Target(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x"))
+        targets.append(
+            RecordTarget(f"192^3 over {SIDE}^3, memory", GROWTH_LIMIT, Figure(growth), " x")
+        )
     if "768^3" in by_name:
         targets.append(
-            Target("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB")
+            RecordTarget("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB")
         )
     targets.append(
-        Target("laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %")
+        RecordTarget(
+            "laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %"
+        )
     )
     return table_of_targets("of large domains", targets)

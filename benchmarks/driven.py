@@ -17,9 +17,9 @@ import numpy as np
 from rich.console import Console
 
 import warp_lcp as wl
-from warp_lcp.run.given_scene import given_scene
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.progress import Lines
+from warp_lcp.run.resolve_scene import resolve_scene
 
 SCENES = {"dam-break-2d": 1.0, "dam-break": 0.3}  # [s] simulated
 TURNS = 15
@@ -27,7 +27,7 @@ TURNS = 15
 
 def by_command(scene: str, folder: Path, duration: float) -> None:
     """Run a scene as the command line does."""
-    given = given_scene(scene, [f"time.duration={duration}"])
+    given = resolve_scene(scene, [f"time.duration={duration}"])
     run_scene(
         RunRequest(scene=given.scene, out=folder, overrides=given.overrides),
         observer=Lines(Console(quiet=True)),

@@ -9,7 +9,7 @@ a graph would hold.
 
 With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels
 whose results depend on it and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of
-cells (`warp_lcp/rows/headers/quad.h`), which are loaded in blocks where rows allow it, also runs by
+cells (`warp_lcp/kernels/headers/quad.h`), which are loaded in blocks where rows allow it, also runs by
 cells, from equal memory: `launched_by_cells` counts such launches, `otherwise` those whose fields
 differ in a bit, or whose sums differ by more than rounding. `meter` counts launches, readbacks and
 allocations, and calls: of Python, to launch, copy or clear, one for a whole graph.
@@ -45,8 +45,8 @@ ADDRESS = 0x6F0000000000  # address at which compiled kernels read the order of 
 # Kernels (module:name) whose results depend on the order of threads, and why they may.
 ORDER_MATTERS = {
     "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
-    "warp_lcp.material.flight:unite": "trees differ, their roots do not",
-    "warp_lcp.material.flight:board_kernel": "a list in the order in which threads come; sums over "
+    "warp_lcp.material.ballistic_fragments:unite": "trees differ, their roots do not",
+    "warp_lcp.material.ballistic_fragments:board_kernel": "a list in the order in which threads come; sums over "
     "it are rounded in that order",
     "warp_lcp.grid.node_distance:claim_groups": "lists of nodes in the order in which threads "
     "come; each node is measured for itself",
@@ -301,8 +301,8 @@ def checked_by_cells(invoke):
 
     Both start from equal memory.
     """
-    from warp_lcp.rows import layout
-    from warp_lcp.rows.pass_form import Form
+    from warp_lcp.kernels import layout
+    from warp_lcp.kernels.kernel_variant import KernelVariant
 
     forms = {}  # form of each kernel; None if it is no pass by quads
 
@@ -311,7 +311,7 @@ def checked_by_cells(invoke):
             made = (
                 o
                 for o in gc.get_objects()
-                if type(o) is Form and o.quads and vars(o).get("kernel") is kernel
+                if type(o) is KernelVariant and o.quads and vars(o).get("kernel") is kernel
             )
             forms[kernel] = next(made, None)
         return forms[kernel]
@@ -407,8 +407,9 @@ if COMPARE:
 
 def replayed():
     """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
-    from warp_lcp.rows import device_graph, host_kernel, joined, layout
-    from warp_lcp.rows.program import LaunchGraph, Loop, Program
+    from warp_lcp.kernels import device_graph, host_kernel, layout
+    from warp_lcp.kernels import joined_graphs as joined
+    from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, Loop
 
     if CELLS:
         context.invoke = checked_by_cells(context.invoke)
@@ -434,8 +435,8 @@ def replayed():
     host_kernel.LaunchGraph = HostGraph
     device_graph.noted = lambda device, event: None
     wp.is_conditional_graph_supported = lambda: True
-    Program._captured = lambda self, commands: list(commands)
-    Program._captured_loop = lambda self, condition: (
+    CommandBuffer._captured = lambda self, commands: list(commands)
+    CommandBuffer._captured_loop = lambda self, condition: (
         lambda: wp.capture_launch([Loop(condition, self)])
     )
 

@@ -34,12 +34,12 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks import gpu_cases, kernels
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Record, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.problems import natural, splash
-from warp_lcp.reduced.multigrid_ahead import RunAhead
-from warp_lcp.rows.program import LaunchGraph, Program, loops_on_device
+from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, loops_on_device
+from warp_lcp.reduced.device_iteration import DeviceIteration
 
 CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
 WRONG = 3  # what `benchmarks.gpu_kernels` ends with where kernels differ
@@ -56,7 +56,7 @@ class Claim:
     found: str
 
 
-class Verdict:
+class GpuVerdict:
     """All claims about a device, as they are tried.
 
     Args:
@@ -68,7 +68,7 @@ class Verdict:
     def __init__(self, device: str, *, rehearsal: bool, out: Path) -> None:
         self.device, self.rehearsal, self.out = device, rehearsal, out
         self.claims: list[Claim] = []
-        self.tables: list[Table] = []
+        self.tables: list[RecordTable] = []
         self.steps = 10 if rehearsal else gpu_cases.STEPS
 
     def claim(self, name: str, found: Callable[[], str | None]) -> None:
@@ -186,7 +186,7 @@ class Verdict:
         """Solve with launches one by one."""
         recorded = gpu_cases.large(self.device, 32)
         with (
-            mock.patch.object(Program, "_captured", lambda _, commands: list(commands)),
+            mock.patch.object(CommandBuffer, "_captured", lambda _, commands: list(commands)),
             mock.patch.object(wp, "capture_launch", launched),
         ):
             alone = gpu_cases.large(self.device, 32)
@@ -219,7 +219,7 @@ class Verdict:
             return gpu_cases.large(self.device, 32) | last
 
         found = both()
-        with mock.patch.object(RunAhead, "suits", lambda work: False):
+        with mock.patch.object(DeviceIteration, "suits", lambda work: False):
             judged = both()
         other = [name for name, x in found.items() if not np.array_equal(x, judged[name])]
         assert not other, f"differ: {', '.join(other)}"
@@ -312,7 +312,9 @@ class Verdict:
                 ]
             )
         self.tables.append(
-            Table("Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows)
+            RecordTable(
+                "Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows
+            )
         )
         assert all(row[-1] == "CONVERGED" for row in rows), rows
         for n in (16,) if self.rehearsal else (64, 128):
@@ -320,7 +322,7 @@ class Verdict:
                 [f"{n}", *(f"{1e3 * self._step_time(n, on_device=on):.1f}" for on in (False, True))]
             )
         self.tables.append(
-            Table("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps)
+            RecordTable("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps)
         )
         cells = ("16", "16") if self.rehearsal else ("128", "64")
         said = subprocess.run(
@@ -369,14 +371,14 @@ class Verdict:
         return f"{sum(len(t.rows) for t in found.tables[1:])} kernels at {n}^3"
 
     @functools.cached_property
-    def machine(self) -> Record:
+    def machine(self) -> BenchmarkRecord:
         """The device and its machine."""
         return machine(self.device, elements=1 << 20)
 
     def write(self) -> None:
         """Leave the page, and the file to send in."""
         rows = [["PASS" if c.holds else "FAIL", c.name, c.found] for c in self.claims]
-        tables = [Table("Claims", ["", "claim", "found"], rows), *self.tables]
+        tables = [RecordTable("Claims", ["", "claim", "found"], rows), *self.tables]
         record = self.machine
         lines = [
             f"# Verdict on {self.device}{' (a rehearsal on the CPU)' if self.rehearsal else ''}",
@@ -423,7 +425,7 @@ def main() -> int:
         print("no CUDA device: use `--rehearse` for a rehearsal on the CPU", file=sys.stderr)
         return 2
     given.out.mkdir(parents=True, exist_ok=True)
-    verdict = Verdict(
+    verdict = GpuVerdict(
         "cpu" if given.rehearse else given.device, rehearsal=given.rehearse, out=given.out.resolve()
     )
     verdict.all()

@@ -30,8 +30,8 @@ from benchmarks.machine_code import Kernel, assemble, tools_missing
 from benchmarks.machine_counts import Issued, issued
 from benchmarks.machine_thread import Memory, constants_of
 from warp_lcp.benchmarks.kernels import Heard
-from warp_lcp.rows import RowPass, layout
-from warp_lcp.rows.row_pass import Bound
+from warp_lcp.kernels import StencilKernel, layout
+from warp_lcp.kernels.stencil_kernel import BoundKernel
 
 assert emulated_cuda
 
@@ -65,7 +65,7 @@ GPUS = {"H200": Gpu(132, 1.98, 4800.0, 2.0, 64), "RTX 4090": Gpu(128, 2.52, 1008
 
 
 @dataclass(frozen=True)
-class Count:
+class InstructionCount:
     """What a warp of a pass issues, and what the pass needs.
 
     Attributes:
@@ -136,16 +136,16 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
         wall[side] = wall[:, side] = wall[:, :, side] = True
     b = np.where(cells == wl.FLUID, np.random.default_rng(2015).standard_normal(SHAPE), 0.0)
     heard: list[tuple[Heard, dict[str, Any]]] = []
-    bind = RowPass.bind_arguments
+    bind = StencilKernel.bind_arguments
 
     def listening(
-        declared: RowPass,
+        declared: StencilKernel,
         rows: Any,
         structs: Any,
         given: dict[str, Any],
         stencil: Any = None,
         bounds: Any = None,
-    ) -> Bound:
+    ) -> BoundKernel:
         bound = bind(declared, rows, structs, given, stencil, bounds)
         fields = {
             name: bound.given[name]
@@ -165,7 +165,7 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
         return bound
 
     many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1, MANY_CELLS_OF_BLOCKS=1)
-    with many, mock.patch.object(RowPass, "bind_arguments", listening):
+    with many, mock.patch.object(StencilKernel, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
         lower = np.where(wall, 0.0, -np.inf)
         # fields of weights, as coarser levels have
@@ -194,13 +194,13 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
     return found
 
 
-def cells_of(bound: Bound) -> int:
+def cells_of(bound: BoundKernel) -> int:
     """Return how many cells, or entries of a list, a pass visits; with ghosts those of the larger grid of a transfer."""
     rows, L = bound.rows, bound.layout
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
-def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Count:
+def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> InstructionCount:
     """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
     Raises:
@@ -248,7 +248,9 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Count:
         for begin, size in fields.items()
         if any(begin <= address < begin + size for address in reached)
     )
-    return Count(name, found, cells, planes, kernel.registers, moved / whole, kernel.spilled)
+    return InstructionCount(
+        name, found, cells, planes, kernel.registers, moved / whole, kernel.spilled
+    )
 
 
 def _compiled(form: Any, folder: Path) -> Kernel:
@@ -266,7 +268,7 @@ def _compiled(form: Any, folder: Path) -> Kernel:
     )
 
 
-def counts(words: tuple[str, ...] = AREAS) -> Iterator[Count]:
+def counts(words: tuple[str, ...] = AREAS) -> Iterator[InstructionCount]:
     """Count the passes whose names begin with one of some words."""
     if missing := tools_missing():
         raise SystemExit(f"{', '.join(missing)}: not installed: pip install 'warp-lcp[ptxas]'")
@@ -279,7 +281,7 @@ def counts(words: tuple[str, ...] = AREAS) -> Iterator[Count]:
                     print(f"{name}: {error!r}")
 
 
-def table(found: Iterable[Count], n: int) -> Iterator[str]:
+def table(found: Iterable[InstructionCount], n: int) -> Iterator[str]:
     """Yield the lines of a table of passes, with times over n^3 cells."""
     times = " | ".join(f"{name} ms | limit" for name in GPUS)
     yield (

@@ -29,7 +29,7 @@ from warp._src import build, codegen, context
 from warp._src.types import array_t, launch_bounds_t
 
 from warp_lcp.benchmarks import gpu_cases
-from warp_lcp.rows.program import Program
+from warp_lcp.kernels.launch_graph import CommandBuffer
 
 # of each form of a kernel: two sizes, and of each the first launch of sixteen that writes something
 SIZES, TRIES = 2, 16
@@ -71,8 +71,8 @@ def totals(numbers, threads):
 # how many there are, and what does not
 UNORDERED = {
     "warp_lcp.components.unite.*:unite": ("i", roots),
-    "warp_lcp.material.flight:unite": ("i", roots),
-    "warp_lcp.material.flight:board_kernel": ("i", in_order),
+    "warp_lcp.material.ballistic_fragments:unite": ("i", roots),
+    "warp_lcp.material.ballistic_fragments:board_kernel": ("i", in_order),
     "warp_lcp.grid.node_distance:claim_groups": ("i", in_order),
     "warp_lcp.grid.particles:total": ("f", totals),  # on CUDA a thread takes other particles
 }
@@ -217,7 +217,7 @@ class Copies:
                 self._move(members(at[1][offset : offset + size], a, dtype))
 
 
-class Check:
+class KernelCheck:
     """Compares launches, and counts them.
 
     Args:
@@ -428,7 +428,9 @@ def heard(check):
         )
 
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.multiple(Program, run=one_by_one, run_while=looked_after))
+        stack.enter_context(
+            mock.patch.multiple(CommandBuffer, run=one_by_one, run_while=looked_after)
+        )
         if EMULATED:
             for name in ("invoke", "invoke_cpu_blocks"):
                 stack.enter_context(
@@ -449,7 +451,7 @@ def main():
     """Compare, and print what was found in the last line; return 3 if something is wrong."""
     given, broken = [argument for argument in sys.argv[1:] if not argument.startswith("-")], []
     wp.init()
-    check = Check(*(given or ["cpu" if EMULATED else "cuda:0"]))
+    check = KernelCheck(*(given or ["cpu" if EMULATED else "cuda:0"]))
     steps = [functools.partial(stepped, scene) for scene in gpu_cases.SCENES]
     with heard(check):
         for work in (

@@ -34,9 +34,9 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.benchmarks.problems import splash
-from warp_lcp.rows import RowPass
-from warp_lcp.rows.row_pass import Bound
-from warp_lcp.rows.sequence import Sequence
+from warp_lcp.kernels import StencilKernel
+from warp_lcp.kernels.persistent_kernel import PersistentKernel
+from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -160,21 +160,25 @@ def name_of(kernel: Any) -> str:
 
 def heard(make: Callable[[], Callable[[], object]]) -> Work:
     """Return what a call launches; `make` returns it, and is heard itself, for what is made in the first run is replayed by later ones."""
-    given: dict[int, tuple[Bound, Heard]] = {}
+    given: dict[int, tuple[BoundKernel, Heard]] = {}
     tags: dict[int, tuple[Any, Launched]] = {}
-    bind, launch_bound, launch_sequence = RowPass.bind_arguments, Bound.launch, Sequence.launch
+    bind, launch_bound, launch_sequence = (
+        StencilKernel.bind_arguments,
+        BoundKernel.launch,
+        PersistentKernel.launch,
+    )
     plain, replay = wp.launch, wp.Launch.launch
     current: list[Launched] = []
     found = Work()
 
     def binding(
-        declared: RowPass,
+        declared: StencilKernel,
         rows: Any,
         structs: Any,
         arguments: dict[str, Any],
         stencil: Any = None,
         bounds: Any = None,
-    ) -> Bound:
+    ) -> BoundKernel:
         bound = bind(declared, rows, structs, arguments, stencil, bounds)
         taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
@@ -190,7 +194,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         given[id(bound)] = bound, Heard(bound, fields)
         return bound
 
-    def launching(bound: Bound, *args: Any) -> None:
+    def launching(bound: BoundKernel, *args: Any) -> None:
         known = given.get(id(bound))
         launched = Launched(0.0, 0)
         if known:
@@ -203,7 +207,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         launch_bound(bound, *args)
         current.pop()
 
-    def sequencing(sequence: Sequence, *args: Any) -> None:
+    def sequencing(sequence: PersistentKernel, *args: Any) -> None:
         current.append(Launched(0.0, len(sequence._stages)))
         launch_sequence(sequence, *args)
         current.pop()
@@ -240,9 +244,9 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         found.stages += launched.stages
 
     patches = (
-        mock.patch.object(RowPass, "bind_arguments", binding),
-        mock.patch.object(Bound, "launch", launching),
-        mock.patch.object(Sequence, "launch", sequencing),
+        mock.patch.object(StencilKernel, "bind_arguments", binding),
+        mock.patch.object(BoundKernel, "launch", launching),
+        mock.patch.object(PersistentKernel, "launch", sequencing),
         mock.patch.object(wp, "launch", launch),
         mock.patch.object(wp.Launch, "launch", replaying),
     )

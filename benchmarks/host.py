@@ -1,7 +1,7 @@
 """Host time of a simulation step by stage, and of the native work in it.
 
 Run `python -m warp_lcp.benchmarks.host`. A step consists of Python, which prepares operations, and
-of native calls, which execute tables of them (`warp_lcp.rows.team.Team.run`). The *floor* of a
+of native calls, which execute tables of them (`warp_lcp.kernels.thread_pool.ThreadPool.run`). The *floor* of a
 stage is the time of its native calls alone: each call is repeated from the same memory, without
 Python in between, and the fastest one counts.
 """
@@ -25,10 +25,10 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.report import markdown, write
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.rows.team import COUNT, RUN, UNFINISHED, Team
+from warp_lcp.kernels.thread_pool import COUNT, RUN, UNFINISHED, ThreadPool
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -141,11 +141,11 @@ class StepRecorder:
         for kind, functions in COUNTED.items():
             for owner, name in functions:
                 self._replace(owner, name, self._counted(kind, getattr(owner, name)))
-        self._replace(Team, "run", self._run(Team.run))
+        self._replace(ThreadPool, "run", self._run(ThreadPool.run))
         if self._replays:
             # All arrays are kept alive from here on, so that a replay never writes to freed memory.
             self._arrays = [a for a in gc.get_objects() if type(a) is wp.array]
-            self._replace(Team, "_do", self._replayed(Team._do))
+            self._replace(ThreadPool, "_do", self._replayed(ThreadPool._do))
             self._replace(wp.array, "__init__", self._kept(wp.array.__init__))
         return self
 
@@ -176,7 +176,7 @@ class StepRecorder:
         return call
 
     def _run(self, plain: Callable[..., Any]) -> Callable[..., Any]:
-        def run(team: Team, table: Any) -> None:
+        def run(team: ThreadPool, table: Any) -> None:
             self.counts[self._timer.current].update({CALLS: 1, OPERATIONS: int(table.words[COUNT])})
             self._table = table
             plain(team, table)
@@ -196,7 +196,7 @@ class StepRecorder:
         The last repetition leaves the same memory as the first call.
         """
 
-        def do(team: Team, asked: Any) -> None:
+        def do(team: ThreadPool, asked: Any) -> None:
             if asked.mode != RUN:
                 return plain(team, asked)
             before = [
@@ -234,7 +234,7 @@ class StepRecorder:
 def measure(options: Options, out: Path) -> Results:
     """Measure steps of each scene."""
     scenes = [options.scene] if options.scene else SCENES
-    by_scene: dict[str, list[Record]] = {}
+    by_scene: dict[str, list[BenchmarkRecord]] = {}
     for name in scenes:
         for size in options.sizes or (RESOLUTION,):
             options.say(f"{name}, {size} cells")
@@ -244,7 +244,9 @@ def measure(options: Options, out: Path) -> Results:
     return results(by_scene, machine(options.device, elements=1 << 22, repeat=options.repeat))
 
 
-def scene_records(name: str, resolution: int, device: str, steps: int, rounds: int) -> list[Record]:
+def scene_records(
+    name: str, resolution: int, device: str, steps: int, rounds: int
+) -> list[BenchmarkRecord]:
     """Return the records of a scene: of its whole step, and of each stage.
 
     Args:
@@ -308,7 +310,7 @@ def _records(
     counts: dict[str, Counter[str]],
     native: dict[str, float],
     steps: int,
-) -> list[Record]:
+) -> list[BenchmarkRecord]:
     """Return a record of the step and one of each stage, the longest first."""
     for stage in counts.keys() | native.keys():
         samples[stage]  # creates the stage if the rounds did not have it
@@ -316,7 +318,7 @@ def _records(
     for stage in sorted(samples, key=lambda stage: -min(samples[stage])):
         records.append((f"{label}: {stage}", samples[stage], counts[stage], native[stage], stage))
     return [
-        Record(
+        BenchmarkRecord(
             name,
             {"host": Figure.least(taken, "ms"), "native": Figure(1e3 * floor, "ms")}
             | {kind: Figure(number[kind] / steps) for kind in COUNTS},
@@ -326,7 +328,7 @@ def _records(
     ]
 
 
-def results(found: dict[str, list[Record]], *machines: Record) -> Results:
+def results(found: dict[str, list[BenchmarkRecord]], *machines: BenchmarkRecord) -> Results:
     """Return records, a table and a chart of each scene."""
     remark = (
         f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds. "
@@ -338,7 +340,7 @@ def results(found: dict[str, list[Record]], *machines: Record) -> Results:
     )
     records = [*machines, *(record for of_scene in found.values() for record in of_scene)]
     tables = [
-        Table(
+        RecordTable(
             label, ["stage", "host [ms]", "share [%]", "native [ms]", *COUNTS], _rows(own), remark
         )
         for label, own in found.items()
@@ -349,7 +351,7 @@ def results(found: dict[str, list[Record]], *machines: Record) -> Results:
     return Results(records, tables, [Bars("stages", "Host time of a step by stage", "ms", bars)])
 
 
-def _rows(records: Sequence[Record]) -> list[list[str]]:
+def _rows(records: Sequence[BenchmarkRecord]) -> list[list[str]]:
     whole = sum(record.figures["host"].value for record in records[1:])
     rows = []
     for r in records:

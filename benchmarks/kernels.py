@@ -19,12 +19,12 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
-from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
 from warp_lcp.benchmarks.problems import Splash, basin
-from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.row_pass import Bound
+from warp_lcp.kernels import Rows, StencilKernel
+from warp_lcp.kernels.stencil_kernel import BoundKernel
 
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)
@@ -50,7 +50,7 @@ PEER_ROUNDS = 3
 class Heard:
     """Pass with its fields by name, recorded when it was bound."""
 
-    bound: Bound
+    bound: BoundKernel
     fields: dict[str, wp.array[Any]]
 
     @property
@@ -131,7 +131,7 @@ def measure(options: Options, out: Path) -> Results:
     return Results(records, [_weakest(largest), *tables], [chart])
 
 
-def _measure_form(n: int, form: str, options: Options) -> list[Record]:
+def _measure_form(n: int, form: str, options: Options) -> list[BenchmarkRecord]:
     """Record the passes of one form of coefficients and time them, interleaved.
 
     Copies and the peers take part in the rounds.
@@ -177,16 +177,18 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
             "writes": sorted(one.writes),
         }
         records.append(
-            Record(f"{n}^3 {form}: {PRODUCT if one is product else key}", figures, facts)
+            BenchmarkRecord(f"{n}^3 {form}: {PRODUCT if one is product else key}", figures, facts)
         )
     for peer in peers:
         figures = _figures(apart[peer], n, 8 if "constant" in peer else 9, own)
-        records.append(Record(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"}))
+        records.append(
+            BenchmarkRecord(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"})
+        )
     finder = wl.GridPoisson(_basin(n, form).cells, device=device, **_basin(n, form).faces)
     search = in_turns({"search": finder.floating_components}, options.repeat)["search"]
     name = f"{n}^3 {form}: search for floating components, all kernels"
     records.append(
-        Record(name, _figures(search, n, 0.0, copying), {"form": form, "role": "set-up"})
+        BenchmarkRecord(name, _figures(search, n, 0.0, copying), {"form": form, "role": "set-up"})
     )
     return sorted(records, key=lambda r: -(r.value("seconds") or 0))
 
@@ -217,16 +219,16 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     Each pass has a unique label. The float32 product among them is returned as well.
     """
     recorded: list[Heard] = []
-    bind = RowPass.bind
+    bind = StencilKernel.bind
 
     def listening(
-        declared: RowPass,
+        declared: StencilKernel,
         rows: Rows,
         *structs: Any,
         stencil: Any = None,
         bounds: list[Any] | None = None,
         **given: Any,
-    ) -> Bound:
+    ) -> BoundKernel:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)
         taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
@@ -242,7 +244,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         recorded.append(Heard(bound, fields))
         return bound
 
-    with mock.patch.object(RowPass, "bind", listening):
+    with mock.patch.object(StencilKernel, "bind", listening):
         for solver, most in (
             (wl.ProjectedMultigrid(), 5),
             (wl.MinimumMapNewton(), 4),
@@ -310,7 +312,7 @@ def _figures(
     return figures
 
 
-def _table(n: int, records: list[Record]) -> Table:
+def _table(n: int, records: list[BenchmarkRecord]) -> RecordTable:
     columns = [
         "kernel",
         "coefficients",
@@ -343,7 +345,7 @@ def _table(n: int, records: list[Record]) -> Table:
             ("" if v is None else f"{v:.{d}f}") for v, d in zip(numbers, (2, 0, 1, 1), strict=True)
         ]
         rows.append([r.name.partition(": ")[2], r.facts["form"], r.facts["role"], *cells, *share])
-    return Table(
+    return RecordTable(
         f"{n}^3",
         columns,
         rows,
@@ -351,10 +353,10 @@ def _table(n: int, records: list[Record]) -> Table:
     )
 
 
-def _weakest(records: list[Record]) -> Table:
+def _weakest(records: list[BenchmarkRecord]) -> RecordTable:
     """Return the hot kernels below half of the copy bandwidth."""
     below = [r for r in records if r.facts["role"] == "hot" and (r.value("of_copy") or 1) < 0.5]
     rows = [[r.name, f"{100 * (r.value('of_copy') or 0):.0f} %"] for r in below] or [["none", ""]]
-    return Table(
+    return RecordTable(
         "Hot kernels below 50 % of copy bandwidth at the largest size", ["kernel", "of copy"], rows
     )

@@ -22,7 +22,7 @@ import warp as wp
 from scipy.optimize import nnls
 
 from warp_lcp.benchmarks.harness.machine import array_bytes, machine
-from warp_lcp.benchmarks.harness.record import Record, Results, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.run.stepping import plan_dt
@@ -267,7 +267,7 @@ def counts(scene: Scene) -> tuple[int, int]:
     return math.prod(simulation.grid.counts), simulation.particles.count
 
 
-def records_of(simulator: str, dimension: int, options: Options) -> list[Record]:
+def records_of(simulator: str, dimension: int, options: Options) -> list[BenchmarkRecord]:
     """Measure a simulator's models."""
     options.say(f"{simulator}, {dimension}-D")
     size = max(options.sizes, default=RESOLUTION[dimension])
@@ -285,7 +285,7 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
         "cell_bytes": Figure(base.bytes / cells, "B"),
     }
     facts = {"cells": cells, "particles": particles}
-    records = [Record(f"{simulator} {dimension}d: base", figures, facts)]
+    records = [BenchmarkRecord(f"{simulator} {dimension}d: base", figures, facts)]
     for name, offer in offers(simulator, dimension).items():
         on, off, many = str(offer.on), str(offer.off), {"cell": cells, "particle": particles}
         added, added_half = (
@@ -302,7 +302,9 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
             ),
         }
         records.append(
-            Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames})
+            BenchmarkRecord(
+                f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames}
+            )
         )
     return records
 
@@ -319,7 +321,7 @@ def measure(options: Options, out: Path) -> Results:
     return Results(records, tables)
 
 
-def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
+def table_of(simulator: str, dimension: int, records: list[BenchmarkRecord]) -> RecordTable:
     """Return the table of a simulator's prices."""
     base = records[0]
     whole = base.figures["step"].value
@@ -338,7 +340,7 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
         "differences of short times. Each rigid body "
         "adds its own, beside what moving solids add once."
     )
-    return Table(
+    return RecordTable(
         f"{what.capitalize()}, {dimension}-D",
         ["model", "ms a step", "of base", "bytes"],
         rows,
@@ -346,7 +348,7 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
     )
 
 
-def price_list(records: list[Record]) -> Mapping[str, Any]:
+def price_list(records: list[BenchmarkRecord]) -> Mapping[str, Any]:
     """Return the contents of `warp_lcp/scene/models.toml`.
 
     It holds the fields of `warp_lcp.scene.models.Price` by simulator, dimension and model.
@@ -366,7 +368,7 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
     return listed
 
 
-def overview(records: Sequence[Record]) -> Table:
+def overview(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return the prices of all models in 3-D.
 
     The columns are time per step as a share of `base`, and memory.
@@ -381,10 +383,10 @@ def overview(records: Sequence[Record]) -> Table:
             record, base = priced.get(f"{place}: {model}"), priced[f"{place}: base"]
             row.append("" if record is None else _price(record, base))
         rows.append(row)
-    return Table("Prices", ["model", *columns.values()], rows)
+    return RecordTable("Prices", ["model", *columns.values()], rows)
 
 
-def _price(record: Record, base: Record) -> str:
+def _price(record: BenchmarkRecord, base: BenchmarkRecord) -> str:
     """Return the added time per step and memory of a model, or those of `base`."""
     step, unit = (
         record.figures["step"].value,

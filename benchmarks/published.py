@@ -18,9 +18,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.cases import RTOL, SolverCase
 from warp_lcp.benchmarks.harness.machine import COPIED, machine
-from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown, spread
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results, shown, spread
 from warp_lcp.benchmarks.harness.timing import Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
 from warp_lcp.problem.protocol import HasStencil, has
@@ -96,7 +96,7 @@ class TruncatedWorkspace(MultigridWorkspace):
 
 
 @dataclass(frozen=True)
-class Entry:
+class PublishedEntry:
     """Row of the tables."""
 
     source: str  # authors and year; "here" for variants of this library
@@ -106,34 +106,36 @@ class Entry:
 
 
 ENTRIES = (
-    Entry(
+    PublishedEntry(
         "Chentanez and Mueller 2011",
         "projected multigrid cycles",
         wl.ProjectedMultigrid(monotone_cycles=10_000),
     ),
-    Entry(
+    PublishedEntry(
         "Andersen et al. 2017",
         "minimum map, CG by products",
         wl.MinimumMapNewton(safeguard=False, max_linear_iterations=2000),
         ProductsOnly,
     ),
-    Entry(
+    PublishedEntry(
         "Macklin et al. 2019", "Fischer-Burmeister, r = A_ii", wl.FischerNewton(monotone_cycles=0)
     ),
-    Entry("Lai et al. 2020", "policy iteration", wl.PrimalDualActiveSet(monotone_cycles=0)),
-    Entry("Lai et al. 2020", "penalty", wl.Penalty(monotone_cycles=0)),
-    Entry(
+    PublishedEntry(
+        "Lai et al. 2020", "policy iteration", wl.PrimalDualActiveSet(monotone_cycles=0)
+    ),
+    PublishedEntry("Lai et al. 2020", "penalty", wl.Penalty(monotone_cycles=0)),
+    PublishedEntry(
         "Lai et al. 2020",
         "multigrid, active set off coarse levels",
         TruncatedMultigrid(monotone_cycles=0),
     ),
-    Entry("Takahashi and Batty 2023", "MPRGP, multilevel", wl.MPRGP(monotone_cycles=0)),
-    Entry("here", "minimum map, default", wl.MinimumMapNewton()),
-    Entry("here", "Fischer-Burmeister, default", wl.FischerNewton()),
-    Entry("here", "policy iteration, default", wl.PrimalDualActiveSet()),
-    Entry("here", "penalty, default", wl.Penalty()),
-    Entry("here", "MPRGP, default", wl.MPRGP()),
-    Entry("here", ENGINE, wl.ProjectedMultigrid()),
+    PublishedEntry("Takahashi and Batty 2023", "MPRGP, multilevel", wl.MPRGP(monotone_cycles=0)),
+    PublishedEntry("here", "minimum map, default", wl.MinimumMapNewton()),
+    PublishedEntry("here", "Fischer-Burmeister, default", wl.FischerNewton()),
+    PublishedEntry("here", "policy iteration, default", wl.PrimalDualActiveSet()),
+    PublishedEntry("here", "penalty, default", wl.Penalty()),
+    PublishedEntry("here", "MPRGP, default", wl.MPRGP()),
+    PublishedEntry("here", ENGINE, wl.ProjectedMultigrid()),
 )
 
 
@@ -146,7 +148,7 @@ def measure(options: Options, out: Path) -> Results:
     where = machine(
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
     )
-    records, tables = list[Record](), list[Table]()
+    records, tables = list[BenchmarkRecord](), list[RecordTable]()
     for make, scale in ((splash, 1), (plane, FLAT)):
         slow = set[tuple[str, str]]()
         for n in sizes:
@@ -161,7 +163,7 @@ def measure(options: Options, out: Path) -> Results:
 
 def _measure_scene(
     scene: Splash, options: Options, slow: set[tuple[str, str]], *, load: bool
-) -> list[Record]:
+) -> list[BenchmarkRecord]:
     """Measure one sample of every method in each round.
 
     Args:
@@ -170,7 +172,7 @@ def _measure_scene(
         slow: pairs of method and bounds that are left out; those above PATIENCE are added.
         load: whether a first round without samples loads the kernels.
     """
-    linear = Case(
+    linear = SolverCase(
         "unit",
         scene,
         BOUNDS[0],
@@ -182,7 +184,7 @@ def _measure_scene(
     cases = [
         (
             entry,
-            Case(
+            SolverCase(
                 "unit",
                 scene,
                 bounds,
@@ -210,7 +212,7 @@ def _measure_scene(
     ]
 
 
-def _record(case: Case, source: str, linear: Case | None = None) -> Record:
+def _record(case: SolverCase, source: str, linear: SolverCase | None = None) -> BenchmarkRecord:
     """Return the figures of a case.
 
     They include ratios to the linear solves of the same rounds.
@@ -220,10 +222,10 @@ def _record(case: Case, source: str, linear: Case | None = None) -> Record:
         of_linear = linear.samples["total"][: len(case.samples["total"])]
         figures["over_linear"] = ratios(case.samples["total"], of_linear)
     facts = {"source": source, "bounds": case.bounds, "method": case.method, "size": case.size}
-    return Record(case.name, figures, facts)
+    return BenchmarkRecord(case.name, figures, facts)
 
 
-def _table(records: Sequence[Record], bounds: str) -> Table:
+def _table(records: Sequence[BenchmarkRecord], bounds: str) -> RecordTable:
     columns = [
         "published",
         "method",
@@ -252,4 +254,4 @@ def _table(records: Sequence[Record], bounds: str) -> Table:
         "without bounds, same rounds."
     )
     where = "at the walls" if bounds == "walls" else bounds
-    return Table(f"p >= 0 {where}, {records[0].facts['size']}", columns, rows, remark)
+    return RecordTable(f"p >= 0 {where}, {records[0].facts['size']}", columns, rows, remark)

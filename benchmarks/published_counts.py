@@ -47,7 +47,7 @@ PREDICTOR_CORRECTOR = wl.InteriorPoint(
 
 
 @dataclass(frozen=True)
-class Count:
+class PublishedCount:
     """Published iteration counts, and the function that counts here.
 
     Attributes:
@@ -399,7 +399,7 @@ def theory(n: int, *, by_rows: bool) -> float:
 
 def recipe(kind: str, method: str, problems: int) -> tuple[float, ...]:
     """Return the mean iterations by the book's tests on its random problems."""
-    make = book.kinds(book.Scale(problems, 10, 30, 100, (16,), (2,), 40))[kind]
+    make = book.kinds(book.ProblemScale(problems, 10, 30, 100, (16,), (2,), 40))[kind]
     return _mean(method, [make(k) for k in range(problems)])
 
 
@@ -428,66 +428,74 @@ HALF_STEP = (
     "the whole step is projected here; with PERMON's half step and fixed step NumPy takes 181"
 )
 MURTYS, SIDE = (2, 3, 4, 5, 6, 7, 8), 15
-COUNTS: tuple[Count, ...] = (
-    Count(
+COUNTS: tuple[PublishedCount, ...] = (
+    PublishedCount(
         NEWTON_NAME,
         "hemisphere, 17^2 to 257^2",
         (3, 6, 7, 12, 21),
         P4PDES,
         partial(cold_membrane, REDUCED, reduced_norm),
     ),
-    Count(
+    PublishedCount(
         NEWTON_NAME,
         "the same, from the coarser grid",
         (3, 4, 2, 2, 3),
         P4PDES,
         partial(sequenced_membrane, REDUCED, reduced_norm),
     ),
-    Count(
+    PublishedCount(
         FISCHER_NAME,
         "hemisphere, 17^2 to 257^2",
         (7, 11, 11, 16, 25),
         P4PDES,
         partial(cold_membrane, SEMISMOOTH, fischer_norm),
     ),
-    Count(
+    PublishedCount(
         FISCHER_NAME,
         "hemisphere, 17^2 to 257^2, from the coarser grid",
         (5, 8, 6, 6, 7),
         P4PDES,
         partial(sequenced_membrane, SEMISMOOTH, fischer_norm),
     ),
-    Count(FISCHER_NAME, "American put, 9 time steps", (5, 5, 4, 4, 4, 4, 4, 4, 4), TAO, put),
-    Count("interior-point", "journal bearing, 10 x 16, e = 0.9", (14,), TAO, interior_bearing),
-    Count(
+    PublishedCount(
+        FISCHER_NAME, "American put, 9 time steps", (5, 5, 4, 4, 4, 4, 4, 4, 4), TAO, put
+    ),
+    PublishedCount(
+        "interior-point", "journal bearing, 10 x 16, e = 0.9", (14,), TAO, interior_bearing
+    ),
+    PublishedCount(
         "lemke",
         "Murty's problems, 2 to 8 unknowns",
         (4, 8, 16, 32, 64, 128, 256),
         MURTY,
         partial(pivots, *MURTYS),
     ),
-    Count("primal-dual-active-set", "stairs, 129^2", (19,), DEALII, stairs),
-    Count("mprgp", "string, 100, projected expansion", (160,), PERMON, string),
-    Count("mprgp", "string, 100, half step and fixed step", (181,), PERMON, string, HALF_STEP),
-    Count(
+    PublishedCount("primal-dual-active-set", "stairs, 129^2", (19,), DEALII, stairs),
+    PublishedCount("mprgp", "string, 100, projected expansion", (160,), PERMON, string),
+    PublishedCount(
+        "mprgp", "string, 100, half step and fixed step", (181,), PERMON, string, HALF_STEP
+    ),
+    PublishedCount(
         "mprgp",
         "journal bearing, 8 x 12, 10 x 16",
         (23, 34),
         PERMON,
         partial(bearings, (8, 12), (10, 16)),
     ),
-    Count("mprgp", "journal bearing, 30 x 30", (119,), PERMON, partial(bearings, (30, 30)), JACOBI),
-    Count(
+    PublishedCount(
+        "mprgp", "journal bearing, 30 x 30", (119,), PERMON, partial(bearings, (30, 30)), JACOBI
+    ),
+    PublishedCount(
         FISCHER_NAME,
         "random fluid, 1000",
         (5.0,),
         BOOK,
         partial(recipe, FLUID, "Fischer-Newton", 20),
     ),
-    Count(
+    PublishedCount(
         NEWTON_NAME, "random fluid, 1000", (4.07,), BOOK, partial(recipe, FLUID, "minimum map", 20)
     ),
-    Count(
+    PublishedCount(
         "psor",
         "random fluid, 1000, omega = 1.4",
         (25.29,),
@@ -495,7 +503,7 @@ COUNTS: tuple[Count, ...] = (
         partial(recipe, FLUID, "PSOR 1.4", 100),
         slow=True,
     ),
-    Count(
+    PublishedCount(
         "psor",
         "random fluid, 1000, omega = 1",
         (49.38,),
@@ -503,15 +511,17 @@ COUNTS: tuple[Count, ...] = (
         partial(recipe, FLUID, "PGS", 100),
         slow=True,
     ),
-    Count(FISCHER_NAME, "random contacts, 180", (14.54,), BOOK, partial(contacts, 100), slow=True),
-    Count(
+    PublishedCount(
+        FISCHER_NAME, "random contacts, 180", (14.54,), BOOK, partial(contacts, 100), slow=True
+    ),
+    PublishedCount(
         "projected-jacobi",
         "5-point, 15^2, no bound met",
         (theory(SIDE, by_rows=False),),
         YOUNG,
         lambda: (sweeps(SIDE, wl.ProjectedJacobi(omega=1.0), by_rows=False),),
     ),
-    Count(
+    PublishedCount(
         "psor",
         "5-point, 15^2, no bound met, omega = 1",
         (theory(SIDE, by_rows=True),),

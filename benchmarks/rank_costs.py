@@ -28,7 +28,7 @@ from warp_lcp.distributed.messages import MpiMailbox
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.simulator import FluidsSimulator
-from warp_lcp.rows.program import LaunchGraph, Program
+from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph
 from warp_lcp.scene.scene_file import load_scene
 
 SKIPPED, STEPS = 10, 10  # the liquid moves when it is measured
@@ -87,8 +87,8 @@ class Traffic:
         """Count recorded exchanges when they run, not when they are recorded."""
         record, run, recorded = (
             LaunchGraph._recorded,
-            Program.run,
-            dict[int, tuple[Program, list[tuple[str, int]]]](),
+            CommandBuffer.run,
+            dict[int, tuple[CommandBuffer, list[tuple[str, int]]]](),
         )
 
         def recording(graph: LaunchGraph, arguments: tuple[Any, ...]) -> Any:
@@ -98,12 +98,12 @@ class Traffic:
             recorded[id(program)], self._recorded = (program, self._recorded), outer
             return program
 
-        def running(program: Program) -> None:
+        def running(program: CommandBuffer) -> None:
             for kind, size in recorded.get(id(program), (program, []))[1]:
                 self._count(kind, size)
             run(program)
 
-        cast(Any, LaunchGraph)._recorded, cast(Any, Program).run = recording, running
+        cast(Any, LaunchGraph)._recorded, cast(Any, CommandBuffer).run = recording, running
 
     def _count(self, kind: str, size: int) -> None:
         if self._recorded is not None:

@@ -26,11 +26,11 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.cases import MIDST, TOLERANCES
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, machine, resident_bytes
 from warp_lcp.benchmarks.harness.record import (
-    Lines,
-    Record,
+    BenchmarkRecord,
+    RecordLines,
+    RecordTable,
+    RecordTarget,
     Results,
-    Table,
-    Target,
     read_json,
     shown,
     spread,
@@ -44,7 +44,7 @@ from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
-from warp_lcp.rows.team import VARIABLE
+from warp_lcp.kernels.thread_pool import VARIABLE
 from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"
@@ -61,7 +61,7 @@ MEGA = 1 << 20
 WALLS = BOUNDS.index("walls")  # bounds whose memory is counted; the others need at most as much
 MEMORY = ("bytes_per_cell", "resident", "resident_more")
 
-Found = Mapping[tuple[int, str, int], Record]  # by cells a side, bounds, ranks
+Found = Mapping[tuple[int, str, int], BenchmarkRecord]  # by cells a side, bounds, ranks
 
 
 @dataclass
@@ -175,7 +175,7 @@ class Shared:
         self.counts["resident"] = self.ranks.max(peak) / MEGA
         self.counts["resident_more"] = self.ranks.max(peak - before) / MEGA
 
-    def record(self, plain: Growing | None, team: Growing | None) -> Record:
+    def record(self, plain: Growing | None, team: Growing | None) -> BenchmarkRecord:
         """Return the figures.
 
         `plain` is the same solve by one process, `team` by one with a thread for each rank.
@@ -199,7 +199,7 @@ class Shared:
             }
         n, boxes = self.decomposition.counts[0], " x ".join(map(str, self.decomposition.processes))
         facts = {"n": n, "bounds": self.bounds, "ranks": self.ranks.size, "boxes": boxes}
-        return Record(f"{n}^3 {self.bounds}, ranks: {self.ranks.size}", figures, facts)
+        return BenchmarkRecord(f"{n}^3 {self.bounds}, ranks: {self.ranks.size}", figures, facts)
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -236,7 +236,7 @@ def measure(options: Options, out: Path) -> Results:
     )
 
 
-def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
+def _started(count: int, sizes: Sequence[int], options: Options) -> list[BenchmarkRecord]:
     """Start so many ranks and measure on them."""
     with tempfile.TemporaryDirectory() as folder:
         suite_options = [
@@ -269,7 +269,7 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
         return [r for r in read_json(Path(folder) / "ranks.json").values() if "ranks" in r.name]
 
 
-def _together(sizes: Sequence[int], options: Options) -> list[Record]:
+def _together(sizes: Sequence[int], options: Options) -> list[BenchmarkRecord]:
     """Measure on the ranks that mpiexec has started.
 
     Every rank calls it; only the first one returns.
@@ -292,7 +292,7 @@ def _together(sizes: Sequence[int], options: Options) -> list[Record]:
 
 def on_ranks(
     ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[str], object]
-) -> list[Record]:
+) -> list[BenchmarkRecord]:
     """Measure the sizes that fit on all ranks, one sample of each in every round.
 
     This call is collective. The first rank also solves each problem alone, on one thread and on as
@@ -309,7 +309,7 @@ def on_ranks(
     for case in shared_cases(min(sizes), ranks, here):
         case.sample(keep=False)  # loads the kernels
     records, cases, threads = (
-        list[Record](),
+        list[BenchmarkRecord](),
         list[tuple[Shared, Growing | None, Growing | None]](),
         wl.get_threads(),
     )
@@ -317,7 +317,9 @@ def on_ranks(
         if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, here)):
             say(f"rank {ranks.rank}: {n}^3 does not fit into memory")
             records.append(
-                Record(f"{n}^3, ranks: {ranks.size}", {}, {"left out": "does not fit into memory"})
+                BenchmarkRecord(
+                    f"{n}^3, ranks: {ranks.size}", {}, {"left out": "does not fit into memory"}
+                )
             )
             continue
         forget_peak()
@@ -377,13 +379,13 @@ def _fits(cells: int, device: str) -> bool:
     )
 
 
-def _ratio(a: Record | None, b: Record | None, figure: str) -> Figure | None:
+def _ratio(a: BenchmarkRecord | None, b: BenchmarkRecord | None, figure: str) -> Figure | None:
     """Return the ratio of a figure in two records."""
     first, second = (None if r is None else r.value(figure) for r in (a, b))
     return None if first is None or not second else Figure(first / second)
 
 
-def targets(found: Found, sizes: Sequence[int]) -> Table:
+def targets(found: Found, sizes: Sequence[int]) -> RecordTable:
     """Return the targets at the sizes from 128^3 on."""
     rows = []
     for n in (size for size in sizes if size >= 128):
@@ -400,22 +402,22 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
         # Meaningless without a core for each rank.
         gain = _ratio(one, two, TOLD) if (os.cpu_count() or 1) >= 2 else None
         rows += [
-            Target(
+            RecordTarget(
                 f"{n}^3 walls: iterations to 1e-6, the most of any number of ranks less the least",
                 1,
                 spread_,
             ),
-            Target(
+            RecordTarget(
                 f"{n}^3 walls: seconds to 1e-6 on 1 rank over those on 2", 1.6, gain, at_least=True
             ),
-            Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over one process's", 1.5, single),
-            Target(
+            RecordTarget(f"{n}^3 walls: seconds to 1e-6 on 1 rank over one process's", 1.5, single),
+            RecordTarget(
                 f"{n}^3 walls: seconds to 1e-6 on 2 ranks over one process's on 2 threads",
                 1,
                 team,
                 at_least=True,
             ),
-            Target(
+            RecordTarget(
                 f"{n}^3 walls: memory of a rank of 2 over that of 1",
                 0.6,
                 _ratio(two, one, "resident_more"),
@@ -424,7 +426,7 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
     return table_of_targets("figure", rows)
 
 
-def _table(found: Found) -> Table:
+def _table(found: Found) -> RecordTable:
     columns = [
         "cells",
         "problem",
@@ -475,10 +477,10 @@ def _table(found: Found) -> Table:
         "computed from x by NumPy in float64. Bytes: of all arrays. MiB: the "
         "most that a rank's process holds in a solve with walls, the scene included."
     )
-    return Table("Ranks and sizes", columns, rows, remark)
+    return RecordTable("Ranks and sizes", columns, rows, remark)
 
 
-def _failures(records: Sequence[Record]) -> list[str]:
+def _failures(records: Sequence[BenchmarkRecord]) -> list[str]:
     """Return solves that do not converge or report a wrong residual."""
     lines = []
     for record in (r for r in records if "boxes" in r.facts):
@@ -490,7 +492,7 @@ def _failures(records: Sequence[Record]) -> list[str]:
     return lines
 
 
-def _chart(found: Found, sizes: Sequence[int]) -> Lines:
+def _chart(found: Found, sizes: Sequence[int]) -> RecordLines:
     """Return the chart of the speedup by ranks."""
     gains: dict[str, tuple[list[float], list[float]]] = {
         "as many times as ranks": (list(RANKS), list(RANKS))
@@ -501,4 +503,4 @@ def _chart(found: Found, sizes: Sequence[int]) -> Lines:
         ]
         gains[f"{n}^3"] = [r for r, f in strong if f], [f.value for _, f in strong if f]
     title = f"One grid on more ranks: walls, to 1e-6, {os.cpu_count()} cores"
-    return Lines("strong", title, "ranks", "times as fast as 1 rank", gains, log="")
+    return RecordLines("strong", title, "ranks", "times as fast as 1 rank", gains, log="")

@@ -15,7 +15,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.material.particle_simulation import ParticleSimulation
@@ -115,7 +115,7 @@ def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]
     return counts | stages | {"rest of steps": rest, "output": total - steps}
 
 
-def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> Record:
+def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> BenchmarkRecord:
     figures = {
         "steps": Figure(samples[0]["steps"]),
         "linear_iterations_per_step": Figure(samples[0]["linear"] / samples[0]["steps"]),
@@ -126,7 +126,7 @@ def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> Record:
     figures |= {
         f"share {stage}": Figure.of([s[stage] / s["total"] for s in samples]) for stage in stages
     }
-    return Record(name, figures)
+    return BenchmarkRecord(name, figures)
 
 
 class BothSolves:
@@ -191,7 +191,7 @@ class BothSolves:
         )
 
 
-def _walls(size: int, options: Options) -> Record:
+def _walls(size: int, options: Options) -> BenchmarkRecord:
     """Solve each step of a dam break with separating walls and without bounds."""
     scene = load_scene(
         "dam-break",
@@ -222,10 +222,10 @@ def _walls(size: int, options: Options) -> Record:
         "linear_iterations_per_step": Figure(both.iterations[1] / steps),
         "released_cells": Figure(float(np.mean([row["active"] or 0 for row in watch.rows]))),
     }
-    return Record("dam-break, 3-D: walls", figures)
+    return BenchmarkRecord("dam-break, 3-D: walls", figures)
 
 
-def _particles(size: int, options: Options) -> Record:
+def _particles(size: int, options: Options) -> BenchmarkRecord:
     """Step a dam break and time its particle stages."""
     scene = load_scene("dam-break", [WHOLE, f"domain.resolution={size}"])
     simulation: Any = simulators()[scene.scene.simulator].create(
@@ -245,10 +245,10 @@ def _particles(size: int, options: Options) -> Record:
         [1e9 * (a + b) / count for a, b in zip(to_grid, back, strict=True)], "ns"
     )
     figures["advection"] = Figure.of([1e9 * t / count for t in seconds["advection"][1:]], "ns")
-    return Record("particles, 3-D", figures)
+    return BenchmarkRecord("particles, 3-D", figures)
 
 
-def _table(scenes: Sequence[Record]) -> Table:
+def _table(scenes: Sequence[BenchmarkRecord]) -> RecordTable:
     shares = [*STAGES, "rest of steps", "output"]
     columns = [
         "scene",
@@ -268,7 +268,7 @@ def _table(scenes: Sequence[Record]) -> Table:
         percent = [f"{100 * (r.value(f'share {s}') or 0):.1f}" for s in shares]
         rows.append([r.name, *numbers, f"{r.value('linear_iterations_per_step'):.1f}", *percent])
     remark = "steps/s: of the whole run, frames, checkpoints and start included. Simulated: "
-    return Table(
+    return RecordTable(
         "Scenes",
         columns,
         rows,
@@ -276,10 +276,10 @@ def _table(scenes: Sequence[Record]) -> Table:
     )
 
 
-def _figures_table(records: Sequence[Record]) -> Table:
+def _figures_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     rows = [
         [r.name, name.replace("_", " "), str(figure)]
         for r in records
         for name, figure in r.figures.items()
     ]
-    return Table("Walls and particles", ["what", "figure", "measured"], rows)
+    return RecordTable("Walls and particles", ["what", "figure", "measured"], rows)

@@ -14,10 +14,10 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Lines, Record, Results, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordLines, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.granular import SIMULATOR
-from warp_lcp.granular.coupled import METHODS
+from warp_lcp.granular.heavy_ball import METHODS
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -56,7 +56,7 @@ def measure(options: Options, out: Path) -> Results:
             steps,
         ),
     ]
-    chart = Lines(
+    chart = RecordLines(
         "convergence",
         "Residual against seconds, mid-flow",
         "seconds",
@@ -152,7 +152,7 @@ def _solve(
 
 def _methods(
     size: int, options: Options
-) -> tuple[list[Record], dict[str, tuple[list[float], list[float]]]]:
+) -> tuple[list[BenchmarkRecord], dict[str, tuple[list[float], list[float]]]]:
     """Return each method's iterations and seconds from each state.
 
     The curves of the methods from the state in mid-flow are returned too.
@@ -183,7 +183,7 @@ def _methods(
                 "residual": Figure(solve.residual),
             }
             records.append(
-                Record(f"{label}: {name}", figures, {"status": solve.outcome.status.name})
+                BenchmarkRecord(f"{label}: {name}", figures, {"status": solve.outcome.status.name})
             )
             if label == "mid-flow":
                 curves[name] = _curve(simulation, state, name)
@@ -199,7 +199,7 @@ def _curve(
     return [t.seconds for t in taken], [t.residual for t in taken]
 
 
-def _collapse(size: int, model: str, options: Options) -> Record:
+def _collapse(size: int, model: str, options: Options) -> BenchmarkRecord:
     """Run a whole collapse with a yield set."""
     options.say(f"collapse: {model}")
     simulation = _simulation(collapse(size, friction={"model": model}), options.device)
@@ -218,10 +218,10 @@ def _collapse(size: int, model: str, options: Options) -> Record:
             rows[-1]["kinetic_energy"] / max(row["kinetic_energy"] for row in rows)
         ),
     }
-    return Record(f"collapse: {model}", figures)
+    return BenchmarkRecord(f"collapse: {model}", figures)
 
 
-def _steps(name: str, scene: SandScene, options: Options) -> Record:
+def _steps(name: str, scene: SandScene, options: Options) -> BenchmarkRecord:
     """Time steps of a large scene."""
     options.say(f"steps: {name}")
     simulation = _simulation(scene, options.device)
@@ -237,10 +237,10 @@ def _steps(name: str, scene: SandScene, options: Options) -> Record:
         "iterations": Figure.of(iterations),
         "particles": Figure(simulation.particles.count),
     }
-    return Record(f"steps: {name}", figures)
+    return BenchmarkRecord(f"steps: {name}", figures)
 
 
-def _method_table(records: list[Record]) -> Table:
+def _method_table(records: list[BenchmarkRecord]) -> RecordTable:
     keys = ("iterations", "residual", "seconds", "ratio")
     rows = [[r.name, r.facts["status"], *(str(r.figures[k]) for k in keys)] for r in records]
     columns = [
@@ -251,14 +251,16 @@ def _method_table(records: list[Record]) -> Table:
         "seconds",
         "of interleaved sweeps",
     ]
-    return Table(
+    return RecordTable(
         f"The step after a state of the collapse, to {TOLERANCE:g} rho g dx", columns, rows
     )
 
 
-def _table(title: str, what: str, columns: dict[str, str], records: list[Record]) -> Table:
+def _table(
+    title: str, what: str, columns: dict[str, str], records: list[BenchmarkRecord]
+) -> RecordTable:
     """Return a table of figures by their columns' names."""
-    return Table(
+    return RecordTable(
         title,
         [what, *columns],
         [[r.name, *(str(r.figures[k]) for k in columns.values())] for r in records],

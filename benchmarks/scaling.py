@@ -18,15 +18,15 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.cases import TOLERANCES, Case
+from warp_lcp.benchmarks.cases import TOLERANCES, SolverCase
 from warp_lcp.benchmarks.harness.machine import COPIED, machine
 from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
     Chart,
-    Lines,
-    Record,
+    RecordLines,
+    RecordTable,
+    RecordTarget,
     Results,
-    Table,
-    Target,
     shown,
     spread,
     table_of_targets,
@@ -92,10 +92,10 @@ class Growing:
                 if keep:
                     self.samples[name].append(setup + met.seconds)
 
-    def record(self, copying: float) -> Record:
+    def record(self, copying: float) -> BenchmarkRecord:
         """Return the figures; `copying` is the machine's copy bandwidth [GB/s]."""
         n = self.scene.n
-        case = Case("unit", self.scene, self.bounds, wl.ProjectedMultigrid(), self.device)
+        case = SolverCase("unit", self.scene, self.bounds, wl.ProjectedMultigrid(), self.device)
         case.memory()
         figures = {
             name: Figure.of(samples, "s") for name, samples in self.samples.items() if samples
@@ -111,7 +111,7 @@ class Growing:
             figures["in_copies"] = Figure.of(
                 [t * copying * 1e9 / (FIELD_BYTES * n**3) for t in samples]
             )
-        return Record(f"{n}^3 {self.bounds}", figures, {"n": n, "bounds": self.bounds})
+        return BenchmarkRecord(f"{n}^3 {self.bounds}", figures, {"n": n, "bounds": self.bounds})
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -141,7 +141,7 @@ def measure(options: Options, out: Path) -> Results:
         for bounds in BOUNDS[:2]
         for p in PRECISIONS
     ]
-    skipped = [Record(f"{n}^3", {}, {"left out": why}) for n, why in left_out.items()]
+    skipped = [BenchmarkRecord(f"{n}^3", {}, {"left out": why}) for n, why in left_out.items()]
     tables = [
         _targets(growth, floors),
         _growth_table(growth),
@@ -150,7 +150,7 @@ def measure(options: Options, out: Path) -> Results:
     ]
     if left_out:
         rows = [[f"{n}^3", why] for n, why in left_out.items()]
-        tables.append(Table("Sizes that were not measured", ["cells", "why"], rows))
+        tables.append(RecordTable("Sizes that were not measured", ["cells", "why"], rows))
     return Results(
         [where, *records, *growth, *floors, *skipped],
         tables,
@@ -159,7 +159,7 @@ def measure(options: Options, out: Path) -> Results:
     )
 
 
-def floor(scene: Splash, bounds: str, precision: str, device: str) -> Record:
+def floor(scene: Splash, bounds: str, precision: str, device: str) -> BenchmarkRecord:
     """Solve until no step reduces the residual further.
 
     Return that residual over the residual at 0, recomputed and as the solve reports it.
@@ -185,7 +185,7 @@ def floor(scene: Splash, bounds: str, precision: str, device: str) -> Record:
         "precision": precision,
         "status": result.status.name,
     }
-    return Record(f"floor {scene.n}^3 {bounds} {precision}", figures, facts)
+    return BenchmarkRecord(f"floor {scene.n}^3 {bounds} {precision}", figures, facts)
 
 
 def fitting(asked: Sequence[int], device: str) -> tuple[list[int], dict[int, str]]:
@@ -223,7 +223,7 @@ def exponent(unknowns: Sequence[float], seconds: Sequence[float]) -> float:
     return float(np.polyfit(np.log(unknowns), np.log(seconds), 1)[0])
 
 
-def _growth(bounds: str, cases: Sequence[Growing]) -> Record:
+def _growth(bounds: str, cases: Sequence[Growing]) -> BenchmarkRecord:
     """Return the growth exponents of each round."""
     large = (
         [c for c in cases if c.scene.n >= ASYMPTOTIC]
@@ -237,14 +237,14 @@ def _growth(bounds: str, cases: Sequence[Growing]) -> Record:
             figures[f"exponent_{name}"] = Figure.of(
                 [exponent([c.unknowns for c in large], taken) for taken in rounds]
             )
-    return Record(
+    return BenchmarkRecord(
         f"growth {bounds}",
         figures,
         {"bounds": bounds, "from": large[0].scene.n, "to": large[-1].scene.n},
     )
 
 
-def _targets(growth: Sequence[Record], floors: Sequence[Record]) -> Table:
+def _targets(growth: Sequence[BenchmarkRecord], floors: Sequence[BenchmarkRecord]) -> RecordTable:
     targets = []
     for g in growth:
         figure = g.figures.get("exponent_to_1e-06") if g.facts["from"] >= ASYMPTOTIC else None
@@ -252,15 +252,18 @@ def _targets(growth: Sequence[Record], floors: Sequence[Record]) -> Table:
             f"exponent of the seconds to 1e-6, {g.facts['bounds']}, {g.facts['from']}^3 to "
             f"{g.facts['to']}^3"
         )
-        targets.append(Target(what, 1.05, figure))
+        targets.append(RecordTarget(what, 1.05, figure))
     worst = max(r.figures["floor"].value for r in floors if r.facts["precision"] == "mixed")
     return table_of_targets(
         "figure",
-        [*targets, Target("mixed precision: largest floor of any grid", REACHED, Figure(worst))],
+        [
+            *targets,
+            RecordTarget("mixed precision: largest floor of any grid", REACHED, Figure(worst)),
+        ],
     )
 
 
-def _growth_table(growth: Sequence[Record]) -> Table:
+def _growth_table(growth: Sequence[BenchmarkRecord]) -> RecordTable:
     names = [f"exponent_{name}" for name in ("setup", *FIGURES)]
     rows = [
         [
@@ -272,10 +275,12 @@ def _growth_table(growth: Sequence[Record]) -> Table:
     remark = (
         "Exponents of the number of unknowns, fitted in each round; seconds include the set-up."
     )
-    return Table("Growth", ["problem", "set-up", *(f"to {t:g}" for t in TOLERANCES)], rows, remark)
+    return RecordTable(
+        "Growth", ["problem", "set-up", *(f"to {t:g}" for t in TOLERANCES)], rows, remark
+    )
 
 
-def _table(records: Sequence[Record]) -> Table:
+def _table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     columns = [
         "cells",
         "problem",
@@ -306,10 +311,10 @@ def _table(records: Sequence[Record]) -> Table:
         "problem and workspace, b and the bounds "
         "included."
     )
-    return Table("Sizes", columns, rows, remark)
+    return RecordTable("Sizes", columns, rows, remark)
 
 
-def _floor_table(floors: Sequence[Record]) -> Table:
+def _floor_table(floors: Sequence[BenchmarkRecord]) -> RecordTable:
     columns = ["cells", "precision, problem", "floor", "as the solve tells it", "steps", "status"]
     rows = [
         [
@@ -326,10 +331,10 @@ def _floor_table(floors: Sequence[Record]) -> Table:
         "over that at x = 0, computed in float64 "
         "with NumPy from cells, b and the x that came back; single precision returns x in float32."
     )
-    return Table("Floors", columns, rows, remark)
+    return RecordTable("Floors", columns, rows, remark)
 
 
-def _failures(floors: Sequence[Record]) -> list[str]:
+def _failures(floors: Sequence[BenchmarkRecord]) -> list[str]:
     """Return failures of mixed precision, and solves with a wrong reported residual."""
     lines = []
     for r in floors:
@@ -344,7 +349,9 @@ def _failures(floors: Sequence[Record]) -> list[str]:
 
 
 def _charts(
-    records: Sequence[Record], growth: Sequence[Record], floors: Sequence[Record]
+    records: Sequence[BenchmarkRecord],
+    growth: Sequence[BenchmarkRecord],
+    floors: Sequence[BenchmarkRecord],
 ) -> list[Chart]:
     """Return the charts of seconds to 1e-6 over the unknowns, and of the floors."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
@@ -366,8 +373,8 @@ def _charts(
     # It would hide the other curves.
     double = frozenset(label for label in ends if label.startswith("double"))
     return [
-        Lines("seconds", "Cold solves to 1e-6, set-up included", "unknowns", "s", curves),
-        Lines(
+        RecordLines("seconds", "Cold solves to 1e-6, set-up included", "unknowns", "s", curves),
+        RecordLines(
             "floors",
             "Smallest relative residual",
             "cells a side",

@@ -14,12 +14,20 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp import gallery
-from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.cases import RTOL, SolverCase
 from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
-from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, shown, spread
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    Chart,
+    RecordLines,
+    RecordTable,
+    Results,
+    shown,
+    spread,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.peers.libraries import pyamg, scipy_cg
-from warp_lcp.benchmarks.peers.peer import Answer, Question
+from warp_lcp.benchmarks.peers.peer import PeerAnswer, Question
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
 from warp_lcp.solvers.fallback import Progress
 
@@ -60,7 +68,7 @@ def measure(options: Options, out: Path) -> Results:
     where = machine(
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
     )
-    records, tables = list[Record](), list[Table]()
+    records, tables = list[BenchmarkRecord](), list[RecordTable]()
     for n in sizes:
         cases, answers, question = _measure_size(n, options)
         found = _records(n, cases, answers, question)
@@ -69,7 +77,7 @@ def measure(options: Options, out: Path) -> Results:
     curves = _curves(cases)
     book, residuals = _book(options)
     charts: list[Chart] = [
-        Lines(
+        RecordLines(
             "convergence",
             f"Cold solves at {sizes[-1]}^3",
             "s",
@@ -79,20 +87,22 @@ def measure(options: Options, out: Path) -> Results:
         )
     ]
     charts += [
-        Lines(f"book-{name.split()[0]}", name, "iterations", "relative residual", c)
+        RecordLines(f"book-{name.split()[0]}", name, "iterations", "relative residual", c)
         for name, c in residuals.items()
     ]
     return Results([where, *records, *book], [*tables, _book_table(book)], charts)
 
 
-def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[Answer]], Question]:
+def _measure_size(
+    n: int, options: Options
+) -> tuple[list[SolverCase], dict[str, list[PeerAnswer]], Question]:
     """Measure one sample of every case and peer in each round."""
     cases, question = _cases(n, options.device), Question(splash(n), "linear")
-    solves: dict[str, Callable[[Question, float], Answer]] = (
+    solves: dict[str, Callable[[Question, float], PeerAnswer]] = (
         {"PyAMG SA-CG": pyamg} if present("pyamg") else {}
     )
     solves |= {"SciPy CG": scipy_cg} if n <= SCIPY_CELLS else {}
-    answers: dict[str, list[Answer]] = {name: [] for name in solves}
+    answers: dict[str, list[PeerAnswer]] = {name: [] for name in solves}
     for turn in range(options.repeat + 1):  # the first turn loads kernels
         options.say(f"solvers at {n}^3, round {turn} of {options.repeat}")
         for case in cases:
@@ -109,7 +119,7 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
     return cases, answers, question
 
 
-def _cases(n: int, device: str) -> list[Case]:
+def _cases(n: int, device: str) -> list[SolverCase]:
     """Return the cases of a size.
 
     ProjectedMultigrid and other methods run on unit coefficients. Only ProjectedMultigrid runs on
@@ -117,37 +127,37 @@ def _cases(n: int, device: str) -> list[Case]:
     """
     scene, engine = splash(n), wl.ProjectedMultigrid()
     if n > LARGE:
-        return [Case("unit", scene, bounds, engine, device) for bounds in BOUNDS]
+        return [SolverCase("unit", scene, bounds, engine, device) for bounds in BOUNDS]
     flat = anisotropic(scene)
     arrays = {
         f"face_{a}": np.full([n + (i == j) for j in range(3)], flat.faces.get(f"face_{a}", 1.0))
         for i, a in enumerate("zyx")
     }
     cases = [
-        Case("unit", scene, bounds, solver, device)
+        SolverCase("unit", scene, bounds, solver, device)
         for bounds in BOUNDS
         for solver in (engine, wl.MinimumMapNewton())
     ]
     cases += [
-        Case("unit", scene, b, solver, device, full=False, label=label)
+        SolverCase("unit", scene, b, solver, device, full=False, label=label)
         for label, solver in OTHERS.items()
         for b in BOUNDS[1:]
     ]
-    cases += [Case("faces", cut_cells(scene), bounds, engine, device) for bounds in BOUNDS]
+    cases += [SolverCase("faces", cut_cells(scene), bounds, engine, device) for bounds in BOUNDS]
     harder = {
         "cells 1:100": flat,
         "arrays 1:100": type(scene)(n, scene.cells, scene.b, scene.wall, arrays),
     }
     return cases + [
-        Case(form, s, bounds, engine, device, full=False)
+        SolverCase(form, s, bounds, engine, device, full=False)
         for form, s in harder.items()
         for bounds in BOUNDS[:2]
     ]
 
 
 def _records(
-    n: int, cases: list[Case], answers: dict[str, list[Answer]], question: Question
-) -> list[Record]:
+    n: int, cases: list[SolverCase], answers: dict[str, list[PeerAnswer]], question: Question
+) -> list[BenchmarkRecord]:
     """Return the records of a size, with ratios of samples of the same rounds."""
     by_name = {case.name: case for case in cases}
     pyamg = [a.total for a in answers.get("PyAMG SA-CG", [])]
@@ -170,7 +180,7 @@ def _records(
         if pyamg and case.form == "unit":
             figures["pyamg_over_this"] = ratios(pyamg, case.samples["total"][: len(pyamg)])
         records.append(
-            Record(
+            BenchmarkRecord(
                 case.name,
                 figures,
                 {"form": case.form, "bounds": case.bounds, "method": method, "n": n},
@@ -186,7 +196,7 @@ def _records(
             "residual": Figure(question.residual(solutions[-1].x)),
         }
         records.append(
-            Record(
+            BenchmarkRecord(
                 f"{n}^3 unit linear {name}",
                 figures,
                 {"form": "unit", "bounds": "linear", "method": name, "n": n},
@@ -195,7 +205,7 @@ def _records(
     return records
 
 
-def _curves(cases: list[Case]) -> dict[str, tuple[list[float], list[float]]]:
+def _curves(cases: list[SolverCase]) -> dict[str, tuple[list[float], list[float]]]:
     """Return the curves of relative residual over seconds."""
     curves = {}
     for case in cases:
@@ -212,7 +222,7 @@ def _curves(cases: list[Case]) -> dict[str, tuple[list[float], list[float]]]:
     return curves
 
 
-def _times(n: int, records: Sequence[Record]) -> Table:
+def _times(n: int, records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return the table of seconds: medians, and the range of the cold total."""
     parts = ("setup", "solve", "total", "reuse", "warm", "to_1e-04", "to_1e-06", "to_1e-08")
     columns = [
@@ -237,10 +247,10 @@ def _times(n: int, records: Sequence[Record]) -> Table:
         "warm: from the last solution after b changed by 1 %. to 1e-4 ...: seconds of one solve to "
         "1e-8, set-up not included."
     )
-    return Table(f"Seconds at {n}^3", columns, rows, remark)
+    return RecordTable(f"Seconds at {n}^3", columns, rows, remark)
 
 
-def _quality(n: int, records: Sequence[Record]) -> Table:
+def _quality(n: int, records: Sequence[BenchmarkRecord]) -> RecordTable:
     names = [
         "iterations",
         "linear_iterations",
@@ -256,7 +266,7 @@ def _quality(n: int, records: Sequence[Record]) -> Table:
         "growth of the process's peak memory. "
         "over linear: to the same method's linear solve, set-up included."
     )
-    return Table(
+    return RecordTable(
         f"Iterations, memory and ratios at {n}^3",
         ["case", *(f.replace("_", " ") for f in names)],
         rows,
@@ -266,12 +276,15 @@ def _quality(n: int, records: Sequence[Record]) -> Table:
 
 def _book(
     options: Options,
-) -> tuple[list[Record], dict[str, dict[str, tuple[list[float], list[float]]]]]:
+) -> tuple[list[BenchmarkRecord], dict[str, dict[str, tuple[list[float], list[float]]]]]:
     """Solve each small problem by every applicable method.
 
     The result is records, and residuals over iterations by problem and method.
     """
-    records, curves = list[Record](), dict[str, dict[str, tuple[list[float], list[float]]]]()
+    records, curves = (
+        list[BenchmarkRecord](),
+        dict[str, dict[str, tuple[list[float], list[float]]]](),
+    )
     for what, make in BOOK.items():
         curves[what] = {}
         for name, method in wl.METHODS.items():
@@ -289,7 +302,7 @@ def _book(
             }
             figures["residual"] = Figure(result.relative_residual)
             records.append(
-                Record(
+                BenchmarkRecord(
                     f"{what}: {name}",
                     figures,
                     {"problem": what, "method": name, "status": result.status.name},
@@ -305,7 +318,7 @@ def _book(
     return records, curves
 
 
-def _book_table(records: Sequence[Record]) -> Table:
+def _book_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     columns = ["problem", "method", "status", "iterations", "relative residual", "ms"]
     rows = [
         [
@@ -321,6 +334,6 @@ def _book_table(records: Sequence[Record]) -> Table:
         f"To {BOOK_STOPPING.rtol:g} in {BOOK_STOPPING.max_iterations} steps at most, set-up "
         "included; who is not listed refuses."
     )
-    return Table(
+    return RecordTable(
         "Every method on small problems of [Book] appendix C's kinds", columns, rows, remark
     )

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Record, Results, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.sparse_family import FAMILY, SparseProblem, numbered_at_random
 
@@ -101,7 +101,7 @@ def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
     )
 
 
-def _contest(kind: str, n: int, seed: int, options: Options) -> Record:
+def _contest(kind: str, n: int, seed: int, options: Options) -> BenchmarkRecord:
     problem = numbered_at_random(kind, n, seed)
     solvers = pyamg_solvers(problem)
     first = {name: solve() for name, solve in solvers.items()}
@@ -129,10 +129,10 @@ def _contest(kind: str, n: int, seed: int, options: Options) -> Record:
         "pyamg": best,
         "status": result.status.name,
     }
-    return Record(f"{kind}, {n}", figures, facts)
+    return BenchmarkRecord(f"{kind}, {n}", figures, facts)
 
 
-def _table(records: list[Record]) -> Table:
+def _table(records: list[BenchmarkRecord]) -> RecordTable:
     columns = [
         "problem",
         "unknowns",
@@ -171,4 +171,6 @@ def _table(records: list[Record]) -> Table:
         f"Set-up included, to {RTOL:g}. At most {TARGET:g} is asked for; missed: "
         f"{'; '.join(missed) or 'none'}."
     )
-    return Table("A cold solve with bounds over PyAMG's best linear one", columns, rows, remark)
+    return RecordTable(
+        "A cold solve with bounds over PyAMG's best linear one", columns, rows, remark
+    )

@@ -20,17 +20,17 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import forget_peak, machine, resident_bytes
 from warp_lcp.benchmarks.harness.record import (
-    Record,
+    BenchmarkRecord,
+    RecordTable,
+    RecordTarget,
     Results,
-    Table,
-    Target,
     shown,
     spread,
     table_of_targets,
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.problems import natural
-from warp_lcp.rows.team import available_threads
+from warp_lcp.kernels.thread_pool import available_threads
 from warp_lcp.run.devices import free_memory
 
 TITLE = "A tank filled to 30 %: what a solve costs a cell of the box and of the liquid"
@@ -177,7 +177,7 @@ def measure(options: Options, out: Path) -> Results:
     )
 
 
-def record(tank: Tank, repeat: int) -> Record:
+def record(tank: Tank, repeat: int) -> BenchmarkRecord:
     """Solve cold from the arrays and check the result."""
     samples, counts = defaultdict[str, list[float]](list), dict[str, float]()
     for _ in range(repeat):
@@ -202,7 +202,7 @@ def record(tank: Tank, repeat: int) -> Record:
         "residual": Figure(norm / reference),
     }
     figures |= {"per_iteration": Figure(figures["solve"].value / max(result.iterations, 1), "s")}
-    return Record(
+    return BenchmarkRecord(
         f"tank {tank.n}^3",
         figures,
         {"n": tank.n, "status": result.status.name, "threads": wl.get_threads()},
@@ -242,17 +242,17 @@ def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]
     return result
 
 
-def _targets(records: Sequence[Record]) -> Table:
+def _targets(records: Sequence[BenchmarkRecord]) -> RecordTable:
     targets = []
     for r in records:
-        targets += [Target(f"{r.name}: iterations", STEPS, r.figures["iterations"])]
-        targets += [Target(f"{r.name}: peak memory", PEAK, r.figures["peak"], " GB")] * (
+        targets += [RecordTarget(f"{r.name}: iterations", STEPS, r.figures["iterations"])]
+        targets += [RecordTarget(f"{r.name}: peak memory", PEAK, r.figures["peak"], " GB")] * (
             r.facts["n"] == max(SIZES)
         )
     return table_of_targets("figure", targets)
 
 
-def _table(records: Sequence[Record]) -> Table:
+def _table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     columns = [
         "cells",
         "unknowns [10^6]",
@@ -291,10 +291,10 @@ def _table(records: Sequence[Record]) -> Table:
         "arrays are let go when the problem is made. "
         f"After the solve: what is resident when the result is there. {MCADAMS}"
     )
-    return Table("Tanks", columns, rows, remark)
+    return RecordTable("Tanks", columns, rows, remark)
 
 
-def _failures(records: Sequence[Record]) -> list[str]:
+def _failures(records: Sequence[BenchmarkRecord]) -> list[str]:
     """Return solves that do not converge or report a wrong residual."""
     lines = [f"{r.name}: {r.facts['status']}" for r in records if r.facts["status"] != "CONVERGED"]
     for r in records:

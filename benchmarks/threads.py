@@ -17,13 +17,19 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Record, Results, Table, Target, table_of_targets
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    RecordTable,
+    RecordTarget,
+    Results,
+    table_of_targets,
+)
 from warp_lcp.benchmarks.harness.timing import Options, in_turns, ratios
 from warp_lcp.benchmarks.problems import splash
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch
+from warp_lcp.kernels.thread_pool import available_threads
+from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.rows.program import Launch, Program
-from warp_lcp.rows.team import available_threads
-from warp_lcp.rows.vectors import ADD, rows_of
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -77,7 +83,7 @@ def measure(options: Options, out: Path) -> Results:
                         [len(copies) * TURNS[name] * t for t in times["1"]], times["apart"]
                     )
                 records.append(
-                    Record(
+                    BenchmarkRecord(
                         f"{label}: {name}",
                         figures,
                         {"what": name, "group": label, "seconds": min(times["1"])},
@@ -105,7 +111,7 @@ def measure(options: Options, out: Path) -> Results:
     return Results(
         records,
         [
-            Table("Speed against one thread", heads, rows, remark),
+            RecordTable("Speed against one thread", heads, rows, remark),
             table_of_targets("on 2 threads", _targets(records)),
         ],
     )
@@ -178,7 +184,7 @@ class _Grid:
 
 
 def _program(build: Callable[[Launch], object]) -> Callable[[], object]:
-    program = Program(wp.get_device("cpu"))
+    program = CommandBuffer(wp.get_device("cpu"))
     build(program.launch)
     return program.run
 
@@ -200,13 +206,13 @@ def _scene(name: str, resolution: int, count: int) -> Work:
     return {STEP: step}
 
 
-def _targets(records: list[Record]) -> list[Target]:
+def _targets(records: list[BenchmarkRecord]) -> list[RecordTarget]:
     limits = {
         f"{name}, {resolution} cells: {STEP}": limit for name, (resolution, limit) in SCENES.items()
     }
     found = [(r, limits.get(r.name, TARGETS.get(str(r.facts.get("what"))))) for r in records[1:]]
     return [
-        Target(r.name, limit, r.figures.get("speed_2"), " x", at_least=True)
+        RecordTarget(r.name, limit, r.figures.get("speed_2"), " x", at_least=True)
         for r, limit in found
         if limit is not None
     ]

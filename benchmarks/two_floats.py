@@ -23,9 +23,9 @@ from warp._src.context import user_modules
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import Splash, natural, splash
-from warp_lcp.rows.layout import make_struct, put
-from warp_lcp.rows.pass_form import C
-from warp_lcp.rows.vectors import CUDA_BLOCK
+from warp_lcp.kernels.kernel_variant import C
+from warp_lcp.kernels.layout import make_struct, put
+from warp_lcp.kernels.vectors import CUDA_BLOCK
 
 # Of an RTX 4090: clock [Hz], and bandwidth of streaming kernels [byte/s].
 ARCH, MULTIPROCESSORS, CLOCK, BANDWIDTH = 89, 128, 2.52e9, 0.8 * 1008e9

@@ -13,11 +13,11 @@ from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.fluids.carried_liquid import CarriedLiquid
 from warp_lcp.fluids.forces import walls_of
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.launch_graph import LaunchGraph, call, clear, launch
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import LaunchGraph, call, clear, launch
 
 LEAST = 4096  # least capacity for entries on a GPU, which counts them during the solve
 SPARE = 1.5  # factor on the number of entries when the buffer is enlarged

@@ -3,10 +3,10 @@
 
 import warp as wp
 
-from warp_lcp.fluids.wall_kernels import Walls, face_center, moving_on
+from warp_lcp.fluids.wall_kernels import WallKernelFields, face_center, moving_on
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.rows.compiler import forward_kernel
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _I32 = wp.array(dtype=wp.int32)
@@ -17,7 +17,7 @@ _F64 = wp.array(dtype=wp.float64)
 class Solids:
     """Indices and centers of mass of the rigid bodies, and the layout of the fields."""
 
-    walls: Walls
+    walls: WallKernelFields
     bodies: int
     body: _I32  # body of each wall number; -1 for a wall that is no body
     center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]

@@ -13,17 +13,17 @@ import warp as wp
 
 from warp_lcp.fluids import forces_kernels as kernels
 from warp_lcp.fluids.thin_forces_kernels import thin_pressure_kernel
-from warp_lcp.fluids.wall_kernels import Walls
+from warp_lcp.fluids.wall_kernels import WallKernelFields
 from warp_lcp.grid.cell_kernel import scan
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_log import Row
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR, BodyMotion
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear
 
 if TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
@@ -32,8 +32,8 @@ SPARE = 1.5  # factor on the number of entries when the buffer is enlarged
 
 
 def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
-    """Return the solids of a boundary as the kernel struct `wall_kernels.Walls`."""
-    S = Walls()
+    """Return the solids of a boundary as the kernel struct `wall_kernels.WallKernelFields`."""
+    S = WallKernelFields()
     S.planes, S.spacing, S.origin = grid.planes, grid.spacing, wp.vec3i(*grid.origin)
     if isinstance(boundary, CutBoundary):
         cut = boundary.cut

@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.fluids.wall_kernels import (
-    Walls,
+    WallKernelFields,
     closed_on,
     crossing_on,
     face_center,
@@ -22,7 +22,7 @@ def pressure_kernel(
     j,
     first,
     end,
-    S: Walls,
+    S: WallKernelFields,
     references: wp.array(dtype=wp.vec3d),
     counts: INTS,
     offsets: INTS,

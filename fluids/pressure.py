@@ -24,15 +24,15 @@ from warp_lcp.grid.staggered import (
     Window,
     three_components,
 )
-from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.launch_graph import LaunchGraph, copy
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, copy
 
 CONSTANTS = {
     "FLUID": FLUID,

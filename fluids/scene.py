@@ -13,7 +13,7 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
 from warp_lcp.scene.shapes import MaterialProperties, SourceProperties
-from warp_lcp.scene.unusual import LIQUID_DENSITY, Usual
+from warp_lcp.scene.suspicious_settings import LIQUID_DENSITY, UsualRange
 from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
@@ -30,7 +30,7 @@ VISCOUS_BYTES = {2: 140, 3: 220}
 SHORT_STEPS = 0.5
 # Added for a right-hand side that bodies change, and for each motion of a light body.
 BODY_BYTES, POTENTIAL_BYTES = 8, 4
-VISCOSITY = Usual(
+VISCOSITY = UsualRange(
     1e-4,
     1e7,
     "Pa s",
@@ -38,9 +38,9 @@ VISCOSITY = Usual(
     "m^2/s of a liquid as heavy as water",
     1e3,
 )
-TENSION = Usual(1e-4, 3.0, "N/m", "0.02 to 0.5, 0.072 for water,", "mN/m", 1e-3)
-DRAG = Usual(0.0, 1.0, "", "about 0.005")
-LIQUID_CFL = Usual(0.0, 10.0, "", "1 to 4")
+TENSION = UsualRange(1e-4, 3.0, "N/m", "0.02 to 0.5, 0.072 for water,", "mN/m", 1e-3)
+DRAG = UsualRange(0.0, 1.0, "", "about 0.005")
+LIQUID_CFL = UsualRange(0.0, 10.0, "", "1 to 4")
 # Methods for A + U W U', see `fluids.coupling`.
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")
 
@@ -60,7 +60,7 @@ class Pressure(Table):
     )
 
 
-class Viscosity(Table):
+class ViscositySettings(Table):
     """[viscosity]: viscous liquid; off without the table."""
 
     value: float = Field(
@@ -99,7 +99,7 @@ class LiquidScene(ParticleScene):
     stirred: ClassVar[float] = 1.2
 
     pressure: Pressure = Field(default_factory=Pressure)
-    viscosity: Viscosity | None = Field(default=None)
+    viscosity: ViscositySettings | None = Field(default=None)
     surface_tension: SurfaceTensionSettings | None = None
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)

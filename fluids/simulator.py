@@ -29,8 +29,10 @@ from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import particles_to_faces
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.kernels.joined_graphs import joined
+from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.coverage import start_of
+from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_assembly import (
     Parts,
     make_bodies,
@@ -46,8 +48,6 @@ from warp_lcp.material.particle_assembly import (
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.rows.joined import joined
-from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
@@ -218,14 +218,18 @@ class LiquidSimulation(ParticleSimulation):
         if self.projection.coupling is not None:
             with self.watch.stage("bodies"):
                 self.projection.coupling.take_along(self.velocity, self.projection.kind)
-        viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
+        viscous = (
+            self._apply_viscosity(self.viscosity, window, dt, speed)
+            if self.viscosity is not None
+            else {}
+        )
         projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
                 if self.tension is not None:
                     self.tension.measure(window, self.projection.kind)
-        walls = self._meet_walls(window, dt)
+        walls = self._apply_wall_forces(window, dt)
         self.solve_contacts()
         self.extrapolate_velocity(
             window, self.projection.known, self.projection.kind, self.projection.contact, dt
@@ -282,7 +286,7 @@ class LiquidSimulation(ParticleSimulation):
             self.forces.impulses = np.asarray(self.grid.part.ranks.sum(self.forces.impulses))
             self.measured["forces"] = clock | self.forces.row(self.kick_dt)
 
-    def _meet_walls(self, window: Window, dt: float) -> Row:
+    def _apply_wall_forces(self, window: Window, dt: float) -> Row:
         """Collect the pressure impulses on solids, and apply wall drag.
 
         This comes before closed faces get other velocities.
@@ -414,7 +418,9 @@ class LiquidSimulation(ParticleSimulation):
         self._mark_cells(window)
         self.surface.complete(window, self.velocity, self.weights, self.projection.known)
 
-    def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
+    def _apply_viscosity(
+        self, viscosity: Viscosity, window: Window, dt: float, speed: float
+    ) -> Row:
         """Apply viscosity before the pressure solve; return its log values.
 
         A first pressure solve finds which walls hold the liquid: viscosity acts on the projected

@@ -13,9 +13,9 @@ from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.kernels.launch_graph import copy
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import AIR, FLUID
-from warp_lcp.rows.program import copy
 
 _AIR = wp.constant(wp.int8(AIR))
 _FLUID = wp.constant(wp.int8(FLUID))

@@ -17,11 +17,11 @@ from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
-from warp_lcp.grid.tally import WindowTally
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear
 
 # Binomial passes of the filter: the minimum follows from the noise of the particles, the maximum
 # from the cost and from thin liquid.

@@ -11,7 +11,7 @@ from warp_lcp.fluids.pressure import CONSTANTS, THETA_MIN
 from warp_lcp.grid.cell_kernel import F32 as FIELD
 from warp_lcp.grid.cell_kernel import I8 as MARKS
 from warp_lcp.grid.cell_kernel import INTS, POINTS, cell_kernel, list_kernel
-from warp_lcp.rows import KernelFile
+from warp_lcp.kernels import KernelFile
 
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)

@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.fluids.wall_kernels import Walls, cell_center, crossing_on, fields_on, put
+from warp_lcp.fluids.wall_kernels import WallKernelFields, cell_center, crossing_on, fields_on, put
 from warp_lcp.grid.cell_kernel import F64, INTS, U8, cell_kernel, next_to
 
 OPEN = -1.0  # the distance to a wall along an edge that none crosses
@@ -29,7 +29,7 @@ class Cube:
 
 
 @wp.func
-def edge_of(S: Walls, axis: int, side: int, k: int, j: int, i: int):
+def edge_of(S: WallKernelFields, axis: int, side: int, k: int, j: int, i: int):
     """Return the distance from a cell's center to the wall before the next center, and its number."""
     c, b, a = next_to(axis, wp.where(side > 0, 1, 0), k, j, i)
     distance = _OPEN
@@ -44,7 +44,7 @@ def edge_of(S: Walls, axis: int, side: int, k: int, j: int, i: int):
 
 
 @wp.func
-def cube_at(S: Walls, octant: int, k: int, j: int, i: int):
+def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
     """Return the cube between a cell's center, its corner 0, and those in an octant around it."""
     cube = Cube()
     cube.planes = S.planes
@@ -104,7 +104,7 @@ def arc_area(count: int, a: float, b: float, alike: bool):
 
 
 @wp.func
-def lean(S: Walls, cube: Cube, at: wp.vec3i, corner: int, axis: int, other: int):
+def lean(S: WallKernelFields, cube: Cube, at: wp.vec3i, corner: int, axis: int, other: int):
     """Return how much farther the wall along an axis is from the next center away from the square.
 
     `at` is the cell of corner 0. It is 0 for a wall along the other axis of the square, and -1
@@ -145,7 +145,9 @@ def corner_area(a: float, b: float, lean_a: float, lean_b: float):
 
 
 @wp.func
-def open_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, first: int, along: int, other: int):
+def open_area(
+    S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, first: int, along: int, other: int
+):
     """Return how much of a square of the cube belongs to the connected corners [cells^2].
 
     Walls on its edges divide its corners, taken around it, into arcs.
@@ -183,7 +185,7 @@ def open_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, first: int, along:
 
 
 @wp.func
-def wall_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, axis: int):
+def wall_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, axis: int):
     """Return the part along an axis of the vector area of the wall around the connected corners.
 
     It points into the wall [cells, 3-D: cells^2]. With the open parts of the cube's sides it closes
@@ -202,7 +204,7 @@ def wall_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, axis: int):
 
 
 @wp.func
-def shared_area(S: Walls, cube: Cube, at: wp.vec3i, found: int, crossed: int):
+def shared_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, crossed: int):
     """Return the vector area that the wall on corner 0's edge along an axis has a share in.
 
     Each part belongs to the walls on edges along its own axis or, without those, to all.
@@ -228,7 +230,7 @@ def thin_pressure_kernel(
     j,
     first,
     end,
-    S: Walls,
+    S: WallKernelFields,
     references: wp.array(dtype=wp.vec3d),
     counts: INTS,
     offsets: INTS,

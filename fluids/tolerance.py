@@ -9,9 +9,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Across, Reduction, convert, rows_of
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Communicator, Reduction, convert, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h")
 CHANGE = KERNELS["tolerance.change"]
@@ -55,14 +55,14 @@ class TimeErrorTolerance:
         used: relative residual that was the criterion of the last solve.
     """
 
-    def __init__(self, size: int, device: wp.Device, across: Across | None = None) -> None:
+    def __init__(self, size: int, device: wp.Device, across: Communicator | None = None) -> None:
         self.used = FIRST
         self._error: float | None = None
         # Whether there was a previous step, and whether `_sum` has an error that was not read yet.
         self._warm = self._change = False
         self._unknowns = 1
         self._reference = 0.0  # residual of the last step at x = 0, root mean square [m/s]
-        self._sum = Reading(device)
+        self._sum = DeviceScalar(device)
         self._reduction = Reduction(size, device, self._sum.array, across=across)
 
     def criteria(self, ratio: float, atol: float) -> dict[str, float]:

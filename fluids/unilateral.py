@@ -15,12 +15,12 @@ from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
+from warp_lcp.kernels.launch_graph import clear
+from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import clear
-from warp_lcp.rows.readings import Reading
 
 
 class UnilateralPressure(PressureProjection):
@@ -107,7 +107,7 @@ class UnilateralPressure(PressureProjection):
         self._weights = list(weights)
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         # Totals of `_sums` on a GPU.
-        self._totals = Reading(grid.device, 2) if grid.device.is_cuda else None
+        self._totals = DeviceScalar(grid.device, 2) if grid.device.is_cuda else None
         self._unknown, self._least = grid.field(wp.int8), 0.0
         wp.copy(self._unknown, boundary.base)  # the ring does not change
         if boundary.open and self._shift is None:  # pockets between solids that are overfull

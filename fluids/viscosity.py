@@ -51,15 +51,15 @@ from warp_lcp.grid.staggered import (
     Window,
     three_components,
 )
-from warp_lcp.grid.tally import WindowTally
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
-from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 
 # Rounding error of a force, relative to the diagonal times the speed.
 ROUNDING = 4 * float(np.finfo(np.float32).eps)

@@ -16,11 +16,11 @@ import warp as wp
 
 from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.kernels.launch_graph import Launch
+from warp_lcp.kernels.vectors import Communicator
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.operators.low_rank import BlockColumns, weigh_kernel
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.rows.program import Launch
-from warp_lcp.rows.vectors import Across
 
 SPARE = 1.5  # factor on the number of links when the buffer is enlarged
 
@@ -224,7 +224,7 @@ class BodyDrag:
         density: float,
         passes: Any,
         solved: Window,
-        across: Across | None,
+        across: Communicator | None,
     ) -> None:
         self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved
         self._pull = WallPull(grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes)

@@ -24,8 +24,8 @@ import warp as wp
 
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window, three_components
+from warp_lcp.kernels.launch_graph import Launch, perform
 from warp_lcp.multigrid.cycle import CycleStage, Launches
-from warp_lcp.rows.program import Launch, perform
 
 # Layers of ghost cells that sweeps need: rows of the second color read those of the first, in which
 # odd cells read even ones.

@@ -10,10 +10,10 @@ import warp as wp
 
 from warp_lcp.fluids.viscosity_level import KNOWN, ViscosityLevel
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
 from warp_lcp.multigrid.cycle import Cycle, GatheredLevel, Launches, recorded
 from warp_lcp.multigrid.halo_levels import GATHERED
-from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.program import Launch, launch_now, perform
 
 LEAST = 8  # cells of the longest side of the coarsest level
 

@@ -6,9 +6,9 @@ import functools
 from pathlib import Path
 from types import SimpleNamespace
 
+from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.rows import KernelFile, RowPass
 
 CLOSE = 1e-3  # cells: a face this near to a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
@@ -50,15 +50,15 @@ def viscous_passes(
         {"CUT": cut, "GHOST": ghost, "MOVING": moving},
     )
 
-    def near(name: str, apart: str = "", **more: bool) -> RowPass:
+    def near(name: str, apart: str = "", **more: bool) -> StencilKernel:
         return KERNELS.kernel(
             f"fluids.viscosity.{name}", module=area + walls + apart, constants=flags | more
         )
 
-    def plain(name: str) -> RowPass:
+    def plain(name: str) -> StencilKernel:
         return KERNELS.kernel(f"fluids.viscosity.{name}", module=area)
 
-    def level(name: str, apart: str = "", **constants: bool) -> RowPass:
+    def level(name: str, apart: str = "", **constants: bool) -> StencilKernel:
         return LEVELS.kernel(f"fluids.viscosity.{name}", module=area + apart, constants=constants)
 
     return SimpleNamespace(

@@ -12,9 +12,9 @@ from warp_lcp.fluids.forces import WallSums
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.wall_drag_kernels import Drag, drag_kernel
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear, copy
 
 
 class WallDrag:

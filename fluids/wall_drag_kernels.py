@@ -3,7 +3,14 @@
 
 import warp as wp
 
-from warp_lcp.fluids.wall_kernels import Walls, closed_on, face_center, fields_on, put, standing_of
+from warp_lcp.fluids.wall_kernels import (
+    WallKernelFields,
+    closed_on,
+    face_center,
+    fields_on,
+    put,
+    standing_of,
+)
 from warp_lcp.grid.cell_kernel import F32, I8, INTS, U8, cell_kernel
 from warp_lcp.material.boundary_kernels import HELD
 from warp_lcp.operators.grid_poisson import FLUID
@@ -16,7 +23,7 @@ HALF = wp.constant(0.5)
 class Drag:
     """Fields that the wall drag reads; velocities are those after the projection."""
 
-    walls: Walls
+    walls: WallKernelFields
     kind: I8
     contact: U8
     # Distance to the free surface at cell centers [cells]; null if it lies on the cells' faces.
@@ -34,7 +41,7 @@ class Drag:
 
 
 @wp.func
-def open_share(S: Walls, axis: int, k: int, j: int, i: int):
+def open_share(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the open fraction of a face."""
     free = float(0.0)
     if S.index:
@@ -100,7 +107,7 @@ def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
+def piece_of(S: WallKernelFields, n: int, along: int, k: int, j: int, i: int):
     """Return area [faces], normal and solid of a piece of wall in a cell.
 
     The area is the one that drags along an axis. The first 2 d pieces are the parts of each face
@@ -176,7 +183,7 @@ def drag_kernel(
     j,
     first,
     end,
-    S: Walls,
+    S: WallKernelFields,
     references: wp.array(dtype=wp.vec3d),
     counts: INTS,
     offsets: INTS,

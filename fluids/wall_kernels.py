@@ -8,7 +8,7 @@ from warp_lcp.grid.cut_cells_kernels import Moving, moving_part, open_face
 
 
 @wp.struct
-class Walls:
+class WallKernelFields:
     """Open fractions and numbers of the solids on faces and cells.
 
     See `warp_lcp.grid.cut_cells`; for whole cells `index` has the solids, see
@@ -40,7 +40,7 @@ class Walls:
 
 
 @wp.func
-def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
+def fields_on(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the open fraction of a face of cut cells, and the closing solid."""
     free = of_axis(axis, S.open_x, S.open_y, S.open_z, k, j, i)
     wall = of_axis(axis, S.wall_x, S.wall_y, S.wall_z, k, j, i)
@@ -48,7 +48,7 @@ def fields_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
+def crossing_on(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the thin solid that crosses a face, and its distances.
 
     0 without one. The distances are those from the cells below and above [cells].
@@ -60,7 +60,7 @@ def crossing_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def reach_across(S: Walls, axis: int, k: int, j: int, i: int):
+def reach_across(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the area of a thin solid's side toward a cell, across an axis [faces].
 
     The part of a neighbor that the thin solid cuts off belongs to the cell.
@@ -82,7 +82,7 @@ def reach_across(S: Walls, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def moving_on(S: Walls, axis: int, k: int, j: int, i: int):
+def moving_on(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return open fraction, moving solid and its share of a face.
 
     The solid is 0 if no moving one covers the face; the share is that of the closed part.
@@ -103,7 +103,7 @@ def moving_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def moves(S: Walls, solid: int):
+def moves(S: WallKernelFields, solid: int):
     """Return whether a solid moves."""
     found = bool(False)
     if S.moving.moves:
@@ -112,7 +112,7 @@ def moves(S: Walls, solid: int):
 
 
 @wp.func
-def standing_of(S: Walls, k: int, j: int, i: int):
+def standing_of(S: WallKernelFields, k: int, j: int, i: int):
     """Return the standing solid with the largest closed part of a face of a cell.
 
     0, the domain, if none does.
@@ -136,7 +136,7 @@ def standing_of(S: Walls, k: int, j: int, i: int):
 
 
 @wp.func
-def closed_on(S: Walls, axis: int, k: int, j: int, i: int):
+def closed_on(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the owner of a face, and the shares of the solids that close it.
 
     In this order: an owner and its share of a face, the share of the standing solid of the cell
@@ -175,7 +175,7 @@ def closed_on(S: Walls, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def wall_way(S: Walls, k: int, j: int, i: int):
+def wall_way(S: WallKernelFields, k: int, j: int, i: int):
     """Return the vector from a cut cell's center to the solids' nearest point [cells]."""
     mean = float(0.0)
     slope = wp.vec3()
@@ -192,7 +192,7 @@ def wall_way(S: Walls, k: int, j: int, i: int):
 
 
 @wp.func
-def cell_center(S: Walls, k: int, j: int, i: int):
+def cell_center(S: WallKernelFields, k: int, j: int, i: int):
     """Return the center of a cell [m], z = 0 in 2-D."""
     o = S.origin
     half = wp.float64(0.5)
@@ -206,7 +206,7 @@ def cell_center(S: Walls, k: int, j: int, i: int):
 
 
 @wp.func
-def face_center(S: Walls, axis: int, k: int, j: int, i: int):
+def face_center(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the center of a cell's lower face [m], with z = 0 in 2-D."""
     o = S.origin
     half = wp.float64(0.5)

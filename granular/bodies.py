@@ -34,14 +34,14 @@ from warp_lcp.granular.fields import StressFields
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.yield_set import F64, I32, U8
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.rows import Rows
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import Launch, LaunchGraph, copy, launch
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import add_across
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, copy, launch
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import add_across
 
 if typing.TYPE_CHECKING:
-    from warp_lcp.granular.stress import Velocity, Walls
+    from warp_lcp.granular.stress import SandWalls, Velocity
 
 # Trial steps before a step. One is exact while all stresses around a body are free; a second one
 # saved a sixth of the steps.
@@ -93,7 +93,7 @@ class SandBodies:
         self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
         count, k, device = len(self.numbers), self.freedoms, grid.device
         # Velocity and force that result from the stresses.
-        self._left = [Reading(device, count * k) for _ in range(2)]
+        self._left = [DeviceScalar(device, count * k) for _ in range(2)]
         self.velocity, self._force = (reading.array.reshape((count, k)) for reading in self._left)
         self._error = wp.zeros((count, k), dtype=wp.float64, device=device)
         self._start = HostArray((count, k), wp.float64, device)
@@ -114,10 +114,10 @@ class SandBodies:
         # 1 if sand is beside a body on some rank; else no force is computed.
         self._met = wp.zeros(1, dtype=wp.int32, device=device)
         self.faces: BodyFaces | None = None
-        self._walls: Walls
+        self._walls: SandWalls
         self._faces, self._cells, self._edges = Places(), Places(), Places()
 
-    def place(self, index: np.ndarray, centers: np.ndarray, walls: Walls) -> None:
+    def place(self, index: np.ndarray, centers: np.ndarray, walls: SandWalls) -> None:
         """Find the faces, cells and edges where bodies meet sand.
 
         Args:

@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_lcp.granular.stress_kernels import KERNELS
 from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.layout import make_struct, put
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.layout import make_struct, put
 
 _INTS, _BYTES, _REALS = (
     wp.array(dtype=wp.int32),

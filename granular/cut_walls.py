@@ -21,9 +21,9 @@ from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.yield_set import COLUMNS
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.launch_graph import Launch
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import Rows
-from warp_lcp.rows.program import Launch
 
 if TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity

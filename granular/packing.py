@@ -13,10 +13,10 @@ from warp_lcp.granular.fields import SandFields
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
-from warp_lcp.rows.layout import put
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch
-from warp_lcp.rows.readings import Reading
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, launch
+from warp_lcp.kernels.layout import put
+from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.readback import DeviceScalar
 
 if TYPE_CHECKING:
     from warp_lcp.granular.cut_walls import CutWalls
@@ -110,7 +110,7 @@ class Packing:
         self._known = grid.part.stored
         # Number of sand cells and largest fraction of each row.
         self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)
-        self._found = Reading(grid.device, 2)
+        self._found = DeviceScalar(grid.device, 2)
         self._rate = Scalar()  # dx / dt [m/s]
         self._update = LaunchGraph(grid.device, self._launch)
         if sides is not None:  # the neighbors of a row may be at its other end

@@ -10,10 +10,10 @@ import warp as wp
 from warp_lcp.granular.report_kernels import contact_kernel, report_pass, take_kernel
 from warp_lcp.granular.stress import Stress
 from warp_lcp.grid.staggered import Window
-from warp_lcp.grid.tally import WindowTally
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.particle_log import Row
-from warp_lcp.rows.program import LaunchGraph
 
 
 class SandReport:

@@ -9,8 +9,8 @@ import warp as wp
 from warp_lcp.granular.yield_set import CONSTANTS
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED
+from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import KernelFile, RowPass
 
 RATIO_YIELDS = 0.99  # ratio to the bound from which a cell counts as yielding
 KERNELS = KernelFile(
@@ -19,7 +19,7 @@ KERNELS = KernelFile(
 
 
 @functools.cache
-def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPass:
+def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> StencilKernel:
     """Return the kernel for 2 or 3 dimensions.
 
     `rate`: friction depends on the shear rate. `cut`: solids cut cells.

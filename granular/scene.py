@@ -29,7 +29,7 @@ from warp_lcp.scene.shapes import (
     SphereTable,
     WallFriction,
 )
-from warp_lcp.scene.unusual import GRAIN_DENSITY, Usual
+from warp_lcp.scene.suspicious_settings import GRAIN_DENSITY, UsualRange
 from warp_lcp.settings import NonNegative, Positive, Share
 
 STRESS_BYTES = {2: 160, 3: 330}  # bytes per cell: the coupled solve's fields
@@ -37,9 +37,9 @@ CUT_STRESS_BYTES = {2: 48, 3: 76}  # added where solids cut cells
 # Slope k from which on the yield cone contains tensile stresses.
 STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}
 STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
-FRICTION_ANGLE = Usual(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
-COHESION = Usual(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
-SAND_CFL = Usual(0.0, 4.0, "", "0.5 to 1")
+FRICTION_ANGLE = UsualRange(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
+COHESION = UsualRange(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
+SAND_CFL = UsualRange(0.0, 4.0, "", "0.5 to 1")
 # Inertial number at which friction of glass beads has reached half of its growth
 # [Jop, Forterre & Pouliquen 2006].
 GLASS = 0.279

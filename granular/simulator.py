@@ -13,9 +13,9 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.coupled import METHODS
-from warp_lcp.granular.front import Front
+from warp_lcp.granular.heavy_ball import METHODS
 from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.percentiles import ParticlePercentiles
 from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.solids import SandSolids
@@ -25,7 +25,9 @@ from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.part import ONE_PROCESS
 from warp_lcp.grid.particles import SORTED, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.coverage import start_of
+from warp_lcp.kernels.joined_graphs import joined
+from warp_lcp.kernels.launch_graph import LaunchGraph, copy
+from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_assembly import (
     Parts,
     make_bodies,
@@ -42,8 +44,6 @@ from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
-from warp_lcp.rows.joined import joined
-from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
 
@@ -102,7 +102,9 @@ class SandSimulation(ParticleSimulation):
         self.method = METHODS[scene.solver.method]()
         self._at_rest = scene.particles.per_axis**grid.dimension
         self._percentiles = (
-            Front(grid.device) if grid.device.is_cuda and not grid.part.shared else None
+            ParticlePercentiles(grid.device)
+            if grid.device.is_cuda and not grid.part.shared
+            else None
         )
         super().__init__(scene, grid, parts, particles, **more)
         if self._percentiles is not None:

@@ -15,10 +15,10 @@ from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.fields import WallFaces
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, launch
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 INTS, BYTES = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
 CUDA_LISTS = 1024  # parts of the list of faces, one per thread on a GPU
@@ -31,7 +31,7 @@ def part_begin(part: int, entries: int, parts: int):
     return int((wp.int64(part) * wp.int64(entries)) // wp.int64(parts))
 
 
-class Walls:
+class SandWalls:
     """Friction on the faces between sand and solids.
 
     Args:
@@ -250,7 +250,7 @@ class SandSolids:
             rubbing = not self.moves
             self._cells, self.walls = (
                 cells.copy(),
-                Walls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted),
+                SandWalls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted),
             )
 
     def _thin_notes(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.cut_walls import WALL_FACE
 from warp_lcp.granular.fields import StressFields, VelocityFields
 from warp_lcp.granular.packing import REACH, SHEARS, Packing
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress_kernels import (
     BETA_X,
     NEXT_X,
@@ -30,10 +30,17 @@ from warp_lcp.granular.stress_kernels import (
 )
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.grid.staggered import three_components
-from warp_lcp.rows import Rows
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now
-from warp_lcp.rows.vectors import Reduction, add_across
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.launch_graph import (
+    CommandBuffer,
+    Launch,
+    LaunchGraph,
+    copy,
+    launch,
+    launch_now,
+)
+from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.vectors import Reduction, add_across
 from warp_lcp.settings import renamed_method
 
 WALL_GRAIN = 256  # wall faces per CPU thread
@@ -140,7 +147,7 @@ class Stress(wl.VariationalInequality):
     y/d), with y = (w, -E u), where P projects onto x >= 0 first and then onto the slice at that x.
     P is not the projection onto the cones themselves, which would make sand dilate as it shears (an
     associated flow rule, whose normal velocity is k times the slip). `wl.solve` solves the problem
-    by the methods of `granular.coupled`. Gradient, projection and momentum of a cell are fused in
+    by the methods of `granular.heavy_ball`. Gradient, projection and momentum of a cell are fused in
     one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no separate
     functions for y and P.
 
@@ -163,7 +170,7 @@ class Stress(wl.VariationalInequality):
     def __init__(
         self,
         packing: Packing,
-        walls: Walls,
+        walls: SandWalls,
         *,
         box: bool = False,
         rate: bool = False,
@@ -206,8 +213,8 @@ class Stress(wl.VariationalInequality):
         self._wall_sums: Reduction | None = None
         # On the CPU these are views of the device arrays.
         self._host, self._host_momentum = self.numbers.numpy(), self.momentum.numpy()
-        self._program: Program | None = None  # a period of steps with momentum
-        self._check: Program | None = None  # evaluation of the residual
+        self._program: CommandBuffer | None = None  # a period of steps with momentum
+        self._check: CommandBuffer | None = None  # evaluation of the residual
         self._cells: int | None = 1  # None until it is read after `begin`
         self._yields = [Scalar() for _ in range(NUMBERS - 3)]  # arguments of `numbers_kernel`
         self.last_residual = 0.0, 0.0
@@ -220,7 +227,7 @@ class Stress(wl.VariationalInequality):
         )
         self.set_walls(walls)
 
-    def set_walls(self, walls: Walls) -> None:
+    def set_walls(self, walls: SandWalls) -> None:
         """Replace the walls after solids have moved."""
         device = self.packing.grid.device
         self.walls, self._program, self._check = walls, None, None
@@ -371,10 +378,10 @@ class Stress(wl.VariationalInequality):
             1.0 / math.sqrt(self.cells) * math.sqrt(pressure * pressure + friction * friction)
         )
 
-    def period(self) -> Program:
+    def period(self) -> CommandBuffer:
         """Return the program of `PERIOD` steps with momentum, for the current walls."""
         if self._program is None:
-            self._program = Program(self.packing.grid.device)
+            self._program = CommandBuffer(self.packing.grid.device)
             for step in range(PERIOD):
                 self._record(step, self._program.launch)
         return self._program
@@ -415,10 +422,10 @@ class Stress(wl.VariationalInequality):
         sums = self.total.numpy()
         return self.take_residual(sums[0], sums[1] + sums[COLUMNS])
 
-    def check(self) -> Program:
+    def check(self) -> CommandBuffer:
         """Return the program that writes the sums of the residual to `total`."""
         if self._check is None:
-            self._check = Program(self.packing.grid.device)
+            self._check = CommandBuffer(self.packing.grid.device)
             self.checked.find(self.now, launch=self._check.launch, bodies=self.bodies, respond=True)
             self._project(self.checked, self._check.launch)
             self._add_up(self._check.launch)

@@ -3,7 +3,7 @@
 
 They run projected steps on the stresses of `granular.yield_set`, update the momentum of these
 steps, and make the decisions with which a device runs them without the host, see
-`granular.stress_ahead`.
+`granular.stress_device_iteration`.
 
 They also damp a pattern that exerts no force: a checkerboard in the pressure and one in the shear
 balance each other on every face. Noise in the fraction excites it, and no equation damps it. With
@@ -36,8 +36,8 @@ from warp_lcp.granular.yield_set import (
     TENSION,
     WEIGHT,
 )
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
 
 # Slots of the momentum's state: number of steps; limits for pressure and friction; momenta of this
 # step and of the next one; estimates of the natural residuals over the last PERIOD steps; sums over

@@ -10,7 +10,7 @@ import warp as wp
 from hypothesis import HealthCheck, settings
 
 from dots import dots, scene_file  # noqa: F401  # fixtures of whatever runs scenes
-from warp_lcp.rows.kernel_messages import start_warp
+from warp_lcp.kernels.log_filter import start_warp
 
 collect_ignore = ["emulated_cuda.py"]  # a plug-in that changes all later imports
 wp.config.log_level = wp.LOG_ERROR

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from warp_lcp.fluids import coupling
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 

@@ -20,23 +20,23 @@ from warp_lcp.fluids.pressure import pressure_passes
 from warp_lcp.fluids.surface_tension_kernels import push_pass
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
-from warp_lcp.granular.coupled import interleaved_passes
+from warp_lcp.granular.heavy_ball import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
 from warp_lcp.grid.advection import CENTERS, advect_pass, carry_pass, distance_pass
 from warp_lcp.grid.sides import wrap_kernel
 from warp_lcp.grid.transfer import transfer_passes
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.kernel_variant import KernelVariant
+from warp_lcp.kernels.layout import Alignment
+from warp_lcp.kernels.native import sections
+from warp_lcp.kernels.persistent_kernel import PersistentKernel
+from warp_lcp.kernels.stencil_kernel import StencilKernel
+from warp_lcp.kernels.vectors import CUDA_BLOCK
 from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.rows import Rows
-from warp_lcp.rows.layout import Alignment
-from warp_lcp.rows.native import sections
-from warp_lcp.rows.pass_form import Form
-from warp_lcp.rows.row_pass import RowPass
-from warp_lcp.rows.sequence import Sequence
-from warp_lcp.rows.vectors import CUDA_BLOCK
 from warp_lcp.solvers.mprgp import MPRGP
 
 # Modules that have compiled for CUDA, with the hash of their sources.
@@ -392,12 +392,12 @@ def modules_of_every_kernel(reals):
     use_coupled_kernels(reals)
     use_sand_kernels()
     use_contact_kernels()
-    for form in [made for made in gc.get_objects() if isinstance(made, Form)]:
+    for form in [made for made in gc.get_objects() if isinstance(made, KernelVariant)]:
         assert form.kernel  # kernel of the pass alone, which the CPU launches in waves
         if form.by_quads:
             assert form.by_quads.kernel  # in place of it on CUDA
             assert form.with_quads(IN_BLOCKS).kernel  # and on large grids
-    for sequence in [made for made in gc.get_objects() if isinstance(made, Sequence)]:
+    for sequence in [made for made in gc.get_objects() if isinstance(made, PersistentKernel)]:
         for clustered in (False, True):
             assert sequence.kernel_by_quads(clustered=clustered)  # as CUDA launches it
     from warp._src.context import user_modules
@@ -415,7 +415,7 @@ def kernels_not_taken():
     taken = {
         (made.header.resolve(), made.declared)
         for made in gc.get_objects()
-        if isinstance(made, RowPass) and made.declared
+        if isinstance(made, StencilKernel) and made.declared
     }
     return [
         f"{path}:{section.line}"

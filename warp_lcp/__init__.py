@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from warp_lcp.default import default_method, solve
 from warp_lcp.default_chain import default_chain
 from warp_lcp.gradients.vjp import Gradients, vjp
+from warp_lcp.kernels.log_filter import install_log_filter
+from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.monitor import plot_convergence, print_progress
 from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -36,8 +38,6 @@ from warp_lcp.problem.solve import Precision, Step, VariationalInequality
 from warp_lcp.problem.spare_workspace import release_workspace
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
-from warp_lcp.rows.kernel_messages import hear_kernels
-from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
@@ -71,9 +71,9 @@ from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
 if TYPE_CHECKING:
     from warp_lcp.frames.read_frame import read_frame
-    from warp_lcp.run.driven import Run
+    from warp_lcp.run.api import Run
 
-hear_kernels()
+install_log_filter()
 
 try:
     __version__ = version("warp-lcp")
@@ -89,7 +89,7 @@ def __getattr__(name: str) -> Any:
     if name == "read_frame":
         return import_module("warp_lcp.frames.read_frame").read_frame
     if name == "Run":
-        return import_module("warp_lcp.run.driven").Run
+        return import_module("warp_lcp.run.api").Run
     if name == "ConvexSetProblem":
         warnings.warn(
             "wl.ConvexSetProblem is now wl.VariationalInequality", DeprecationWarning, stacklevel=2

@@ -28,7 +28,7 @@ class Deadline:
     Args:
         seconds: time limit from now; inf: no limit of its own. A deadline never ends later than
             that of the enclosing solve.
-        across: communicator of a distributed solve, see `warp_lcp.rows.vectors.Across`: time is up
+        across: communicator of a distributed solve, see `warp_lcp.kernels.vectors.Across`: time is up
             on all ranks as soon as it is up on one. None if serial.
     """
 

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Never
 
 from warp_lcp.default_chain import default_chain
+from warp_lcp.kernels.fields import Array
 from warp_lcp.operators.restated import RestatedProblem, renumbered
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
@@ -17,7 +18,6 @@ from warp_lcp.problem.solve import EPS, Solver, VariationalInequality, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, criteria, recommend
-from warp_lcp.rows.fields import Array
 from warp_lcp.rules import Attempt, method_for, steps_allowed
 from warp_lcp.solvers.registry import method_of
 

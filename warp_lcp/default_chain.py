@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from warp_lcp.multigrid.aggregates import suits_multigrid
-from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.banded_matrix import NARROW
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator

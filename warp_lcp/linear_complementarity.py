@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve, solve_by_attempts
+from warp_lcp.kernels.fields import Array, real_array
 from warp_lcp.operators.restated import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
@@ -18,7 +19,6 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
 from warp_lcp.solvers.registry import method_of
 

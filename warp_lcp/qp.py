@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse
 
+from warp_lcp.kernels.fields import real_array
 from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
@@ -27,7 +28,6 @@ from warp_lcp.problem.program_optimality import (
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.reduced.dense_problem import PROVABLE, DenseProblem
-from warp_lcp.rows.fields import real_array
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.quadratic_program import is_convex

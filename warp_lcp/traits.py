@@ -12,7 +12,7 @@ import scipy.linalg
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.curvature import has_negative_curvature

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from warp_lcp.benchmarks.book import appendix_c, contact_scenes, studies
-from warp_lcp.benchmarks.book.problems import Scale
+from warp_lcp.benchmarks.book.problems import ProblemScale
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Results
 from warp_lcp.benchmarks.harness.timing import Options
@@ -18,7 +18,7 @@ TITLE = "The book's experiments"
 
 def measure(options: Options, out: Path) -> Results:
     """Run all experiments."""
-    scale = Scale.of(options)
+    scale = ProblemScale.of(options)
     results = Results([machine(options.device, elements=1 << 22, repeat=options.repeat)], [])
     for part in (appendix_c, studies, contact_scenes):
         part.measure(results, scale, options)

@@ -14,9 +14,15 @@ from typing import Any
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.book.outcome import RTOL, Merit, Outcome, outcome
-from warp_lcp.benchmarks.book.problems import Scale, kinds
-from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, Table
+from warp_lcp.benchmarks.book.outcome import RTOL, BookOutcome, Merit, outcome
+from warp_lcp.benchmarks.book.problems import ProblemScale, kinds
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    Panels,
+    RecordLines,
+    RecordTable,
+    Results,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, splash
 
@@ -64,7 +70,7 @@ NEAR = 1e-9  # relative residual at which the convergence rate is measured
 UNIT = "residual / residual at x = 0"
 
 
-def measure(results: Results, scale: Scale, options: Options) -> None:
+def measure(results: Results, scale: ProblemScale, options: Options) -> None:
     """Run the experiments on random problems."""
     problems = {
         kind: [make(k) for k in range(scale.problems)] for kind, make in kinds(scale).items()
@@ -84,7 +90,7 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
 
 def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
     """Draw figure C.1 and check the solutions that the recipes plant."""
-    rows, panels = list[list[str]](), list[Lines]()
+    rows, panels = list[list[str]](), list[RecordLines]()
     for kind, of_kind in problems.items():
         infeasible, worst, held = 0, 0.0, list[float]()
         for p in of_kind:
@@ -104,7 +110,9 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
             "held": statistics.fmean(held),
         }
         results.records.append(
-            Record(f"planted: {kind}", {name: Figure(value) for name, value in figures.items()})
+            BenchmarkRecord(
+                f"planted: {kind}", {name: Figure(value) for name, value in figures.items()}
+            )
         )
         planted = "none" if of_kind[0].solution is None else f"{infeasible} of {len(of_kind)}"
         rows.append([kind, planted, f"{worst:.2g}", f"{statistics.fmean(held):.1%}"])
@@ -115,7 +123,7 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
                 else of_kind[0].A[:60, :60]
             )
             panels.append(
-                Lines(
+                RecordLines(
                     kind,
                     f"{kind}: {len(i)} entries",
                     "column",
@@ -135,7 +143,7 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
         "most negative y",
         "held in the solution (mean of 10)",
     ]
-    results.tables.append(Table("Planted solutions", columns, rows, remark))
+    results.tables.append(RecordTable("Planted solutions", columns, rows, remark))
     results.charts.append(
         Panels("c1-patterns", "Figure C.1: entries of the first 60 rows and columns", panels, 4)
     )
@@ -143,9 +151,9 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
 
 def _states(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
     """Make tables C.1 and C.2, and figure C.2 from the first problem of each kind."""
-    rows, panels = list[list[str]](), list[Lines]()
+    rows, panels = list[list[str]](), list[RecordLines]()
     for kind, of_kind in problems.items():
-        outcomes = dict[str, Outcome]()
+        outcomes = dict[str, BookOutcome]()
         for method, (solver, merit) in METHODS.items():
             options.say(f"book: {kind}, {method}")
             try:
@@ -170,7 +178,7 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
             curves = {
                 name: _curve(o.traces[0].residuals[: SHOWN + 1]) for name, o in outcomes.items()
             }
-            panels.append(Lines(kind, kind, "iterations", UNIT, curves, log="y"))
+            panels.append(RecordLines(kind, kind, "iterations", UNIT, curves, log="y"))
     remark = (
         "Book's test: states and iterations by Num4LCP's rules (relative 1e-6, absolute 1e-3, at "
         "most 100) on the merit or, for sweeps, "
@@ -193,7 +201,7 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
         "[Book] C.1, C.2",
     ]
     results.tables.append(
-        Table("Tables C.1 and C.2: final states and iterations", columns, rows, remark)
+        RecordTable("Tables C.1 and C.2: final states and iterations", columns, rows, remark)
     )
     results.charts.append(
         Panels(
@@ -204,7 +212,7 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
     )
 
 
-def _rate(of_method: Outcome) -> float:
+def _rate(of_method: BookOutcome) -> float:
     """Return the median factor by which the residual falls in a late step.
 
     The step is the one that takes the residual below NEAR, or the last one.
@@ -227,7 +235,7 @@ def _curve(residuals: Sequence[float]) -> tuple[list[float], list[float]]:
 
 def _kinks(results: Results, problems: dict[str, list[Problem]], options: Options) -> None:
     """Compare derivatives of the Fischer map at a kink, in the book's loop (fig. C.3)."""
-    rows, panels = list[list[str]](), list[Lines]()
+    rows, panels = list[list[str]](), list[RecordLines]()
     for kind, few in problems.items():
         row, curves = [kind], {}
         for kink, solver in KINKS.items():
@@ -237,13 +245,13 @@ def _kinks(results: Results, problems: dict[str, list[Problem]], options: Option
             row.append(found.share)
             curves[kink] = _curve(found.traces[0].residuals[: SHOWN + 1])
         rows.append(row)
-        panels.append(Lines(kind, kind, "iterations", UNIT, curves, log="y"))
+        panels.append(RecordLines(kind, kind, "iterations", UNIT, curves, log="y"))
     remark = (
         f"Problems solved to {RTOL:g} within 100 steps, and the mean of their steps, of the "
         "book's Fischer-Newton."
     )
     results.tables.append(
-        Table("Figure C.3: strategies at kinks", ["problems", *KINKS], rows, remark)
+        RecordTable("Figure C.3: strategies at kinks", ["problems", *KINKS], rows, remark)
     )
     results.charts.append(
         Panels(
@@ -289,15 +297,17 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
         "plain Fischer map."
     )
     panels = [
-        Lines("solved", "solved", "lambda", "%", solved, log=""),
-        Lines("steps", "steps of those", "lambda", "steps", steps, log=""),
+        RecordLines("solved", "solved", "lambda", "%", solved, log=""),
+        RecordLines("steps", "steps of those", "lambda", "steps", steps, log=""),
     ]
     title = "Lambda of the penalized Fischer map"
-    results.tables.append(Table(title, ["problems", "loop", *map(str, SHARES)], rows, remark))
+    results.tables.append(RecordTable(title, ["problems", "loop", *map(str, SHARES)], rows, remark))
     results.charts.append(Panels("lambda", title, panels))
 
 
-def _omega(results: Results, given: dict[str, Problem], scale: Scale, options: Options) -> None:
+def _omega(
+    results: Results, given: dict[str, Problem], scale: ProblemScale, options: Options
+) -> None:
     """Vary the relaxation factor of PSOR (figure C.4)."""
     given = given | {
         f"splash {n}^3, p >= 0": splash(n).named("everywhere", device=options.device)
@@ -316,7 +326,7 @@ def _omega(results: Results, given: dict[str, Problem], scale: Scale, options: O
         figures = {f"sweeps at {omega:g}": Figure(sweeps) for omega, sweeps in done.items()} | {
             "best": Figure(best)
         }
-        results.records.append(Record(f"omega: {label}", figures))
+        results.records.append(BenchmarkRecord(f"omega: {label}", figures))
         rows.append(
             [label, f"{best:g}", *(str(done.get(omega, f"> {SWEEPS}")) for omega in FACTORS)]
         )
@@ -324,6 +334,6 @@ def _omega(results: Results, given: dict[str, Problem], scale: Scale, options: O
     remark = "Matrices are swept row by row, grids red-black."
     title = f"Figure C.4: relaxation factors of PSOR, sweeps to {RTOL:g}"
     results.tables.append(
-        Table(title, ["problem", "best", *(f"{w:g}" for w in FACTORS)], rows, remark)
+        RecordTable(title, ["problem", "best", *(f"{w:g}" for w in FACTORS)], rows, remark)
     )
-    results.charts.append(Lines("c4-omega", title, "omega", "sweeps", curves, log="y"))
+    results.charts.append(RecordLines("c4-omega", title, "omega", "sweeps", curves, log="y"))

@@ -13,8 +13,14 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.benchmarks import contacts
 from warp_lcp.benchmarks.book.appendix_c import UNIT
-from warp_lcp.benchmarks.book.problems import Scale
-from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, Table
+from warp_lcp.benchmarks.book.problems import ProblemScale
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    Panels,
+    RecordLines,
+    RecordTable,
+    Results,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import contact_scenes
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
@@ -45,13 +51,13 @@ ORDERS: dict[str, Callable[[ContactSystem, np.ndarray], Any]] = {
 }
 
 
-def measure(results: Results, scale: Scale, options: Options) -> None:
+def measure(results: Results, scale: ProblemScale, options: Options) -> None:
     """Solve the next step of every scene."""
     rows, panels, order_rows, ordered = (
         list[list[str]](),
-        list[Lines](),
+        list[RecordLines](),
         list[list[str]](),
-        list[Lines](),
+        list[RecordLines](),
     )
     for name in contact_scenes.SCENES:
         assembly = contacts.next_step(name, options.device)
@@ -73,9 +79,9 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
                 figures |= {f"sweeps to {level:g}": Figure(there)} if there is not None else {}
                 cells.append("" if there is None else f"{there:g}")
             cells.append(f"{figures['residual'].value:.1e}")
-            results.records.append(Record(f"scenes: {name}: {method}", figures))
+            results.records.append(BenchmarkRecord(f"scenes: {name}: {method}", figures))
         rows.append(cells)
-        panels.append(Lines(name, system.name, "sweeps", UNIT, curves))
+        panels.append(RecordLines(name, system.name, "sweeps", UNIT, curves))
         if name in ORDERED:
             height = np.concatenate(
                 [np.repeat(assembly.contacts.point[:, 2], 3), np.full(len(system.lower), np.inf)]
@@ -85,13 +91,13 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
                 for label, make in ORDERS.items()
             }
             ordered.append(
-                Lines(name, system.name, "sweeps or rounds", UNIT, residual_curves, log="y")
+                RecordLines(name, system.name, "sweeps or rounds", UNIT, residual_curves, log="y")
             )
             order_rows.append(
                 [name, *(f"{min(r, default=0.0):.1e}" for _, r in residual_curves.values())]
             )
             last = {label: Figure(min(r, default=0.0)) for label, (_, r) in residual_curves.items()}
-            results.records.append(Record(f"orders: {name}", last))
+            results.records.append(BenchmarkRecord(f"orders: {name}", last))
     remark = (
         f"At most {scale.sweeps} sweeps; least: the smallest residual met. Boxed friction, "
         "residuals over that at x = 0."
@@ -102,14 +108,16 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
         *(f"{m} {part}" for m in METHODS for part in (*(f"to {x:g}" for x in LEVELS), "least")),
     ]
     results.tables.append(
-        Table(
+        RecordTable(
             f"Figure 2.3: least residual in {ROUNDS} sweeps or rounds",
             ["scene", *ORDERS],
             order_rows,
         )
     )
     results.tables.append(
-        Table("Figures 2.10 and 2.12: sweeps to residuals on contact scenes", columns, rows, remark)
+        RecordTable(
+            "Figures 2.10 and 2.12: sweeps to residuals on contact scenes", columns, rows, remark
+        )
     )
     results.charts.append(
         Panels("2-3-orders", "Figure 2.3: orders of the unknowns in sweeps", ordered)

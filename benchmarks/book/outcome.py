@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.gallery import Problem
 
@@ -117,7 +117,7 @@ def follow(
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BookOutcome:
     """Solves of one kind of problem by one method, with the book's verdicts."""
 
     name: str  # name of the record
@@ -150,7 +150,7 @@ class Outcome:
             f", {statistics.fmean(self.solved):.2f}" if self.solved else ""
         )
 
-    def record(self) -> Record:
+    def record(self) -> BenchmarkRecord:
         """Return the record of figures."""
         figures: dict[str, float] = {
             "solved": len(self.solved),
@@ -161,7 +161,9 @@ class Outcome:
         figures |= {"steps": statistics.fmean(self.solved)} if self.solved else {}
         figures |= {"iterations": statistics.fmean(self.accepted)} if self.accepted else {}
         facts = {"states": self.states, "statuses": counted(t.status.name for t in self.traces)}
-        return Record(self.name, {name: Figure(value) for name, value in figures.items()}, facts)
+        return BenchmarkRecord(
+            self.name, {name: Figure(value) for name, value in figures.items()}, facts
+        )
 
     def row(self) -> list[str]:
         """Return a table row: the book's verdicts, then problems solved to RTOL.
@@ -188,7 +190,7 @@ def outcome(
     *,
     limits: Limits | None = None,
     starts: Sequence[Any] | None = None,
-) -> Outcome:
+) -> BookOutcome:
     """Solve all problems by a method, from x = 0 or the given starts."""
     limits = limits or Limits()
     given = starts or [None] * len(problems)
@@ -196,7 +198,7 @@ def outcome(
         follow(p, solver, merit, device, most=limits.most, x0=x0)
         for p, x0 in zip(problems, given, strict=True)
     ]
-    return Outcome(name, traces, [t.verdict(merit, limits) for t in traces])
+    return BookOutcome(name, traces, [t.verdict(merit, limits) for t in traces])
 
 
 def counted(words: Iterable[str]) -> str:

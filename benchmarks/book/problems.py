@@ -20,7 +20,7 @@ SMALL = 32  # cells along the longest side; all experiments are small if no grid
 
 
 @dataclass(frozen=True)
-class Scale:
+class ProblemScale:
     """Sizes of the experiments.
 
     Args:
@@ -42,12 +42,12 @@ class Scale:
     sweeps: int
 
     @staticmethod
-    def of(options: Options) -> Scale:
+    def of(options: Options) -> ProblemScale:
         """Return the book's sizes, or small ones if only small grids are requested."""
         grids = options.sizes or (16, 32, 64)
         if max(grids) < SMALL:
-            return Scale(2 * options.repeat, 4, 3, 12, grids, (2, 4), 40)
-        return Scale(20 * options.repeat, 10, 30, 100, grids, (10, 20, 40, 80), 5000)
+            return ProblemScale(2 * options.repeat, 4, 3, 12, grids, (2, 4), 40)
+        return ProblemScale(20 * options.repeat, 10, 30, 100, grids, (10, 20, 40, 80), 5000)
 
 
 def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
@@ -109,7 +109,7 @@ def contact_matrix(contacts: int, rng: np.random.Generator, tangents: int = 4) -
     return A
 
 
-def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
+def dense(rule: str, scale: ProblemScale, number: int, zeros: float = 0.0) -> Problem:
     """Return a dense positive semi-definite problem with zero eigenvalues.
 
     The eigenvalues are 1/n, 2/n, ... 1; the smallest ones, a share `zeros`, are set to 0.
@@ -120,7 +120,7 @@ def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
     return RULES[rule](spectrum_matrix(eigenvalues, rng), rng, f"{rule} {number}")
 
 
-def kinds(scale: Scale) -> dict[str, Callable[[int], Problem]]:
+def kinds(scale: ProblemScale) -> dict[str, Callable[[int], Problem]]:
     """Return functions that make fluid and contact problems from a number, by kind."""
     n = scale.side**3
 

@@ -22,8 +22,14 @@ from warp_lcp.benchmarks.book.appendix_c import (
     Method,
 )
 from warp_lcp.benchmarks.book.outcome import RTOL, Limits, Merit, outcome, spread
-from warp_lcp.benchmarks.book.problems import RULES, SEED, Scale, dense
-from warp_lcp.benchmarks.harness.record import Lines, Panels, Record, Results, Table
+from warp_lcp.benchmarks.book.problems import RULES, SEED, ProblemScale, dense
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    Panels,
+    RecordLines,
+    RecordTable,
+    Results,
+)
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, contact, splash
 
@@ -55,16 +61,16 @@ SEMIDEFINITE: dict[str, Method] = {
 }
 
 
-def measure(results: Results, scale: Scale, options: Options) -> None:
+def measure(results: Results, scale: ProblemScale, options: Options) -> None:
     """Run the three experiments."""
     _cost(results, scale, options)
     _warm(results, scale, options)
     _zeros(results, scale, options)
 
 
-def _cost(results: Results, scale: Scale, options: Options) -> None:
+def _cost(results: Results, scale: ProblemScale, options: Options) -> None:
     """Time solves against the number of unknowns (figure C.5)."""
-    panels = list[Lines]()
+    panels = list[RecordLines]()
     fluids = {
         int((splash(n).cells == wl.FLUID).sum()): splash(n).lcp("everywhere", device=options.device)
         for n in scale.grids
@@ -92,7 +98,7 @@ def _cost(results: Results, scale: Scale, options: Options) -> None:
                 }
                 figures |= {f"seconds to {RTOL:g}": Figure(seconds, "s")} if result else {}
                 results.records.append(
-                    Record(
+                    BenchmarkRecord(
                         f"cost: {what}: {method}: {unknowns}",
                         figures,
                         {"status": result.status.name},
@@ -110,7 +116,7 @@ def _cost(results: Results, scale: Scale, options: Options) -> None:
                 list(sizes),
                 [STEPS * t for t in steps] if unsolved else solves,
             )
-        panels.append(Lines(what, what, "unknowns", "s", curves))
+        panels.append(RecordLines(what, what, "unknowns", "s", curves))
         remark = (
             f"ms to {RTOL:g} and steps, the least of the samples, with a workspace that has solved "
             "before; ms of a step where the limit of "
@@ -119,7 +125,7 @@ def _cost(results: Results, scale: Scale, options: Options) -> None:
         )
         columns = ["method", *(f"{n} unknowns" for n in problems), "exponent", "of a step"]
         results.tables.append(
-            Table(f"Figure C.5: cost against size, {what}", columns, rows, remark)
+            RecordTable(f"Figure C.5: cost against size, {what}", columns, rows, remark)
         )
     results.charts.append(
         Panels("c5-cost", f"Figure C.5: time to {RTOL:g} against unknowns", panels)
@@ -150,9 +156,9 @@ def exponent(sizes: np.ndarray, seconds: Sequence[float], least: int) -> float:
     return float(np.polyfit(np.log(sizes[kept]), np.log(np.array(seconds)[kept]), 1)[0])
 
 
-def _warm(results: Results, scale: Scale, options: Options) -> None:
+def _warm(results: Results, scale: ProblemScale, options: Options) -> None:
     """Count Newton iterations from zero and from ten PGS sweeps (figure C.6)."""
-    rows, panels = list[list[str]](), list[Lines]()
+    rows, panels = list[list[str]](), list[RecordLines]()
     limits = Limits(rtol=1e-6, atol=1e-2, most=30)
     for rule in RULES:
         options.say(f"book: warm starts, {rule}")
@@ -189,7 +195,7 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
                     [float(k) for k in shown],
                     [float(solves.accepted.count(k)) for k in shown],
                 )
-        panels.append(Lines(rule, rule, "iterations", "problems", curves, log=""))
+        panels.append(RecordLines(rule, rule, "iterations", "problems", curves, log=""))
     remark = (
         f"{scale.problems} dense positive definite problems of {scale.dense} unknowns, eigenvalues "
         "evenly spaced in (0, 1]. Iterations to "
@@ -198,7 +204,7 @@ def _warm(results: Results, scale: Scale, options: Options) -> None:
         f"Solved: to {RTOL:g} of the natural residual of the start, within 30 steps."
     )
     columns = ["problems", "method", "start", "book's test", "iterations", "solved, steps"]
-    results.tables.append(Table("Figure C.6: warm starts", columns, rows, remark))
+    results.tables.append(RecordTable("Figure C.6: warm starts", columns, rows, remark))
     results.charts.append(Panels("c6-warm", "Figure C.6: warm starts", panels))
 
 
@@ -216,9 +222,9 @@ def solvable(problem: Problem) -> bool:
     )
 
 
-def _zeros(results: Results, scale: Scale, options: Options) -> None:
+def _zeros(results: Results, scale: ProblemScale, options: Options) -> None:
     """Solve problems with a growing number of zero eigenvalues."""
-    rows, panels = list[list[str]](), list[Lines]()
+    rows, panels = list[list[str]](), list[RecordLines]()
     few, limits = max(2, scale.problems // 10), Limits(rtol=1e-4, atol=1e-2)
     for rule in RULES:
         curves = {name: (list[float](), list[float]()) for name in ("solvable", *SEMIDEFINITE)}
@@ -227,7 +233,7 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
             problems = [dense(rule, scale, k, zeros) for k in range(few)]
             able = sum(map(solvable, problems))
             results.records.append(
-                Record(
+                BenchmarkRecord(
                     f"zeros: {rule}: {zeros:.0%}",
                     {"solvable": Figure(able), "problems": Figure(few)},
                 )
@@ -249,7 +255,7 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
             for name, count in shares.items():
                 curves[name][0].append(100 * zeros)
                 curves[name][1].append(100 * count / few)
-        panels.append(Lines(rule, rule, "zero eigenvalues [%]", "solved [%]", curves, log=""))
+        panels.append(RecordLines(rule, rule, "zero eigenvalues [%]", "solved [%]", curves, log=""))
     remark = (
         f"{few} dense positive semi-definite problems of {scale.dense} unknowns for each share of "
         "zero eigenvalues. Book's test: relative "
@@ -268,7 +274,7 @@ def _zeros(results: Results, scale: Scale, options: Options) -> None:
         "steps",
         "the library says",
     ]
-    results.tables.append(Table("Zero eigenvalues", columns, rows, remark))
+    results.tables.append(RecordTable("Zero eigenvalues", columns, rows, remark))
     results.charts.append(
         Panels("zeros", f"Zero eigenvalues: problems solved to {RTOL:g} in 100 steps", panels)
     )

@@ -23,10 +23,17 @@ from warp_lcp.benchmarks.extremes import (
     shapes,
     simulations,
 )
-from warp_lcp.benchmarks.extremes.case import PRECISIONS, REFUSED, Case, Expected, Verdict, judge
+from warp_lcp.benchmarks.extremes.case import (
+    PRECISIONS,
+    REFUSED,
+    Expected,
+    ExtremeCase,
+    ExtremeVerdict,
+    judge,
+)
 from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results, shown
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 
 ORDINARY = ("CONVERGED", REFUSED, "done")  # statuses that the report does not list by case
@@ -51,7 +58,7 @@ FAMILIES = (
 )
 
 
-def cases(seed: int) -> Iterator[Case]:
+def cases(seed: int) -> Iterator[ExtremeCase]:
     """Yield all cases, family by family.
 
     Args:
@@ -70,7 +77,7 @@ def cases(seed: int) -> Iterator[Case]:
 
 def measure(options: Options, out: Path) -> Results:
     """Run every case in each of its precisions."""
-    verdicts, family = list[Verdict](), ""
+    verdicts, family = list[ExtremeVerdict](), ""
     seed = SystemRandom().choice(FRESH) if options.seed is None else options.seed
     for case in cases(seed):
         if case.family != family:
@@ -94,7 +101,7 @@ def measure(options: Options, out: Path) -> Results:
     return Results(records, [families(family_records), unseen, table(verdicts)], failures=failures)
 
 
-def record(verdict: Verdict) -> Record:
+def record(verdict: ExtremeVerdict) -> BenchmarkRecord:
     """Return the record of a failed case."""
     attempt, case = verdict.attempt, verdict.case
     facts = {
@@ -109,10 +116,10 @@ def record(verdict: Verdict) -> Record:
         "message": attempt.message,
         **attempt.facts,
     }
-    return Record(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts | more)
+    return BenchmarkRecord(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts | more)
 
 
-def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
+def by_family(verdicts: Sequence[ExtremeVerdict]) -> list[BenchmarkRecord]:
     """Return the number of passed cases of each family."""
     records = []
     for family in dict.fromkeys(v.case.family for v in verdicts):
@@ -130,7 +137,7 @@ def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
         seconds = [v.attempt.seconds for v in own]
         figures = {name: Figure(count) for name, count in counts.items()}
         records.append(
-            Record(
+            BenchmarkRecord(
                 family,
                 figures
                 | {"slowest": Figure(max(seconds), "s"), "seconds": Figure(sum(seconds), "s")},
@@ -139,7 +146,7 @@ def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
     return records
 
 
-def families(records: Sequence[Record]) -> Table:
+def families(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return the families' records as a table."""
     rows = []
     for r in records:
@@ -164,7 +171,7 @@ def families(records: Sequence[Record]) -> Table:
         f"{cases:.0f} cases, {attempts:.0f} attempts in {seconds:.0f} s, {wrong:.0f} not as "
         "they must be."
     )
-    return Table(
+    return RecordTable(
         "Families",
         ("family", "cases", "attempts", "expected", "not as they must be", "slowest [s]"),
         rows,
@@ -172,7 +179,7 @@ def families(records: Sequence[Record]) -> Table:
     )
 
 
-def table(verdicts: Sequence[Verdict]) -> Table:
+def table(verdicts: Sequence[ExtremeVerdict]) -> RecordTable:
     """Return a row for each noteworthy case.
 
     A row has status, relative residual and seconds in each precision.
@@ -180,7 +187,7 @@ def table(verdicts: Sequence[Verdict]) -> Table:
     A case is noteworthy if a verdict is wrong, a solve stops before its tolerance, or it takes a
     second or more. Random problems are listed only if a verdict is wrong.
     """
-    by_case = defaultdict[tuple[str, str], list[Verdict]](list)
+    by_case = defaultdict[tuple[str, str], list[ExtremeVerdict]](list)
     for v in (v for v in verdicts if v.wrong or v.case.family not in judging.FAMILIES):
         by_case[v.case.family, v.case.name].append(v)
     rows = []
@@ -200,7 +207,7 @@ def table(verdicts: Sequence[Verdict]) -> Table:
         "residual relative to that of "
         "clip(0, l, u) (computed by NumPy and SciPy from cells and faces), seconds."
     )
-    return Table(
+    return RecordTable(
         "Noteworthy cases",
         ("family", "case", "expected", *PRECISIONS, "as it must be?"),
         rows,

@@ -15,8 +15,8 @@ import numpy as np
 from warp_lcp.benchmarks.extremes.case import (
     BELOW_ROUNDING,
     EITHER,
-    Case,
     Expected,
+    ExtremeCase,
     Promise,
     refusal,
     stopped,
@@ -36,7 +36,7 @@ def but(at: tuple[int, int], value: float, b: np.ndarray) -> np.ndarray:
     return changed
 
 
-def scales() -> Iterator[Case]:
+def scales() -> Iterator[ExtremeCase]:
     """Yield right-hand sides from 0 to 1e30, and spikes."""
     case = partial(given_pool, "scales of b")
     yield from case("b = 0", b=np.zeros(SHAPE))
@@ -64,7 +64,7 @@ def scales() -> Iterator[Case]:
 
 def given_pool(
     family: str, name: str, more: dict[str, Any] | None = None, **fields: Any
-) -> Iterator[Case]:
+) -> Iterator[ExtremeCase]:
     """Yield a pool with these fields for both methods.
 
     `more` holds arguments of SolveCase.
@@ -72,7 +72,7 @@ def given_pool(
     return given(family, name, partial(pool, SHAPE, **fields), **(more or {}))
 
 
-def degenerate() -> Iterator[Case]:
+def degenerate() -> Iterator[ExtremeCase]:
     """Yield degenerate solutions, and active sets of all or no unknowns.
 
     A degenerate solution has x_i = l_i and y_i = 0 on many cells.
@@ -129,7 +129,7 @@ def ceiling() -> GridProblem:
     return GridProblem(cells=cells, b=b, lower=np.where(np.indices(SHAPE)[0] >= 38, 0.0, -np.inf))
 
 
-def tolerances() -> Iterator[Case]:
+def tolerances() -> Iterator[ExtremeCase]:
     """Yield tolerances below rounding.
 
     The solve must end as FLOOR, not as CONVERGED, and must not loop for ever.

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.extremes.case import Case, Expected, Promise, SolveCase
+from warp_lcp.benchmarks.extremes.case import Expected, ExtremeCase, Promise, SolveCase
 from warp_lcp.benchmarks.extremes.shapes import grounded, pool
 
 CAUGHT = Promise(Expected.CAUGHT)
@@ -92,7 +92,7 @@ SOLVERS: dict[str, Callable[..., wl.SolveResult]] = {
 }
 
 
-def wrong_solvers() -> Iterator[Case]:
+def wrong_solvers() -> Iterator[ExtremeCase]:
     """Yield each wrong solver on two ordinary problems."""
     for name, solve in SOLVERS.items():
         for dimensions, make, method in RIGHT:

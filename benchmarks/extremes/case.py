@@ -77,7 +77,7 @@ def refusal(names: str) -> Promise:
 
 
 @dataclass
-class Attempt:
+class ExtremeAttempt:
     """Actual outcome of a case."""
 
     status: str  # status of the result, `refused`, or the message of a simulation
@@ -107,7 +107,7 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class Case(ABC):
+class ExtremeCase(ABC):
     """Base class of cases; subclasses implement `tried`."""
 
     family: str  # the cases that share an expectation
@@ -123,7 +123,7 @@ class Case(ABC):
         """Return the expected outcome in a precision."""
         return self.promises.get(precision, self.expected)
 
-    def attempt(self, precision: str, device: str) -> Attempt:
+    def attempt(self, precision: str, device: str) -> ExtremeAttempt:
         """Run the case and turn exceptions into outcomes.
 
         A ValueError is a refusal. Other errors give a status with their names.
@@ -135,14 +135,14 @@ class Case(ABC):
             return attempt
         except (ValueError, *BROKEN) as error:
             broken = isinstance(error, BROKEN)
-            return Attempt(
+            return ExtremeAttempt(
                 type(error).__name__ if broken else REFUSED,
                 seconds=time.perf_counter() - start_time,
                 message=str(error),
             )
 
     @abstractmethod
-    def tried(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Run the case and return its outcome."""
 
 
@@ -170,7 +170,7 @@ def interrupted_after(seconds: float) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class SolveCase(Case):
+class SolveCase(ExtremeCase):
     """Problem solved by a method and its fallbacks.
 
     It runs in all precisions of the method, or in "double" if the method has no such setting.
@@ -192,7 +192,7 @@ class SolveCase(Case):
         fields = {field.name for field in dataclasses.fields(wl.METHODS[self.method])}
         object.__setattr__(self, "precisions", PRECISIONS if "precision" in fields else ("double",))
 
-    def tried(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Solve and compare the reported with the independent residual."""
         criteria: dict[str, Any] = {
             "rtol": RTOL[precision],
@@ -215,11 +215,11 @@ def checked(
     criteria: Mapping[str, Any],
     seconds: float,
     precision: str,
-) -> Attempt:
+) -> ExtremeAttempt:
     """Return the attempt of a result, with all faults that NumPy finds."""
     exact, x = problem.exact(), problem.unknowns(result.x.numpy())
     if not np.isfinite(x).all():
-        return Attempt(result.status.name, None, seconds, faults=["x is not finite"])
+        return ExtremeAttempt(result.status.name, None, seconds, faults=["x is not finite"])
     own, reference, sizes, single = (
         exact.residual(x),
         exact.residual(exact.start),
@@ -253,7 +253,7 @@ def checked(
         faults.append(f"x is {beyond.max():.1e} outside its bounds")
     if not result and own < 0.99 * required - rounding:
         faults.append(f"{result.status.name} at a solution")
-    return Attempt(
+    return ExtremeAttempt(
         result.status.name,
         own / reference if reference > 0 else own,
         seconds,
@@ -263,7 +263,7 @@ def checked(
 
 
 @dataclass(frozen=True)
-class RefusalCase(Case):
+class RefusalCase(ExtremeCase):
     """Call that must raise ValueError before any solve."""
 
     call: Callable[[str, str], object]  # takes device and precision
@@ -273,20 +273,20 @@ class RefusalCase(Case):
         """Return the promise of a refusal."""
         return refusal(self.names)
 
-    def tried(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Make the call."""
         made = self.call(device, precision)
-        return Attempt(made.status.name if isinstance(made, wl.SolveResult) else "accepted")
+        return ExtremeAttempt(made.status.name if isinstance(made, wl.SolveResult) else "accepted")
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ExtremeVerdict:
     """One case in one precision: expected and actual outcome, and faults."""
 
-    case: Case
+    case: ExtremeCase
     precision: str
     promise: Promise
-    attempt: Attempt
+    attempt: ExtremeAttempt
     wrong: Sequence[str]
 
     @property
@@ -300,7 +300,7 @@ class Verdict:
         return "as expected" if not self.wrong else "; ".join(self.wrong)
 
 
-def judge(case: Case, precision: str, device: str) -> Verdict:
+def judge(case: ExtremeCase, precision: str, device: str) -> ExtremeVerdict:
     """Run a case and return its verdict.
 
     A case over its budget runs again, since the first run may compile kernels.
@@ -311,10 +311,10 @@ def judge(case: Case, precision: str, device: str) -> Verdict:
     wrong = violations(promise, attempt)
     if attempt.spent > case.budget:
         wrong.append(f"{attempt.spent:.1f} s, its budget is {case.budget:g} s")
-    return Verdict(case, precision, promise, attempt, wrong)
+    return ExtremeVerdict(case, precision, promise, attempt, wrong)
 
 
-def in_time(case: Case, precision: str, device: str) -> Attempt:
+def in_time(case: ExtremeCase, precision: str, device: str) -> ExtremeAttempt:
     """Run a case; interrupt it far beyond its budget."""
     start_time, processor = time.perf_counter(), time.process_time()
     try:
@@ -324,10 +324,10 @@ def in_time(case: Case, precision: str, device: str) -> Attempt:
             attempt.processor = time.process_time() - processor
         return attempt
     except OverBudgetError:
-        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - start_time)
+        return ExtremeAttempt(OUT_OF_TIME, seconds=time.perf_counter() - start_time)
 
 
-def violations(promise: Promise, attempt: Attempt) -> list[str]:
+def violations(promise: Promise, attempt: ExtremeAttempt) -> list[str]:
     """Return the faults of an attempt for a promise."""
     wrong, status, expected = list(attempt.faults), attempt.status, promise.expected
     if expected is Expected.CAUGHT:

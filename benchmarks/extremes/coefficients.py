@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.extremes.case import EITHER, SOLVED, Case
+from warp_lcp.benchmarks.extremes.case import EITHER, SOLVED, ExtremeCase
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of
 from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full, given, noise, pool
 
@@ -31,7 +31,7 @@ def may_stop(value: float, largest: float) -> dict[str, Any]:
     return {"promises": SINGLE_MAY_STOP if value <= largest else MIXED_MAY_STOP, "stopping": ROUGH}
 
 
-def slivers() -> Iterator[Case]:
+def slivers() -> Iterator[ExtremeCase]:
     """Yield cut cells whose open fractions go down to 1e-12 and below."""
     case = partial(given, "cut fractions", promises=SINGLE_MAY_STOP)
     for shape in SHAPES:
@@ -108,7 +108,7 @@ def ghost_fluid(theta: float) -> GridProblem:
     return pool((40, 44), faces=faces)
 
 
-def contrasts() -> Iterator[Case]:
+def contrasts() -> Iterator[ExtremeCase]:
     """Yield coefficients of 12 decades, density ratios of 10^8 and very flat cells.
 
     The cells are up to a thousand times flatter than wide.
@@ -169,7 +169,7 @@ def decades_of(shape: tuple[int, ...], decades: int) -> GridProblem:
     )
 
 
-def bodies() -> Iterator[Case]:
+def bodies() -> Iterator[ExtremeCase]:
     """Yield rigid bodies in the liquid, as a term U W U'.
 
     Their masses are 10^-8 to 10^8 of the liquid's.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, SOLVED, Case
+from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, SOLVED, ExtremeCase
 from warp_lcp.benchmarks.extremes.problem import MatrixProblem
 from warp_lcp.benchmarks.extremes.shapes import chance, given
 from warp_lcp.gallery.matrices import semidefinite, skewed, spectrum_matrix
@@ -23,7 +23,7 @@ NEWTON, LEMKE, PIVOTING = ("minimum-map-newton",), ("lemke",), ("incremental-piv
 MAY_STOP = {"single": EITHER}
 
 
-def singular() -> Iterator[Case]:
+def singular() -> Iterator[ExtremeCase]:
     """Yield singular symmetric positive semi-definite matrices, and tiny matrices."""
     case = partial(given, "zero eigenvalues")
     for rank in (1, N // 2, N - 1):
@@ -103,7 +103,7 @@ def nearly(small: float) -> MatrixProblem:
     return MatrixProblem(matrix=A, b=np.where(x == 0, 0.5, 0.0) - A @ x)
 
 
-def cycling() -> Iterator[Case]:
+def cycling() -> Iterator[ExtremeCase]:
     """Yield P-matrices on which Newton's method cycles or pivoting takes 2^n steps.
 
     The Newton method is that of the minimum map.

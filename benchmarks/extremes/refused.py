@@ -14,13 +14,13 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.extremes.case import Case, RefusalCase
+from warp_lcp.benchmarks.extremes.case import ExtremeCase, RefusalCase
 
 SHAPE = (4, 5)
 CELLS = np.array([[1] * 5] * 3 + [[0] * 5])
 
 
-def wrong_arguments() -> Iterator[Case]:
+def wrong_arguments() -> Iterator[ExtremeCase]:
     """Yield every argument with a value that no method can use."""
     for bad in (np.nan, np.inf, -np.inf):
         for name, call in NOT_FINITE.items():

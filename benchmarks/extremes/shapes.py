@@ -13,7 +13,7 @@ from warp_lcp.benchmarks.extremes.case import (
     EITHER,
     INFEASIBLE,
     SOLVED,
-    Case,
+    ExtremeCase,
     RefusalCase,
     SolveCase,
 )
@@ -27,7 +27,7 @@ LARGE_BUDGET = 60.0  # seconds for 10^6 unknowns
 
 def given(
     family: str, name: str, make: Callable[[], Any], methods: tuple[str, ...] = METHODS, **more: Any
-) -> Iterator[Case]:
+) -> Iterator[ExtremeCase]:
     """Yield the case for each method.
 
     `more` holds arguments of SolveCase. Its entry `but` maps a method to another expected outcome.
@@ -72,7 +72,7 @@ def grounded(shape: tuple[int, ...]) -> GridProblem:
     return full(shape, b=noise(shape) if np.prod(shape) > 1 else np.full(shape, -1.5), shift=shift)
 
 
-def sizes() -> Iterator[Case]:
+def sizes() -> Iterator[ExtremeCase]:
     """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
     case = partial(given, "sizes")
     for shape in (
@@ -116,7 +116,7 @@ def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
     return solvable(GridProblem(cells=cells, b=draw.standard_normal(shape)))
 
 
-def masks() -> Iterator[Case]:
+def masks() -> Iterator[ExtremeCase]:
     """Yield grids of few or no unknowns, checkerboards, needles and walls of one cell."""
     case = partial(given, "masks")
     for name, kind in (("solid", SOLID), ("air", AIR)):
@@ -214,7 +214,7 @@ def punctured(shape: tuple[int, ...]) -> GridProblem:
     return GridProblem(cells=cells, b=noise(shape), lower=-np.inf)
 
 
-def closed_pools() -> Iterator[Case]:
+def closed_pools() -> Iterator[ExtremeCase]:
     """Yield closed pools of liquid.
 
     b of sum 0 is solvable; other b only if a bound separates.

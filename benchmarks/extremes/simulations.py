@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.extremes.case import PRECISIONS, Attempt, Case, Expected, Promise, stopped
+from warp_lcp.benchmarks.extremes.case import (
+    PRECISIONS,
+    Expected,
+    ExtremeAttempt,
+    ExtremeCase,
+    Promise,
+    stopped,
+)
 from warp_lcp.benchmarks.extremes.problem import GridProblem
 from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidSimulation
@@ -39,7 +46,7 @@ def ended_with(names: str) -> Promise:
 
 
 @dataclass(frozen=True)
-class RunCase(Case):
+class RunCase(ExtremeCase):
     """Simulation of a few steps."""
 
     # Makes the simulation for a precision and a device.
@@ -55,7 +62,7 @@ class RunCase(Case):
     expected: Promise = DONE
     budget: float = BUDGET
 
-    def tried(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Make the simulation and take its steps."""
         simulation = self.make(precision, device)
         self.prepare(simulation)
@@ -74,7 +81,7 @@ class RunCase(Case):
                 str(error),
             )
         wp.synchronize_device(device)
-        attempt = Attempt(status, None, time.perf_counter() - start_time, message)
+        attempt = ExtremeAttempt(status, None, time.perf_counter() - start_time, message)
         if status == "done":
             attempt.faults += [
                 *lost(simulation, before, leaves=self.leaves),
@@ -139,7 +146,7 @@ def independent(
 
 
 @dataclass(frozen=True)
-class Material:
+class ExtremeMaterial:
     """Column of material that all scenes start from; sand's solver has one precision."""
 
     name: str
@@ -147,7 +154,10 @@ class Material:
     precisions: tuple[str, ...]
 
 
-liquid, sand = Material("liquid", FLUIDS, PRECISIONS), Material("sand", GRANULAR, ("single",))
+liquid, sand = (
+    ExtremeMaterial("liquid", FLUIDS, PRECISIONS),
+    ExtremeMaterial("sand", GRANULAR, ("single",)),
+)
 
 
 def box(low: Sequence[float], high: Sequence[float], **more: Any) -> dict[str, Any]:
@@ -155,7 +165,7 @@ def box(low: Sequence[float], high: Sequence[float], **more: Any) -> dict[str, A
     return {"shape": "box", "min": low, "max": high, **more}
 
 
-def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulation]:
+def made(kind: ExtremeMaterial, **tables: Any) -> Callable[[str, str], ParticleSimulation]:
     """Return a function that makes a small column.
 
     The scene's tables may be overridden. `velocity` is that of the column.
@@ -186,7 +196,7 @@ def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulati
     return make
 
 
-def steps_and_forces() -> Iterator[Case]:
+def steps_and_forces() -> Iterator[ExtremeCase]:
     """Yield extreme time steps, CFL numbers, gravity and speeds.
 
     Time steps are from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from 0 to 1e6 m/s^2,
@@ -196,7 +206,7 @@ def steps_and_forces() -> Iterator[Case]:
 
         def case(
             name: str,
-            kind: Material = kind,
+            kind: ExtremeMaterial = kind,
             *,
             tables: Mapping[str, Any] | None = None,
             **more: Any,
@@ -252,7 +262,7 @@ def gravity(*components: float) -> dict[str, Any]:
     return {"physics": {"gravity": list(components)}}
 
 
-def solids_and_depth() -> Iterator[Case]:
+def solids_and_depth() -> Iterator[ExtremeCase]:
     """Yield 3-D liquid, rigid bodies of extreme density, and fast solids.
 
     Density ratios are 10^-8 to 10^8. Some solids move too fast, and some press liquid between them.
@@ -310,7 +320,7 @@ def all_but_at_rest(simulation: ParticleSimulation) -> list[str]:
     return at_rest(simulation, 0.1 * simulation.grid.spacing)
 
 
-def particles_anywhere() -> Iterator[Case]:
+def particles_anywhere() -> Iterator[ExtremeCase]:
     """Yield particles on nodes, on walls, outside, in one cell, and with NaN."""
     for kind in (liquid, sand):
         name, case = (

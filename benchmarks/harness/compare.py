@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
+from warp_lcp.benchmarks.harness.record import MACHINE, BenchmarkRecord, read_json
 from warp_lcp.benchmarks.harness.timing import Figure
 
 ALLOWED = 0.25  # share of a ratio to a peer that may be lost
@@ -30,7 +30,7 @@ def bounds(old: Figure, new: Figure) -> tuple[float, float]:
 
 
 def losses(
-    old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED
+    old: Mapping[str, BenchmarkRecord], new: Mapping[str, BenchmarkRecord], allowed: float = ALLOWED
 ) -> list[str]:
     """Return a line for each ratio to a peer that fell by more than `allowed`.
 
@@ -90,7 +90,7 @@ def comparison(old: Path, new: Path) -> str:
     return "\n".join(lines)
 
 
-def _hardware(records: Mapping[str, Record]) -> str:
+def _hardware(records: Mapping[str, BenchmarkRecord]) -> str:
     """Return processor and device of a result."""
     hardware = records[MACHINE].facts.get("hardware", {}) if MACHINE in records else {}
     return ", ".join(str(hardware[part]) for part in ("cpu", "device") if part in hardware)

@@ -18,7 +18,7 @@ import warp as wp
 
 import warp_lcp
 from warp_lcp import fluids, granular
-from warp_lcp.benchmarks.harness.record import MACHINE, SOURCE, Record
+from warp_lcp.benchmarks.harness.record import MACHINE, SOURCE, BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, in_turns
 from warp_lcp.run.devices import versions
 
@@ -27,7 +27,7 @@ STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 COPIED = 1 << 26  # float32 elements of the arrays that are copied: 256 MiB, beyond any cache
 
 
-def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
+def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> BenchmarkRecord:
     """Return the record of the machine, with its measured copy bandwidth.
 
     Bytes read and bytes written both count.
@@ -46,7 +46,7 @@ def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
         SOURCE: source_digest(),
         "peers": {name: _version(name) for name in PEERS},
     }
-    return Record(MACHINE, copy_bandwidth(device, elements, repeat), facts)
+    return BenchmarkRecord(MACHINE, copy_bandwidth(device, elements, repeat), facts)
 
 
 def copy_bandwidth(device: str, elements: int, repeat: int) -> dict[str, Figure]:

@@ -15,7 +15,7 @@ MACHINE = "machine"  # name of the record of the machine and the date
 
 
 @dataclass(frozen=True)
-class Record:
+class BenchmarkRecord:
     """Figures of one measured thing."""
 
     name: str  # unique in its file and stable across versions, so that results can be compared
@@ -29,7 +29,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Table:
+class RecordTable:
     """Table of a report: `rows` of cells under `columns`."""
 
     title: str
@@ -51,7 +51,7 @@ class Bars:
 
 
 @dataclass(frozen=True)
-class Lines:
+class RecordLines:
     """Curves over x and y.
 
     Axes in `log` are logarithmic; curves in `marked` are drawn as points.
@@ -68,33 +68,33 @@ class Lines:
 
 @dataclass(frozen=True)
 class Panels:
-    """Several `Lines` in one picture, `columns` side by side.
+    """Several `RecordLines` in one picture, `columns` side by side.
 
     Curves of one name have one color and one entry in the legend.
     """
 
     name: str
     title: str
-    panels: Sequence[Lines]
+    panels: Sequence[RecordLines]
     columns: int = 2
 
 
-Chart = Bars | Lines | Panels
+Chart = Bars | RecordLines | Panels
 
 
 @dataclass(frozen=True)
 class Results:
     """All results of a suite."""
 
-    records: list[Record]  # records of the file
-    tables: list[Table]  # tables of the report
+    records: list[BenchmarkRecord]  # records of the file
+    tables: list[RecordTable]  # tables of the report
     charts: list[Chart] = field(default_factory=list)  # charts to draw
     # Failed checks, a line each; the suite then ends with an error.
     failures: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class Target:
+class RecordTarget:
     """Target: `figure` must be at most or at least the limit; None if not measured."""
 
     what: str
@@ -121,15 +121,15 @@ class Target:
         return [self.what, goal, measured, "yes" if self.met else "no"]
 
 
-def table_of_targets(what: str, targets: Sequence[Target], remark: str = "") -> Table:
+def table_of_targets(what: str, targets: Sequence[RecordTarget], remark: str = "") -> RecordTable:
     """Return the table of targets."""
-    return Table(
+    return RecordTable(
         "Figures to reach", [what, "target", "measured", "met?"], [t.row() for t in targets], remark
     )
 
 
 def shown(
-    record: Record, figures: Sequence[str], digits: str = ".3g", factor: float = 1.0
+    record: BenchmarkRecord, figures: Sequence[str], digits: str = ".3g", factor: float = 1.0
 ) -> list[str]:
     """Return the values of figures as a table shows them; empty if missing."""
     return [
@@ -142,7 +142,7 @@ def spread(figure: Figure, factor: float = 1.0, digits: str = ".1f") -> str:
     return f"{factor * (figure.low or 0):{digits}} to {factor * (figure.high or 0):{digits}}"
 
 
-def write_json(path: Path, records: Sequence[Record]) -> None:
+def write_json(path: Path, records: Sequence[BenchmarkRecord]) -> None:
     """Write records as a JSON list, one per line."""
     kept = [
         {"name": r.name, "figures": {k: f.as_dict() for k, f in r.figures.items()}, **r.facts}
@@ -151,7 +151,7 @@ def write_json(path: Path, records: Sequence[Record]) -> None:
     path.write_text("[\n" + ",\n".join(map(json.dumps, kept)) + "\n]\n", encoding="utf-8")
 
 
-def read_json(path: Path) -> dict[str, Record]:
+def read_json(path: Path) -> dict[str, BenchmarkRecord]:
     """Return the records of a file by name.
 
     Raises:
@@ -161,7 +161,7 @@ def read_json(path: Path) -> dict[str, Record]:
         kept = json.loads(path.read_text(encoding="utf-8"))
         figures = [{k: Figure.from_dict(f) for k, f in r.pop("figures").items()} for r in kept]
         return {
-            name: Record(name, own, r)
+            name: BenchmarkRecord(name, own, r)
             for r, own in zip(kept, figures, strict=True)
             if (name := r.pop("name"))
         }

@@ -14,12 +14,12 @@ from warp_lcp.benchmarks.harness.machine import present
 from warp_lcp.benchmarks.harness.record import (
     MACHINE,
     Bars,
+    BenchmarkRecord,
     Chart,
-    Lines,
     Panels,
-    Record,
+    RecordLines,
+    RecordTable,
     Results,
-    Table,
     write_json,
 )
 
@@ -48,7 +48,11 @@ def write(name: str, title: str, results: Results, out: Path) -> list[str]:
 
 
 def write_markdown(
-    path: Path, title: str, machine: Record, tables: Sequence[Table], images: Sequence[Path]
+    path: Path,
+    title: str,
+    machine: BenchmarkRecord,
+    tables: Sequence[RecordTable],
+    images: Sequence[Path],
 ) -> None:
     """Write a report."""
     lines = [
@@ -63,7 +67,7 @@ def write_markdown(
     path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
-def markdown(table: Table) -> list[str]:
+def markdown(table: RecordTable) -> list[str]:
     """Return the lines of a table below its title."""
     head = [table.remark, ""] if table.remark else []
     return [*head, _row(table.columns), _row(["---"] * len(table.columns)), *map(_row, table.rows)]
@@ -154,7 +158,7 @@ def _panels(canvas: Any, chart: Panels) -> None:
         )
 
 
-def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
+def _lines(axes: Axes, chart: RecordLines, names: Sequence[str] = ()) -> None:
     """Draw the curves, in the colors of their places among `names`."""
     for number, (label, (x, y)) in enumerate(chart.curves.items()):
         place = names.index(label) if names else number

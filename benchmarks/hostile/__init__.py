@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from warp_lcp.benchmarks.hostile import grids, matrices, programs
-from warp_lcp.benchmarks.hostile.case import Answer, Case
+from warp_lcp.benchmarks.hostile.case import HostileAnswer, HostileCase
 from warp_lcp.benchmarks.hostile.judge import Verdicts, judge
 
-KINDS: dict[str, Callable[[np.random.Generator], Case]] = {
+KINDS: dict[str, Callable[[np.random.Generator], HostileCase]] = {
     "rows": matrices.rows,
     "infinity": programs.infinity,
     "program": programs.programs,
@@ -30,12 +30,12 @@ KINDS: dict[str, Callable[[np.random.Generator], Case]] = {
 }
 
 
-def draw_case(kind: str, seed: int, index: int) -> Case:
+def draw_case(kind: str, seed: int, index: int) -> HostileCase:
     """Return a case of a kind; equal arguments give equal cases."""
     return KINDS[kind](np.random.default_rng([seed, list(KINDS).index(kind), index]))
 
 
-def attempt(case: Case) -> Answer:
+def attempt(case: HostileCase) -> HostileAnswer:
     """Solve a case and turn exceptions into answers.
 
     A ValueError is a refusal. LinAlgError, which derives from it, is not.
@@ -53,14 +53,14 @@ def attempt(case: Case) -> Answer:
             else ""
         )
         refused = isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
-        return Answer(
+        return HostileAnswer(
             "REFUSED" if refused else "EXCEPTION",
             None,
             f"{type(error).__name__}: {str(error)[:150]}{where}",
         )
 
 
-def examine(case: Case) -> tuple[Answer, Verdicts]:
+def examine(case: HostileCase) -> tuple[HostileAnswer, Verdicts]:
     """Solve a case and judge its answer."""
     answer = attempt(case)
     return answer, judge(case, answer)

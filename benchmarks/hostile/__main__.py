@@ -29,7 +29,7 @@ COLUMNS = ("solves", "converged", "infeasible right", "honest", "other method", 
 
 
 @dataclass(frozen=True)
-class Outcome:
+class HostileOutcome:
     """Outcome of one case: pairs of category and reason, CPU seconds of its solve."""
 
     kind: str
@@ -64,7 +64,7 @@ def main() -> None:
         return _work(
             arguments.kinds[0], arguments.seed, range(arguments.index, arguments.index + 1)
         )
-    outcomes: list[Outcome] = []
+    outcomes: list[HostileOutcome] = []
     for kind in arguments.kinds or KINDS:
         start = time.perf_counter()
         outcomes += supervise(kind, arguments.seed, arguments.count)
@@ -121,7 +121,7 @@ def _write(record: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
+def supervise(kind: str, seed: int, count: int) -> list[HostileOutcome]:
     """Run workers until all cases of a kind have an outcome."""
     environment = {
         "WARP_LCP_THREADS": "1",
@@ -129,7 +129,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
         "OPENBLAS_NUM_THREADS": "1",
         **os.environ,
     }
-    outcomes: list[Outcome] = []
+    outcomes: list[HostileOutcome] = []
     while len(outcomes) < count:
         first = len(outcomes)
         command = [
@@ -163,7 +163,9 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                     running_case = record["name"]
                     continue
                 outcomes.append(
-                    Outcome(kind, record["end"], record["name"], _late(record), record["seconds"])
+                    HostileOutcome(
+                        kind, record["end"], record["name"], _late(record), record["seconds"]
+                    )
                 )
                 _tell(outcomes[-1], seed)
             messages.seek(0)
@@ -178,7 +180,7 @@ def supervise(kind: str, seed: int, count: int) -> list[Outcome]:
                 else f"exit {worker.returncode}: {error_output.strip()[-150:]}"
             )
             outcomes.append(
-                Outcome(
+                HostileOutcome(
                     kind,
                     len(outcomes),
                     running_case,
@@ -199,12 +201,14 @@ def _late(record: dict[str, Any]) -> list[list[str]]:
     return [*record["verdicts"], *late]
 
 
-def _tell(outcome: Outcome, seed: int) -> None:
+def _tell(outcome: HostileOutcome, seed: int) -> None:
     for line in fault_lines([outcome], seed, FAULTS):
         _say(line)
 
 
-def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...]) -> list[str]:
+def fault_lines(
+    outcomes: list[HostileOutcome], seed: int, categories: tuple[str, ...]
+) -> list[str]:
     """Return a line for each verdict of the categories, with the command to repeat it."""
     return [
         f"{category}: --kinds {o.kind} --seed {seed} --index {o.index}: {o.name} ({o.seconds:.1f} "
@@ -215,7 +219,7 @@ def fault_lines(outcomes: list[Outcome], seed: int, categories: tuple[str, ...])
     ]
 
 
-def report(outcomes: list[Outcome], seed: int) -> str:
+def report(outcomes: list[HostileOutcome], seed: int) -> str:
     """Return a page: a row for each kind, then the faults and remarks."""
     kinds = list(dict.fromkeys(o.kind for o in outcomes))
     lines = [

@@ -31,7 +31,7 @@ GRID_METHODS = ("projected-multigrid", "minimum-map-newton", "mprgp", "psor", "i
 
 
 @dataclass(frozen=True)
-class Answer:
+class HostileAnswer:
     """Result of a solve, on the host.
 
     Args:
@@ -48,7 +48,7 @@ class Answer:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
+class HostileBox:
     """Problem y = A x + b, l <= x <= u as plain arrays, with its known facts.
 
     Args:
@@ -89,7 +89,7 @@ class Box:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Program:
+class HostileProgram:
     """Quadratic program for qpsolvers, and a well-scaled form with the same x.
 
     Args:
@@ -124,7 +124,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Case:
+class HostileCase:
     """One solve, with the truth about its answer.
 
     Args:
@@ -135,15 +135,15 @@ class Case:
     """
 
     name: str
-    solve: Callable[[], Answer]
-    truth: Box | Program | Values | Refusal
+    solve: Callable[[], HostileAnswer]
+    truth: HostileBox | HostileProgram | Values | Refusal
     method: str | None = None
 
 
 def box_case(
     rng: np.random.Generator,
     name: str,
-    box: Box,
+    box: HostileBox,
     *,
     operator: Callable[[], Any] | None = None,
     shape: tuple[int, ...] | None = None,
@@ -153,7 +153,7 @@ def box_case(
     bounds: tuple[Any, Any] | None = None,
     entries: bool = True,
     x0: np.ndarray | None = None,
-) -> Case:
+) -> HostileCase:
     """Return a case that solves a box problem.
 
     The case solves it by the default method, a named method or another entry point.
@@ -185,14 +185,16 @@ def box_case(
         full[unknowns] = values
         return full.reshape(shape)
 
-    def solve() -> Answer:
+    def solve() -> HostileAnswer:
         A = box.A if operator is None else operator()
         low, high = (box.lower, box.upper) if bounds is None else bounds
         if entry == "linear_complementarity":
             found = wl.linear_complementarity(
                 A, box.b, bounds=(low, high), tol=box.rtol, method=method
             )
-            return Answer(found.result.status.name, np.asarray(found.x).ravel(), found.message)
+            return HostileAnswer(
+                found.result.status.name, np.asarray(found.x).ravel(), found.message
+            )
         if entry == "command line":
             return command_line(A, box.b, low, high, box.rtol, method)
         problem = wl.LCP(A, field_of(box.b), field_of(low), field_of(high))
@@ -203,17 +205,17 @@ def box_case(
         )
         x = result.x.numpy().astype(np.float64).ravel()
         note = f"{result.iterations} steps, relative residual {result.relative_residual:.1e}"
-        return Answer(result.status.name, x if unknowns is None else x[unknowns], note)
+        return HostileAnswer(result.status.name, x if unknowns is None else x[unknowns], note)
 
     via = "" if entry == "solve" else f", by {entry}"
-    return Case(
+    return HostileCase(
         f"{name}, n={len(box.b)}, rtol {box.rtol:g}, {method or 'default'}{via}", solve, box, method
     )
 
 
 def command_line(
     A: Any, b: np.ndarray, lower: Any, upper: Any, rtol: float, method: str | None
-) -> Answer:
+) -> HostileAnswer:
     """Solve by `warp-lcp solve` from Matrix Market files."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -254,17 +256,17 @@ def command_line(
         )
         output = f"{run.stdout}\n{run.stderr}".strip()
         if run.returncode == 0 and (folder / "x.mtx").exists():
-            return Answer(
+            return HostileAnswer(
                 CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), output[-200:]
             )
         if run.returncode == 2:
-            return Answer(REFUSED, None, output[-200:])
+            return HostileAnswer(REFUSED, None, output[-200:])
         if run.returncode != 1 or "Traceback" in output:
-            return Answer(EXCEPTION, None, f"exit code {run.returncode}: {output[-200:]}")
+            return HostileAnswer(EXCEPTION, None, f"exit code {run.returncode}: {output[-200:]}")
         status = next(
             (s.name for s in wl.SolveStatus if s.name in output and s.name != CONVERGED), "FAILED"
         )
-        return Answer(status, None, output[-200:])
+        return HostileAnswer(status, None, output[-200:])
 
 
 def _environment() -> dict[str, str]:

@@ -13,7 +13,14 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.hostile import draw
-from warp_lcp.benchmarks.hostile.case import GRID_METHODS, Answer, Box, Case, Values, box_case
+from warp_lcp.benchmarks.hostile.case import (
+    GRID_METHODS,
+    HostileAnswer,
+    HostileBox,
+    HostileCase,
+    Values,
+    box_case,
+)
 
 Rng = np.random.Generator
 
@@ -59,7 +66,7 @@ def _coefficients(
     return a
 
 
-def solid(rng: Rng) -> Case:
+def solid(rng: Rng) -> HostileCase:
     """Draw a stencil with arrays beside SOLID, AIR and outer sides.
 
     The case compares its parts, or solves with it.
@@ -113,7 +120,7 @@ def solid(rng: Rng) -> Case:
             "boundary term": draw.boundary_term(cells, a, border, periodic, outside).ravel()[F],
         }
 
-        def parts() -> Answer:
+        def parts() -> HostileAnswer:
             A = operator()
             fields = {
                 "A x": A.apply(wp.array(x * fluid, dtype=wp.float64, device="cpu")),
@@ -121,18 +128,18 @@ def solid(rng: Rng) -> Case:
             }
             fields["boundary term"] = A.boundary_term(border)
             assert border[inside].shape == cells.shape
-            return Answer(
+            return HostileAnswer(
                 "CONVERGED",
                 None,
                 "",
                 {k: v.numpy().ravel()[F].astype(float) for k, v in fields.items()},
             )
 
-        return Case(f"{name}, its parts", parts, Values(expected, 1e-12))
+        return HostileCase(f"{name}, its parts", parts, Values(expected, 1e-12))
     A = matrix[F][:, F].tocsr()
     kind, low, high = draw.bounds(rng, len(F))
     x, b = draw.plant(rng, A, low, high)
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -155,7 +162,7 @@ def solid(rng: Rng) -> Case:
     )
 
 
-def periodic(rng: Rng) -> Case:
+def periodic(rng: Rng) -> HostileCase:
     """Draw periodic stencils and grids.
 
     They are singular stencils, compatible or not, unsymmetric dominant M-matrices, and grids with
@@ -183,7 +190,7 @@ def periodic(rng: Rng) -> Case:
         A = draw.stencil_matrix(cells, a, None, sides, draw.AIR)
         bound, low, high = draw.bounds(rng, cells.size, str(rng.choice(["none", "lower", "box"])))
         x, b = draw.plant(rng, A, low, high)
-        box = Box(
+        box = HostileBox(
             A=A,
             b=b,
             lower=low,
@@ -217,7 +224,7 @@ def periodic(rng: Rng) -> Case:
     if not solvable:
         b = b - b.mean() - 10 ** rng.uniform(-3, 0)
     solution = x if solvable else None
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -236,8 +243,8 @@ def periodic(rng: Rng) -> Case:
 
 
 def _stencil_case(
-    rng: Rng, name: str, box: Box, cells: np.ndarray, a: Any, sides: Any, outside: int
-) -> Case:
+    rng: Rng, name: str, box: HostileBox, cells: np.ndarray, a: Any, sides: Any, outside: int
+) -> HostileCase:
     """Return a case whose cells are all FLUID."""
 
     def operator() -> Any:
@@ -260,7 +267,7 @@ def _stencil(cells: Any, a: Any, sides: Any, outside: int) -> Any:
     return wl.Stencil(cells, a, periodic=sides, outside=outside, device="cpu", dtype=wp.float64)
 
 
-def _faces(rng: Rng) -> Case:
+def _faces(rng: Rng) -> HostileCase:
     """Draw a GridPoisson with face arrays, in float64 or in its default storage.
 
     AIR surrounds it, or it is periodic.
@@ -293,7 +300,7 @@ def _faces(rng: Rng) -> Case:
     x, b = draw.plant(rng, A, low, high)
     rtol = float(rng.choice([1e-6, 1e-8, 1e-10]))
     storage = 0.0 if double else 1.2e-7
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -319,7 +326,7 @@ def _faces(rng: Rng) -> Case:
     )
 
 
-def gradients(rng: Rng) -> Case:
+def gradients(rng: Rng) -> HostileCase:
     """Draw a well-conditioned problem and a cotangent.
 
     The case compares `wl.vjp` with dense implicit differentiation.
@@ -374,7 +381,7 @@ def gradients(rng: Rng) -> Case:
         full[F] = values
         return full.reshape(cells.shape)
 
-    def solve() -> Answer:
+    def solve() -> HostileAnswer:
         operator = A
         if kind == "stencil":
             operator = _stencil(cells, a, sides, outside)
@@ -385,11 +392,11 @@ def gradients(rng: Rng) -> Case:
             stopping=wl.StoppingCriteria(rtol=1e-11),
         )
         if not result:
-            return Answer(result.status.name, None, "the problem's own solve")
+            return HostileAnswer(result.status.name, None, "the problem's own solve")
         try:
             gradient = wl.vjp(result, field_of(g), stopping=wl.StoppingCriteria(rtol=1e-10))
         except ArithmeticError as error:
-            return Answer("NO GRADIENT", None, str(error)[:100])
+            return HostileAnswer("NO GRADIENT", None, str(error)[:100])
         values = {
             name: getattr(gradient, name).numpy().ravel()[F] for name in ("b", "lower", "upper")
         }
@@ -400,10 +407,10 @@ def gradients(rng: Rng) -> Case:
                 f"coefficient {o}": v.numpy().ravel()[F]
                 for o, v in gradient.coefficients["coefficients"].items()
             }
-        return Answer("CONVERGED", result.x.numpy().ravel()[F], "", values)
+        return HostileAnswer("CONVERGED", result.x.numpy().ravel()[F], "", values)
 
     name = f"gradients of a {kind} problem, n={n}, {free.sum()} free, {bound} bounds"
-    return Case(name, solve, Values(expected, max(1e-6, 1e-8 * condition)))
+    return HostileCase(name, solve, Values(expected, max(1e-6, 1e-8 * condition)))
 
 
 def _by_offset(

@@ -18,10 +18,10 @@ from warp_lcp.benchmarks.hostile.case import (
     EXCEPTION,
     INFEASIBLE,
     REFUSED,
-    Answer,
-    Box,
-    Case,
-    Program,
+    HostileAnswer,
+    HostileBox,
+    HostileCase,
+    HostileProgram,
     Refusal,
     Values,
 )
@@ -31,7 +31,7 @@ HIDDEN = 1e-3  # a row violated by more than this share of its terms counts as h
 Verdicts = list[tuple[str, str]]
 
 
-def judge(case: Case, answer: Answer) -> Verdicts:
+def judge(case: HostileCase, answer: HostileAnswer) -> Verdicts:
     """Return pairs of a category and a reason; the first is the end of the solve."""
     if answer.status == EXCEPTION:
         return [("EXCEPTION", answer.note)]
@@ -41,18 +41,18 @@ def judge(case: Case, answer: Answer) -> Verdicts:
         return [("other method" if case.method else "refused", answer.note)]
     if isinstance(case.truth, Values):
         return _values(case.truth, answer)
-    if isinstance(case.truth, Program):
+    if isinstance(case.truth, HostileProgram):
         return _program(case.truth, answer)
     return _box(case.truth, answer, case.method)
 
 
-def _refusal(truth: Refusal, answer: Answer) -> Verdicts:
+def _refusal(truth: Refusal, answer: HostileAnswer) -> Verdicts:
     if answer.status == CONVERGED:
         return [("FALSE CONVERGED", truth.why)]
     return [("honest", answer.note)]
 
 
-def _values(truth: Values, answer: Answer) -> Verdicts:
+def _values(truth: Values, answer: HostileAnswer) -> Verdicts:
     if answer.status != CONVERGED:
         return [("not solved", f"{answer.status}: {answer.note}")]
     magnitude = max(
@@ -74,7 +74,7 @@ def _values(truth: Values, answer: Answer) -> Verdicts:
 # Boxed problems ------------------------------------------------------------------------------
 
 
-def scales(box: Box) -> np.ndarray:
+def scales(box: HostileBox) -> np.ndarray:
     """Return d of the natural residual.
 
     It is A_ii for positive semi-definite A and grids, and otherwise follows from Ruiz's
@@ -93,7 +93,7 @@ def scales(box: Box) -> np.ndarray:
     return 1 / (rows * columns)
 
 
-def residual(box: Box, x: np.ndarray, d: np.ndarray) -> np.ndarray:
+def residual(box: HostileBox, x: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)).
 
     Where the clip is inactive, r_i = y_i without cancellation.
@@ -104,12 +104,12 @@ def residual(box: Box, x: np.ndarray, d: np.ndarray) -> np.ndarray:
     return np.where(target < low, d * (x - low), np.where(target > high, d * (x - high), y))
 
 
-def terms(box: Box, x: np.ndarray) -> np.ndarray:
+def terms(box: HostileBox, x: np.ndarray) -> np.ndarray:
     """Return |b_i| + sum_j |a_ij x_j|."""
     return np.abs(box.b) + abs(box.A) @ np.abs(x)
 
 
-def _box(box: Box, answer: Answer, method: str | None) -> Verdicts:
+def _box(box: HostileBox, answer: HostileAnswer, method: str | None) -> Verdicts:
     if answer.status == INFEASIBLE:
         return _infeasible(box)
     if answer.status == CONVERGED:
@@ -121,7 +121,7 @@ def _box(box: Box, answer: Answer, method: str | None) -> Verdicts:
     return [("not solved" if solvable else "honest", f"{answer.status}: {answer.note}")]
 
 
-def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
+def _converged(box: HostileBox, x: np.ndarray, note: str) -> Verdicts:
     if not np.isfinite(x).all():
         return [("FALSE CONVERGED", "x is not finite")]
     d = scales(box)
@@ -171,7 +171,7 @@ def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
     return [*verdicts, ("suspicious", far)] if far else verdicts
 
 
-def _far(box: Box, x: np.ndarray, d: np.ndarray) -> str:
+def _far(box: HostileBox, x: np.ndarray, d: np.ndarray) -> str:
     """Return the distance of x from the unique solution.
 
     Only the part beyond tolerance and condition counts.
@@ -194,7 +194,7 @@ def _far(box: Box, x: np.ndarray, d: np.ndarray) -> str:
     )
 
 
-def _infeasible(box: Box) -> Verdicts:
+def _infeasible(box: HostileBox) -> Verdicts:
     if box.solvable:
         return [("FALSE INFEASIBLE", "a solution is known by construction")]
     if box.solvable is False:
@@ -209,7 +209,7 @@ def _infeasible(box: Box) -> Verdicts:
     )
 
 
-def exists(box: Box) -> bool | None:
+def exists(box: HostileBox) -> bool | None:
     """Return whether a solution exists; None if no oracle can decide.
 
     A solution has l <= x <= u, y_i >= 0 where u_i is infinite and y_i <= 0 where l_i is. If A is
@@ -228,7 +228,7 @@ def exists(box: Box) -> bool | None:
     return _enumerate(box) if n <= 7 else None
 
 
-def _linear_program(box: Box) -> bool | None:
+def _linear_program(box: HostileBox) -> bool | None:
     A, n = sp.csr_array(box.A), len(box.b)
     rows = np.maximum(abs(A).max(axis=1).toarray().ravel(), np.abs(box.b))
     A, b = (
@@ -254,7 +254,7 @@ def _linear_program(box: Box) -> bool | None:
     return {0: True, 2: False}.get(optimum.status)
 
 
-def _enumerate(box: Box) -> bool | None:
+def _enumerate(box: HostileBox) -> bool | None:
     A, n = (box.A.toarray() if sp.issparse(box.A) else box.A), len(box.b)
     for state in product((0, -1, 1), repeat=n):  # each unknown free, at l or at u
         s = np.array(state)
@@ -271,7 +271,7 @@ def _enumerate(box: Box) -> bool | None:
 # Quadratic programs --------------------------------------------------------------------------
 
 
-def reference(program: Program) -> np.ndarray | None:
+def reference(program: HostileProgram) -> np.ndarray | None:
     """Return x of the well-scaled program by Clarabel and PIQP; None if they disagree."""
     import qpsolvers
 
@@ -327,7 +327,7 @@ def violation(p: Any, x: np.ndarray) -> float:
     return worst
 
 
-def _program(truth: Program, answer: Answer) -> Verdicts:
+def _program(truth: HostileProgram, answer: HostileAnswer) -> Verdicts:
     p = truth.plain
     if answer.status == CONVERGED:
         x = answer.x

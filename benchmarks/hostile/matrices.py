@@ -14,12 +14,19 @@ from scipy.sparse.linalg import aslinearoperator
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.hostile import draw
-from warp_lcp.benchmarks.hostile.case import NAMED, Answer, Box, Case, Refusal, box_case
+from warp_lcp.benchmarks.hostile.case import (
+    NAMED,
+    HostileAnswer,
+    HostileBox,
+    HostileCase,
+    Refusal,
+    box_case,
+)
 
 Rng = np.random.Generator
 
 
-def rows(rng: Rng) -> Case:
+def rows(rng: Rng) -> HostileCase:
     """Draw a problem in which one or a few rows are 1e8 to 1e16 times larger."""
     n = draw.size(rng, 2, 150)
     what, A = draw.definite(rng, n) if rng.random() < 0.6 else draw.positive(rng, n)
@@ -53,7 +60,7 @@ def rows(rng: Rng) -> Case:
             b[some[0]] += (
                 large if x[some[0]] == low[some[0]] and low[some[0]] < high[some[0]] else 0.0
             )
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -67,7 +74,7 @@ def rows(rng: Rng) -> Case:
     return box_case(rng, f"{what}, {kind} bounds, {way} {large:.0e}", box, x0=x0)
 
 
-def singular(rng: Rng) -> Case:
+def singular(rng: Rng) -> HostileCase:
     """Draw a singular system or LCP: compatible up to rounding, or incompatible.
 
     An incompatible one is incompatible by a margin.
@@ -128,7 +135,7 @@ def singular(rng: Rng) -> Case:
         b = b - b.mean() - 10 ** rng.uniform(-3, 1) * np.abs(b).mean() - 1e-3
         solvable = False if bound in ("none", "lower") else None
     solution = x if solvable else None
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -143,7 +150,7 @@ def singular(rng: Rng) -> Case:
     )
 
 
-def _reynolds(rng: Rng) -> Case:
+def _reynolds(rng: Rng) -> HostileCase:
     """Draw the periodic journal bearing: -(h^3 p')' + h' >= 0, p >= 0.
 
     b sums to 0 up to rounding.
@@ -155,7 +162,7 @@ def _reynolds(rng: Rng) -> Case:
     b = np.roll(h, -1) - np.roll(h, 1)
     b -= b.mean() if rng.random() < 0.7 else 0.0
     low = np.full(n, rng.choice([0.0, -np.inf], p=[0.8, 0.2]))
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -167,7 +174,7 @@ def _reynolds(rng: Rng) -> Case:
     return box_case(rng, f"Reynolds, eccentricity {e}", box, share=0.3)
 
 
-def narrow(rng: Rng) -> Case:
+def narrow(rng: Rng) -> HostileCase:
     """Draw a chain, beam or tridiagonal matrix with bounds in windows."""
     n, bandwidth = draw.size(rng, 50, 8000), int(rng.choice([1, 2, 3], p=[0.65, 0.3, 0.05]))
     n = min(n, {1: n, 2: 2000, 3: 100}[bandwidth])  # condition numbers grow with n^2, n^4 and n^6
@@ -192,7 +199,7 @@ def narrow(rng: Rng) -> Case:
     high = np.full(n, np.inf)
     for _ in range(int(rng.integers(0, 4))):
         high[np.abs(t - rng.random()) < rng.uniform(0.01, 0.3)] = 10 ** rng.uniform(-2.5, 0)
-    box = Box(
+    box = HostileBox(
         A=A.tocsr(),
         b=b,
         lower=low,
@@ -208,7 +215,7 @@ def narrow(rng: Rng) -> Case:
     return box_case(rng, name, box, named=named, share=0.15)
 
 
-def sign(rng: Rng) -> Case:
+def sign(rng: Rng) -> HostileCase:
     """Draw a matrix with its sign flipped, as a whole or in a few rows or entries."""
     n = draw.size(rng, 1, 600)
     what, A = draw.definite(rng, n) if rng.random() < 0.8 else draw.positive(rng, n)
@@ -237,11 +244,11 @@ def sign(rng: Rng) -> Case:
         else:
             A[some[0], rng.integers(0, n)] -= 10 * np.abs(A).max()
         A = sp.csr_array(A) if n > 100 else A
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=1e-6)
+    box = HostileBox(A=A, b=b, lower=low, upper=high, rtol=1e-6)
     return box_case(rng, f"{way} of {what}, {kind} bounds", box, share=0.25)
 
 
-def friction(rng: Rng) -> Case:
+def friction(rng: Rng) -> HostileCase:
     """Draw contacts with friction.
 
     They are scenes of the gallery as boxes, random boxes, and pyramids as LCPs.
@@ -301,7 +308,9 @@ def friction(rng: Rng) -> Case:
     if not isinstance(low, wl.AffineBounds) and not isinstance(high, wl.AffineBounds):
         plain = [np.broadcast_to(np.asarray(side, dtype=float), n).copy() for side in (low, high)]
         # The LCP of Anitescu and Potra.
-        box = Box(A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol, solvable=True)
+        box = HostileBox(
+            A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol, solvable=True
+        )
         return box_case(
             rng,
             name,
@@ -313,7 +322,7 @@ def friction(rng: Rng) -> Case:
     def sides(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return _side(low, x), _side(high, x)
 
-    box = Box(
+    box = HostileBox(
         A=system_A,
         b=system_b,
         lower=np.zeros(n),
@@ -338,7 +347,7 @@ def _side(side: Any, x: np.ndarray) -> np.ndarray:
     return constant + np.where(index < 0, 0.0, slope * x[np.maximum(index, 0)])
 
 
-def malformed(rng: Rng) -> Case:
+def malformed(rng: Rng) -> HostileCase:
     """Draw malformed sparse matrices, singular blocks, or unusual but valid types.
 
     In a malformed matrix the arrays contradict each other.
@@ -370,7 +379,7 @@ def malformed(rng: Rng) -> Case:
         form = str(
             rng.choice(["coo", "csc", "duplicates", "int64", "float32", "dia", "unsorted", "bsr"])
         )
-        box = Box(
+        box = HostileBox(
             A=M,
             b=b,
             lower=low,
@@ -405,12 +414,12 @@ def malformed(rng: Rng) -> Case:
     method = None if rng.random() < 0.6 else str(rng.choice(NAMED))
     wrapped = rng.random() < 0.5
 
-    def solve() -> Answer:
+    def solve() -> HostileAnswer:
         A = wl.SparseOperator(M, device="cpu") if wrapped else M
         result = wl.solve(wl.LCP(A, -np.ones(n)), wl.METHODS[method]() if method else None)
-        return Answer(result.status.name, result.x.numpy())
+        return HostileAnswer(result.status.name, result.x.numpy())
 
-    return Case(
+    return HostileCase(
         f"malformed {M.format} matrix, n={n}: {way}, {method or 'default'}",
         solve,
         Refusal(f"{way} of a malformed matrix"),
@@ -456,7 +465,7 @@ def _form(M: Any, form: str) -> Any:
     return N
 
 
-def _singular_block(rng: Rng, n: int) -> Case:
+def _singular_block(rng: Rng, n: int) -> HostileCase:
     """Draw a matrix with exactly singular blocks, and a planted solution.
 
     The blocks have equal rows, empty rows or columns, or zero diagonals.
@@ -475,7 +484,7 @@ def _singular_block(rng: Rng, n: int) -> Case:
     A = M.toarray() if n <= 200 and rng.random() < 0.3 else M
     kind, low, high = draw.bounds(rng, n)
     x, b = draw.plant(rng, A, low, high)
-    box = Box(A=A, b=b, lower=low, upper=high, solution=x, solvable=True, definite=symmetric)
+    box = HostileBox(A=A, b=b, lower=low, upper=high, solution=x, solvable=True, definite=symmetric)
     return box_case(
         rng,
         f"{'symmetric' if symmetric else 'unsymmetric'} singular blocks, {kind} bounds",
@@ -484,7 +493,7 @@ def _singular_block(rng: Rng, n: int) -> Case:
     )
 
 
-def odd(rng: Rng) -> Case:
+def odd(rng: Rng) -> HostileCase:
     """Draw further inputs of users.
 
     They are buffers, functions, empty rows, stacks of masses, cycles and SciPy's lists of pairs.
@@ -526,7 +535,7 @@ def odd(rng: Rng) -> Case:
         x, b = draw.plant(rng, A, low, high)
         b[free] = 0.0
     unique = way != "empty row"
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -548,7 +557,7 @@ def odd(rng: Rng) -> Case:
     if way == "read-only":
         return box_case(rng, name, box, operator=lambda: _frozen(A), share=0.3)
     if way == "pairs" and n > 1:
-        return Case(f"{name}, n={n}", lambda: _pairs(box), box)
+        return HostileCase(f"{name}, n={n}", lambda: _pairs(box), box)
     return box_case(rng, name, box, share=0.35)
 
 
@@ -574,8 +583,8 @@ def _frozen(A: Any) -> Any:
     return B
 
 
-def _pairs(box: Box) -> Answer:
+def _pairs(box: HostileBox) -> HostileAnswer:
     """Solve with SciPy's list of pairs (l_i, u_i)."""
     pairs = list(zip(box.lower.tolist(), box.upper.tolist(), strict=True))
     found = wl.linear_complementarity(box.A, box.b, bounds=pairs, tol=box.rtol)
-    return Answer(found.result.status.name, np.asarray(found.x).ravel(), found.message)
+    return HostileAnswer(found.result.status.name, np.asarray(found.x).ravel(), found.message)

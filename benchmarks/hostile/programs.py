@@ -11,13 +11,20 @@ import numpy as np
 import scipy.sparse as sp
 
 from warp_lcp.benchmarks.hostile import draw
-from warp_lcp.benchmarks.hostile.case import CONVERGED, Answer, Box, Case, Program, box_case
+from warp_lcp.benchmarks.hostile.case import (
+    CONVERGED,
+    HostileAnswer,
+    HostileBox,
+    HostileCase,
+    HostileProgram,
+    box_case,
+)
 
 Rng = np.random.Generator
 INFINITIES = (1e20, 1e30, 1e100, 1e300, np.inf)
 
 
-def infinity(rng: Rng) -> Case:
+def infinity(rng: Rng) -> HostileCase:
     """Draw bounds, or right sides of a program, with infinity written as 1e20 or more."""
     if rng.random() < 0.3:
         return program(rng, scale=0.0)
@@ -32,7 +39,7 @@ def infinity(rng: Rng) -> Case:
         np.where(np.isfinite(high), high, written[1]),
     )
     definite = what not in ("definite plus skew", "M-matrix")
-    box = Box(
+    box = HostileBox(
         A=A,
         b=b,
         lower=low,
@@ -62,12 +69,12 @@ def infinity(rng: Rng) -> Case:
     )
 
 
-def programs(rng: Rng) -> Case:
+def programs(rng: Rng) -> HostileCase:
     """Draw a quadratic program in units of up to 10^[-8, 8]."""
     return program(rng, scale=8.0)
 
 
-def program(rng: Rng, scale: float) -> Case:
+def program(rng: Rng, scale: float) -> HostileCase:
     """Draw a convex program with costs and rows in units of 10^[-scale, scale].
 
     Infinity may be written as a number.
@@ -158,14 +165,14 @@ def program(rng: Rng, scale: float) -> Case:
         f"{open_rows.sum()} rows"
     )
     name += " and bounds" if rng_bounds and lb is None else ""
-    return Case(
+    return HostileCase(
         name,
         lambda: solve_program(scaled),
-        Program(scaled=scaled, plain=plain, expected=expected, unique=rank == n),
+        HostileProgram(scaled=scaled, plain=plain, expected=expected, unique=rank == n),
     )
 
 
-def solve_program(problem: Any) -> Answer:
+def solve_program(problem: Any) -> HostileAnswer:
     """Solve by qpsolvers and "warp_lcp"."""
     import qpsolvers
 
@@ -174,16 +181,16 @@ def solve_program(problem: Any) -> Answer:
     qp.register()
     solution = qpsolvers.solve_problem(problem, solver="warp_lcp")
     if solution.found:
-        return Answer(CONVERGED, solution.x)
+        return HostileAnswer(CONVERGED, solution.x)
     result = solution.extras.get("result")
-    return Answer(
+    return HostileAnswer(
         getattr(getattr(getattr(result, "result", None), "status", None), "name", "NOT FOUND"),
         None,
         "not found",
     )
 
 
-def low_rank(rng: Rng) -> Case:
+def low_rank(rng: Rng) -> HostileCase:
     """Draw a box problem of low rank.
 
     It is a factored matrix, a support vector machine, a ridge, a portfolio, a game or a linear
@@ -211,10 +218,12 @@ def low_rank(rng: Rng) -> Case:
     none, one = np.full(n, np.inf), np.ones(n)
     if kind == "box":
         b = rng.choice([-one, rng.standard_normal(n)])
-        truth = Box(A=Q, b=b, lower=-one * rng.integers(0, 2), upper=one, definite=True, **box)
+        truth = HostileBox(
+            A=Q, b=b, lower=-one * rng.integers(0, 2), upper=one, definite=True, **box
+        )
     elif kind == "ridge":
         ridge = 10 ** rng.uniform(-8, -1)
-        truth = Box(
+        truth = HostileBox(
             A=Q + ridge * np.eye(n),
             b=rng.standard_normal(n),
             lower=-np.ones(n),
@@ -225,17 +234,17 @@ def low_rank(rng: Rng) -> Case:
     elif kind == "planted":
         _, low, high = draw.bounds(rng, n)
         x, b = draw.plant(rng, Q, low, high)
-        truth = Box(A=Q, b=b, lower=low, upper=high, definite=True, solution=x, **box)
+        truth = HostileBox(A=Q, b=b, lower=low, upper=high, definite=True, solution=x, **box)
     elif kind == "svm":
         C = 10 ** rng.uniform(-2, 3)
-        truth = Box(
+        truth = HostileBox(
             A=Q, b=-np.ones(n), lower=np.zeros(n), upper=np.full(n, C), definite=True, **box
         )
     elif kind == "svm with bias":  # sum_i label_i x_i = 0 with a free multiplier: [Q, -t; t', 0]
         t = np.sign(rng.standard_normal((n, 1)))
         A = np.block([[Q, -t], [t.T, np.zeros((1, 1))]])
         C = 10 ** rng.uniform(-2, 2)
-        truth = Box(
+        truth = HostileBox(
             A=A,
             b=np.r_[-np.ones(n), 0],
             lower=np.r_[np.zeros(n), -np.inf],
@@ -248,7 +257,7 @@ def low_rank(rng: Rng) -> Case:
         A = np.block(
             [[Q / n + np.diag(10 ** rng.uniform(-4, -1, n)), -rows.T], [rows, np.zeros((2, 2))]]
         )
-        truth = Box(
+        truth = HostileBox(
             A=A,
             b=np.r_[np.zeros(n), -1.0, -np.median(mean)],
             lower=np.r_[np.zeros(n), -np.inf, 0.0],
@@ -263,7 +272,7 @@ def low_rank(rng: Rng) -> Case:
             else rng.integers(1, 4, (2, m, m)).astype(float)
         )
         A = np.block([[np.zeros((m, m)), first], [second.T, np.zeros((m, m))]])
-        truth = Box(
+        truth = HostileBox(
             A=A,
             b=-np.ones(2 * m),
             lower=np.zeros(2 * m),
@@ -277,7 +286,7 @@ def low_rank(rng: Rng) -> Case:
         A = np.block([[np.zeros((n, n)), -M.T], [M, np.zeros((m, m))]])
         low = np.zeros(n + m)
         x, b = draw.plant(rng, A, low, np.r_[none, np.full(m, np.inf)])
-        truth = Box(A=A, b=b, lower=low, upper=np.full(n + m, np.inf), solution=x, **box)
+        truth = HostileBox(A=A, b=b, lower=low, upper=np.full(n + m, np.inf), solution=x, **box)
     if rng.random() < 0.2 and kind in ("linear program", "portfolio", "game"):
-        truth = Box(**{**vars(truth), "A": sp.csr_array(truth.A)})
+        truth = HostileBox(**{**vars(truth), "A": sp.csr_array(truth.A)})
     return box_case(rng, f"{kind}, rank {d}", truth, share=0.25)

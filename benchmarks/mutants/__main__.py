@@ -57,7 +57,7 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
         importlib.import_module(name)
 
 
-class Budget:
+class MutantBudget:
     """Plug-in of pytest with a time budget for each file.
 
     Tests that start after its end are left out. On request, each function runs with one parameter
@@ -103,7 +103,7 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
     log, limit = TREE / "mutant.log", int(SECONDS * len(arguments) + HANGS)
     child = os.fork()
     if child == 0:
-        _become_pytest(arguments, Budget(SECONDS, brief=brief), limit, log)
+        _become_pytest(arguments, MutantBudget(SECONDS, brief=brief), limit, log)
     deadline = time.monotonic() + 8 * limit
     while not (found := os.wait4(child, os.WNOHANG))[0]:
         if time.monotonic() > deadline:
@@ -121,7 +121,7 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
     )
 
 
-def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) -> NoReturn:
+def _become_pytest(arguments: list[str], budget: MutantBudget, limit: int, log: Path) -> NoReturn:
     """Turn this fork into a run of pytest on the worker's tree."""
     os.setsid()
     os.chdir(TREE)

@@ -37,7 +37,7 @@ def _users(root: Path) -> dict[str, set[str]]:
     for package in ("warp_lcp", "fluids", "granular"):
         for file in (root / package).rglob("*"):
             if file.suffix in (".py", ".h"):
-                places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
+                places = [file.parent, file.parent / "headers", root / "warp_lcp/kernels/headers"]
                 for header in re.findall(r"[\"/](\w+)\.h(?::[\w.]+)?\"", file.read_text()):
                     included = [
                         place / f"{header}.h"

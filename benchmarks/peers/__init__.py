@@ -11,21 +11,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.cases import RTOL, SolverCase
 from warp_lcp.benchmarks.harness.machine import COPIED, machine
 from warp_lcp.benchmarks.harness.record import (
     MACHINE,
     Bars,
-    Record,
+    BenchmarkRecord,
+    RecordTable,
+    RecordTarget,
     Results,
-    Table,
-    Target,
     shown,
     spread,
     table_of_targets,
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
-from warp_lcp.benchmarks.peers.peer import Answer, Peer, PeerFailed, Question
+from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, Question
 from warp_lcp.benchmarks.peers.roster import Roster, roster
 from warp_lcp.benchmarks.problems import BOUNDS, splash
 
@@ -48,7 +48,7 @@ class Contest:
     question: Question  # the problem
     # Tolerance given to the peer, such that its residual is the required one.
     tolerance: float = RTOL
-    answers: list[Answer] = field(default_factory=list)  # one for each round
+    answers: list[PeerAnswer] = field(default_factory=list)  # one for each round
     residual: float = float("nan")  # residual of the last answer
     remark: str = ""  # why there are no answers
 
@@ -82,7 +82,7 @@ class Contest:
             except PeerFailed as error:
                 self.remark = str(error)
 
-    def record(self, ours: Case) -> Record:
+    def record(self, ours: SolverCase) -> BenchmarkRecord:
         """Return the measured figures, with the ratio to ours in the same rounds."""
         peer, scene = self.peer, self.question.scene
         facts = {
@@ -94,7 +94,7 @@ class Contest:
         }
         name = f"{scene.n}^3 {self.question.bounds} {peer.name}"
         if not self.answers or self.remark:
-            return Record(name, {}, facts | {"remark": self.remark})
+            return BenchmarkRecord(name, {}, facts | {"remark": self.remark})
         figures = {
             part: Figure.of([getattr(a, part) for a in self.answers], "s")
             for part in ("setup", "solve", "total")
@@ -109,7 +109,7 @@ class Contest:
             figures["linear_iterations"] = Figure(last.linear_iterations)
         totals = [a.total for a in self.answers]
         figures["over_engine"] = ratios(totals, ours.samples["total"][: len(totals)])
-        return Record(name, figures, facts)
+        return BenchmarkRecord(name, figures, facts)
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -133,7 +133,7 @@ def measure(options: Options, out: Path) -> Results:
                 if (t := r.value("total"))
             }
     n = max(sizes)
-    asked = Table(
+    asked = RecordTable(
         "Who was asked",
         ["library", "version"],
         [[name, text] for name, text in available.versions.items()],
@@ -144,11 +144,11 @@ def measure(options: Options, out: Path) -> Results:
 
 def _measure_size(
     n: int, there: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
-) -> list[Record]:
+) -> list[BenchmarkRecord]:
     """Measure one sample of each solver in every round."""
     scene = splash(n)
     cases = {
-        bounds: Case("unit", scene, bounds, wl.ProjectedMultigrid(), options.device)
+        bounds: SolverCase("unit", scene, bounds, wl.ProjectedMultigrid(), options.device)
         for bounds in BOUNDS
     }
     questions = {bounds: Question(scene, bounds) for bounds in BOUNDS}
@@ -175,21 +175,21 @@ def _measure_size(
     return [*ours, *(contest.record(cases[contest.question.bounds]) for contest in contests)]
 
 
-def _engine(case: Case) -> Record:
+def _engine(case: SolverCase) -> BenchmarkRecord:
     facts = {
         "n": case.scene.n,
         "bounds": case.bounds,
         "method": case.method,
         "precision": "float64, corrections float32",
     }
-    return Record(
+    return BenchmarkRecord(
         f"{case.scene.n}^3 {case.bounds} {case.method}",
         case.figures(),
         facts | {"settings": "defaults"},
     )
 
 
-def _targets(records: Sequence[Record], n: int) -> Table:
+def _targets(records: Sequence[BenchmarkRecord], n: int) -> RecordTable:
     """Return the targets at the largest size."""
 
     def least(bounds: str, *names: str) -> Figure | None:
@@ -207,11 +207,13 @@ def _targets(records: Sequence[Record], n: int) -> Table:
         )
 
     targets = [
-        Target("linear: PyAMG's best", 20, least("linear", "PyAMG"), " x", True),
-        Target("linear: PETSc's CG+MG", 3, least("linear", "PETSc CG+MG"), " x", True),
-        Target("linear: PETSc's best", 3, least("linear", "PETSc"), " x", True),
+        RecordTarget("linear: PyAMG's best", 20, least("linear", "PyAMG"), " x", True),
+        RecordTarget("linear: PETSc's CG+MG", 3, least("linear", "PETSc CG+MG"), " x", True),
+        RecordTarget("linear: PETSc's best", 3, least("linear", "PETSc"), " x", True),
         *(
-            Target(f"{bounds}: PETSc's best SNESVI", 10, least(bounds, "PETSc SNESVI"), " x", True)
+            RecordTarget(
+                f"{bounds}: PETSc's best SNESVI", 10, least(bounds, "PETSc SNESVI"), " x", True
+            )
             for bounds in BOUNDS[1:]
         ),
     ]
@@ -222,7 +224,7 @@ def _targets(records: Sequence[Record], n: int) -> Table:
     return table_of_targets("peer over engine", targets, remark)
 
 
-def _table(n: int, records: Sequence[Record]) -> Table:
+def _table(n: int, records: Sequence[BenchmarkRecord]) -> RecordTable:
     columns = [
         "problem",
         "solver",
@@ -257,10 +259,10 @@ def _table(n: int, records: Sequence[Record]) -> Table:
         "residual: natural, relative, in float64 from the x that came back; a peer's own tolerance "
         "is tightened until it is as asked."
     )
-    return Table(f"{n}^3 cells", [*columns, "x the engine's time"], rows, remark)
+    return RecordTable(f"{n}^3 cells", [*columns, "x the engine's time"], rows, remark)
 
 
-def _bars(bounds: str, records: Sequence[Record]) -> Bars:
+def _bars(bounds: str, records: Sequence[BenchmarkRecord]) -> Bars:
     """Return the seconds of each solver at the largest size that has any."""
     here = [
         r

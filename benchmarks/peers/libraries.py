@@ -12,14 +12,14 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-from warp_lcp.benchmarks.peers.peer import Answer, Question
+from warp_lcp.benchmarks.peers.peer import PeerAnswer, Question
 
 CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
 
 
 def pyamg(
     question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver"
-) -> Answer:
+) -> PeerAnswer:
     """Solve by CG with one of PyAMG's hierarchies, all defaults."""
     import pyamg as library
 
@@ -30,20 +30,20 @@ def pyamg(
         hierarchy = getattr(library, build)(A)
         middle = time.perf_counter()
         x = hierarchy.solve(-question.b, tol=tolerance, accel="cg", residuals=residuals)
-    return Answer(x, middle - start_time, time.perf_counter() - middle, len(residuals) - 1)
+    return PeerAnswer(x, middle - start_time, time.perf_counter() - middle, len(residuals) - 1)
 
 
-def scipy_cg(question: Question, tolerance: float) -> Answer:
+def scipy_cg(question: Question, tolerance: float) -> PeerAnswer:
     """Solve by plain conjugate gradients."""
     A, b, count = question.matrix, -question.b, list[int]()
     begun = time.perf_counter()
     x, _ = scipy.sparse.linalg.cg(
         A, b, rtol=tolerance, atol=0.0, callback=lambda _: count.append(1)
     )
-    return Answer(x, 0.0, time.perf_counter() - begun, len(count))
+    return PeerAnswer(x, 0.0, time.perf_counter() - begun, len(count))
 
 
-def amgcl(question: Question, tolerance: float) -> Answer:
+def amgcl(question: Question, tolerance: float) -> PeerAnswer:
     """Solve by CG with AMGCL's smoothed aggregation.
 
     One sweep of its ILU(0) smooths; it is the fastest of its smoothers here.
@@ -58,10 +58,10 @@ def amgcl(question: Question, tolerance: float) -> Answer:
     solver = pyamgcl.solver(preconditioner, {"type": "cg", "tol": tolerance, "maxiter": 1000})
     middle = time.perf_counter()
     x = solver(b)
-    return Answer(x, middle - start_time, time.perf_counter() - middle, int(solver.iters))
+    return PeerAnswer(x, middle - start_time, time.perf_counter() - middle, int(solver.iters))
 
 
-def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
+def warp_cg(question: Question, tolerance: float, *, device: str) -> PeerAnswer:
     """Solve by Warp's conjugate gradients with a diagonal preconditioner.
 
     The matrix is a Warp BSR matrix in float64.
@@ -85,10 +85,10 @@ def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
     middle = time.perf_counter()
     iterations, _, _ = warp.optim.linear.cg(A, b, x, tol=tolerance, maxiter=CG_PATIENCE, M=M)
     wp.synchronize_device(device)
-    return Answer(x.numpy(), middle - begun, time.perf_counter() - middle, int(iterations))
+    return PeerAnswer(x.numpy(), middle - begun, time.perf_counter() - middle, int(iterations))
 
 
-def cupy_cg(question: Question, tolerance: float) -> Answer:
+def cupy_cg(question: Question, tolerance: float) -> PeerAnswer:
     """Solve by CuPy's plain conjugate gradients on its current CUDA device."""
     import cupy
     import cupyx.scipy.sparse
@@ -105,10 +105,10 @@ def cupy_cg(question: Question, tolerance: float) -> Answer:
         A, b, tol=tolerance, maxiter=CG_PATIENCE, callback=lambda _: count.append(1)
     )
     cupy.cuda.Device().synchronize()
-    return Answer(cupy.asnumpy(x), 0.0, time.perf_counter() - begun, len(count))
+    return PeerAnswer(cupy.asnumpy(x), 0.0, time.perf_counter() - begun, len(count))
 
 
-def osqp(question: Question, tolerance: float) -> Answer:
+def osqp(question: Question, tolerance: float) -> PeerAnswer:
     """Solve by OSQP: operator splitting with one factorization.
 
     Its tolerances are absolute, in units of b.
@@ -133,12 +133,12 @@ def osqp(question: Question, tolerance: float) -> Answer:
     )
     middle = time.perf_counter()
     result = solver.solve(raise_error=False)
-    return Answer(
+    return PeerAnswer(
         np.array(result.x), middle - start_time, time.perf_counter() - middle, int(result.info.iter)
     )
 
 
-def piqp(question: Question, tolerance: float) -> Answer:
+def piqp(question: Question, tolerance: float) -> PeerAnswer:
     """Solve by PIQP: a proximal interior-point method, sparse factorizations."""
     import piqp as library
 
@@ -151,7 +151,7 @@ def piqp(question: Question, tolerance: float) -> Answer:
     solver.setup(P, question.b, x_l=question.lower)
     middle = time.perf_counter()
     solver.solve()
-    return Answer(
+    return PeerAnswer(
         np.array(solver.result.x),
         middle - start_time,
         time.perf_counter() - middle,
@@ -159,7 +159,7 @@ def piqp(question: Question, tolerance: float) -> Answer:
     )
 
 
-def clarabel(question: Question, tolerance: float) -> Answer:
+def clarabel(question: Question, tolerance: float) -> PeerAnswer:
     """Solve by Clarabel: an interior-point method on a homogeneous embedding.
 
     Its factorizations are sparse.
@@ -186,7 +186,7 @@ def clarabel(question: Question, tolerance: float) -> Answer:
     )
     middle = time.perf_counter()
     solution = solver.solve()
-    return Answer(
+    return PeerAnswer(
         np.array(solution.x),
         middle - start_time,
         time.perf_counter() - middle,

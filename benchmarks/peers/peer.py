@@ -68,7 +68,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Answer:
+class PeerAnswer:
     """Answer of a peer."""
 
     x: np.ndarray  # shape (unknowns,)
@@ -100,7 +100,7 @@ class Peer:
 
     name: str
     library: str
-    solve: Callable[[Question, float], Answer]
+    solve: Callable[[Question, float], PeerAnswer]
     bounds: tuple[str, ...] = ("linear",)
     most: int = 1 << 20
     settings: str = "defaults"

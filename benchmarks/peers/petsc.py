@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Answer, Peer, PeerFailed, Question
+from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer, PeerAnswer, PeerFailed, Question
 from warp_lcp.benchmarks.problems import BOUNDS
 
 VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interpreter
@@ -180,7 +180,7 @@ def asked(
     worker: Worker,
     folder: Path,
     options: Mapping[str, str],
-) -> Answer:
+) -> PeerAnswer:
     """Solve a question by a worker, through files.
 
     The problem's file of a scene is written at its first question.
@@ -215,7 +215,7 @@ def asked(
             f"PETSc did not converge: reason {reply['reason']} after {reply['iterations']} "
             "iterations"
         )
-    return Answer(
+    return PeerAnswer(
         np.load(answer),
         reply["setup"],
         reply["solve"],

@@ -36,7 +36,7 @@ MULTIGRID = {
 LOOSE = {"ksp_rtol": 1e-2}
 
 
-class Problem:
+class PetscProblem:
     """Problem A x + b on the unknowns of a grid, as PETSc objects.
 
     Attributes:
@@ -65,7 +65,7 @@ class Problem:
         self.A.setOption(PETSc.Mat.Option.SPD, True)
 
 
-problem_of = lru_cache(maxsize=1)(Problem)  # keeps the last problem
+problem_of = lru_cache(maxsize=1)(PetscProblem)  # keeps the last problem
 
 
 @contextmanager
@@ -153,7 +153,7 @@ class ReducedMultigrid:
     It aggregates the free unknowns and is rebuilt when they change.
     """
 
-    def __init__(self, problem: Problem, snes: Any) -> None:
+    def __init__(self, problem: PetscProblem, snes: Any) -> None:
         self.problem, self.snes, self.building = problem, snes, 0.0
         self.ksp: Any = None
 

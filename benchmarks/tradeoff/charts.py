@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 
-from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Table, shown
+from warp_lcp.benchmarks.harness.record import (
+    BenchmarkRecord,
+    Chart,
+    RecordLines,
+    RecordTable,
+    shown,
+)
 from warp_lcp.benchmarks.tradeoff.runs import front_of
 
 PARETO = "Pareto front"
@@ -24,7 +30,7 @@ RUN_REMARK = (
 )
 
 
-def run_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
+def run_chart(scene: str, records: Sequence[BenchmarkRecord]) -> list[Chart]:
     """Return the chart of the distance to the finest run over seconds.
 
     The Pareto front is marked.
@@ -33,7 +39,7 @@ def run_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
     return _chart(scene, FINEST, label, "run", [(str(r.facts["curve"]), r) for r in records])
 
 
-def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
+def solve_chart(scene: str, records: Sequence[BenchmarkRecord]) -> list[Chart]:
     """Return the chart of the error over the seconds of the solves.
 
     The Pareto front is marked.
@@ -47,7 +53,7 @@ def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
 
 
 def _chart(
-    scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, Record]]
+    scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, BenchmarkRecord]]
 ) -> list[Chart]:
     """Return the chart of a figure over seconds; none if no record has it."""
     points = defaultdict[str, list[tuple[float, float]]](list)
@@ -61,7 +67,7 @@ def _chart(
     curves = {curve: ([x for x, _ in own], [y for _, y in own]) for curve, own in points.items()}
     name = f"{scene}-{kind}-{figure.replace('_', '-')}"
     return [
-        Lines(
+        RecordLines(
             name,
             f"{scene}: {label}",
             f"seconds of a {kind}",
@@ -72,7 +78,7 @@ def _chart(
     ]
 
 
-def _front(records: Sequence[Record], figure: str) -> set[str]:
+def _front(records: Sequence[BenchmarkRecord], figure: str) -> set[str]:
     """Return the names of the records on the Pareto front of seconds and a figure."""
     return {
         records[i].name
@@ -80,7 +86,7 @@ def _front(records: Sequence[Record], figure: str) -> set[str]:
     }
 
 
-def run_table(scene: str, records: Sequence[Record]) -> Table:
+def run_table(scene: str, records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return the table of runs, the Pareto front of seconds and distance marked."""
     ran = [r for r in records if r.figures]
     best, best_of_all = (
@@ -117,10 +123,10 @@ def run_table(scene: str, records: Sequence[Record]) -> Table:
             r, ["front_error", "volume_drift", "packing"], "+.4f"
         )
         rows.append([name, mark, *cost, *seen])
-    return Table(f"{scene}: runs", [*columns, "packing"], rows, RUN_REMARK)
+    return RecordTable(f"{scene}: runs", [*columns, "packing"], rows, RUN_REMARK)
 
 
-def solve_table(scene: str, records: Sequence[Record]) -> Table:
+def solve_table(scene: str, records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return the table of solves, the Pareto front of seconds and error marked."""
     solved = [r for r in records if r.facts["kind"] == "solve"]
     best = _front(solved, "error")
@@ -160,10 +166,10 @@ def solve_table(scene: str, records: Sequence[Record]) -> Table:
         "error",
         "status",
     ]
-    return Table(f"{scene}: solves", columns, rows, remark)
+    return RecordTable(f"{scene}: solves", columns, rows, remark)
 
 
-def preset_table(scene: str, records: Sequence[Record]) -> Table:
+def preset_table(scene: str, records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return the table of the presets' costs and errors."""
     presets = [r for r in records if str(r.facts["curve"]).startswith("preset ") and r.figures]
     slowest = max((r.figures["seconds"].value for r in presets), default=0.0)
@@ -193,4 +199,6 @@ def preset_table(scene: str, records: Sequence[Record]) -> Table:
         "front [m]",
         "volume or packing",
     ]
-    return Table(f"{scene}: presets", columns, rows, "At the same resolution; columns as below.")
+    return RecordTable(
+        f"{scene}: presets", columns, rows, "At the same resolution; columns as below."
+    )

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from warp_lcp.benchmarks.harness.machine import array_bytes
-from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
 from warp_lcp.run.trial import BIN, Trial, trial
@@ -23,7 +23,7 @@ FRAMES = 18
 
 
 @dataclass
-class Run:
+class TradeoffRun:
     """Runs of one setting."""
 
     setting: Setting  # the setting
@@ -54,9 +54,9 @@ class Runs:
             self.name, [f"domain.resolution={round(scale * self.resolution)}", *overrides]
         )
 
-    def measure(self, settings: Sequence[Setting]) -> list[Run]:
+    def measure(self, settings: Sequence[Setting]) -> list[TradeoffRun]:
         """Run all settings, interleaved."""
-        runs = [Run(setting) for setting in settings]
+        runs = [TradeoffRun(setting) for setting in settings]
         for turn in range(self.options.repeat):
             for number, run in enumerate(runs):
                 if run.failed:
@@ -69,7 +69,7 @@ class Runs:
                 self._add(run)
         return runs
 
-    def figures(self, run: Run) -> dict[str, Figure]:
+    def figures(self, run: TradeoffRun) -> dict[str, Figure]:
         """Return a run's figures; none if it has failed."""
         ran = run.trial
         if ran is None:
@@ -97,7 +97,7 @@ class Runs:
             name: Figure(value) for name in names if (value := getattr(ran, name)) is not None
         }
 
-    def record(self, run: Run) -> Record:
+    def record(self, run: TradeoffRun) -> BenchmarkRecord:
         """Return the record of a run."""
         setting, scene = run.setting, self.scene().scene.name
         facts: dict[str, Any] = {
@@ -112,7 +112,7 @@ class Runs:
             "resolution": round(setting.scale * self.resolution),
         }
         facts |= {"scale": setting.scale} | ({"failed": run.failed} if run.failed else {})
-        return Record(f"{scene} {setting.curve}: {setting.name}", self.figures(run), facts)
+        return BenchmarkRecord(f"{scene} {setting.curve}: {setting.name}", self.figures(run), facts)
 
     def _reference(self, scale: float) -> Trial:
         """Return the reference at a resolution: smallest steps and tolerance."""
@@ -121,7 +121,7 @@ class Runs:
         best = changed(scene, price_table()[scene.scene.simulator].reference)
         return trial(best, device=self.options.device, frames=self.frames, box=self.box)
 
-    def _add(self, run: Run) -> None:
+    def _add(self, run: TradeoffRun) -> None:
         """Run a setting once more."""
         gc.collect()
         before, after = array_bytes(), list[int]()

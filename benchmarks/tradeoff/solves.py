@@ -16,7 +16,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.exact import Exact
 from warp_lcp.benchmarks.harness.machine import array_bytes
-from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.gallery.recorded import RecordedProblem, files, load
 from warp_lcp.run.problem_folder import ProblemFolder
@@ -50,7 +50,7 @@ class Found:
     bytes: int | None = None  # device arrays of the method
 
 
-class Probe(ABC):
+class SolveProbe(ABC):
     """Problems of a run that are solved once for each setting."""
 
     kind: str  # kind of the problems
@@ -70,19 +70,21 @@ class Probe(ABC):
         """Yield a solve function for each problem."""
 
 
-def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
+def measure_solves(scene: Scene, options: Options, frames: int) -> list[BenchmarkRecord]:
     """Solve problems of a run by all methods to all tolerances.
 
     Return a record for each setting, that of the reference first.
     """
     options.say(f"{scene.scene.name}: problems of a run")
-    probe: Probe = PROBES[scene.scene.simulator](scene, options.device, frames)
+    probe: SolveProbe = PROBES[scene.scene.simulator](scene, options.device, frames)
     known, figures = (
         {"scene": scene.scene.name},
         {"residual": Figure(probe.residual), "problems": Figure(len(probe.problems))},
     )
     records = [
-        Record(f"{scene.scene.name} {probe.kind} reference", figures, known | {"kind": "reference"})
+        BenchmarkRecord(
+            f"{scene.scene.name} {probe.kind} reference", figures, known | {"kind": "reference"}
+        )
     ]
     for name, (method, precision) in probe.methods.items():
         options.say(f"{scene.scene.name}: {name}")
@@ -98,7 +100,7 @@ def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
             )
             more = {"status": status} if status else {}
             records.append(
-                Record(
+                BenchmarkRecord(
                     f"{scene.scene.name} {probe.kind} {name} {tolerance:g}", figures, facts | more
                 )
             )
@@ -181,7 +183,7 @@ class Reference:
         return float(np.sqrt(max(difference @ (A @ difference), 0.0) / (self._x @ (A @ self._x))))
 
 
-class Pressures(Probe):
+class Pressures(SolveProbe):
     """Pressure problems recorded in a run of liquid.
 
     They are solved from the initial guess of the run.
@@ -254,7 +256,7 @@ class Pressures(Probe):
         return solve
 
 
-class Steps(Probe):
+class Steps(SolveProbe):
     """Steps of a run of sand, from recorded states.
 
     The error is that of the velocity over g dt.
@@ -313,4 +315,7 @@ class Steps(Probe):
         return simulation.state()["velocity"], dict(row), taken
 
 
-PROBES: dict[str, Callable[[Scene, str, int], Probe]] = {"fluids": Pressures, "granular": Steps}
+PROBES: dict[str, Callable[[Scene, str, int], SolveProbe]] = {
+    "fluids": Pressures,
+    "granular": Steps,
+}

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Chart, Results, Table
+from warp_lcp.benchmarks.harness.record import Chart, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.validation import (
     dam_break,
@@ -28,7 +28,7 @@ from warp_lcp.benchmarks.validation import (
     transfers,
     walls,
 )
-from warp_lcp.benchmarks.validation.finding import Trial, table
+from warp_lcp.benchmarks.validation.finding import ValidationTrial, table
 
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {
@@ -56,7 +56,7 @@ CHECKS = {
 
 def measure(options: Options, out: Path) -> Results:
     """Run all checks."""
-    trials: dict[str, list[Trial]] = {}
+    trials: dict[str, list[ValidationTrial]] = {}
     charts: list[Chart] = []
     for name, check in CHECKS.items():
         options.say(f"{name} ...")
@@ -82,7 +82,7 @@ def measure(options: Options, out: Path) -> Results:
     )
 
 
-def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
+def summary(trials: Mapping[str, Sequence[ValidationTrial]]) -> RecordTable:
     """Return a row for each check.
 
     The columns are figures within their bounds, and controls that fail theirs.
@@ -113,7 +113,7 @@ def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
         "control is a set-up that is wrong on "
         "purpose: a check that it passes would prove nothing."
     )
-    return Table(
+    return RecordTable(
         "Checks",
         ["check", "within tolerance", "controls that fail", "seconds", "verdict"],
         rows,
@@ -121,7 +121,7 @@ def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
     )
 
 
-def misses(trials: Mapping[str, Sequence[Trial]]) -> Table:
+def misses(trials: Mapping[str, Sequence[ValidationTrial]]) -> RecordTable:
     """Return the failures, and why known ones occur."""
     rows = [
         [line, CHECKS[name].known]
@@ -129,4 +129,4 @@ def misses(trials: Mapping[str, Sequence[Trial]]) -> Table:
         for t in own
         for line in t.failures()
     ]
-    return Table("Not as it must be", ["figure", "known"], rows)
+    return RecordTable("Not as it must be", ["figure", "known"], rows)

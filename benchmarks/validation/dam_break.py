@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warp_lcp.benchmarks.validation import signals
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import (
     GRAVITY,
     SUB_CELL,
@@ -77,7 +77,7 @@ FAR, FAR_LENGTH, FAR_END = (4.0, 14.0), 16.0, 11.0
 VISCOSITY = 1e-6  # kinematic viscosity of water [m^2/s]
 
 
-class Collapse(NamedTuple):
+class DamCollapse(NamedTuple):
     """Collapse in the units of the experiment."""
 
     T: np.ndarray  # times at which the front is at its places, T = n t sqrt(g / a)
@@ -124,7 +124,7 @@ def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL)
             )
 
 
-def shown_gravity(c: Collapse) -> float:
+def shown_gravity(c: DamCollapse) -> float:
     """Return the gravity inferred from a collapse's front, over the true one.
 
     It is the gravity with which the experiment's front would be as fast as the collapse's. Times
@@ -193,7 +193,7 @@ def create(
     )
 
 
-def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Collapse:
+def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> DamCollapse:
     """Simulate a collapse.
 
     T and tau are measured with the true gravity, whatever `gravity` [m/s^2] is.
@@ -210,10 +210,10 @@ def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Col
         [now(0.0), *(now(row["time"]) for row in steps(simulation, END / (math.sqrt(N2) * unit)))]
     ).T
     tau = unit * time
-    return Collapse(*stays(math.sqrt(N2) * tau, place / cells), tau, height / (N2 * cells))
+    return DamCollapse(*stays(math.sqrt(N2) * tau, place / cells), tau, height / (N2 * cells))
 
 
-DAM_BREAK = Check(
+DAM_BREAK = ValidationCheck(
     about="A dam break against the experiments of Martin & Moyce 1952: a column of base a and "
     "height n^2 a, n^2 = 2.",
     trials=[(front_and_height, RESOLUTIONS), (far_front, RESOLUTIONS)],
@@ -309,7 +309,7 @@ def watch(
     return time, volumes, density
 
 
-VOLUME = Check(
+VOLUME = ValidationCheck(
     about="Columns that collapse keep their volume: two into each other for half a minute, those "
     "of the experiments for three seconds.",
     trials=[(columns, (64, 96)), (dam, RESOLUTIONS)],

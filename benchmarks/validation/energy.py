@@ -15,7 +15,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 
 
 @dataclass(frozen=True)
-class Step:
+class EnergyStep:
     """Energies [J; J/m in 2-D] of a step.
 
     Attributes:
@@ -123,7 +123,7 @@ class Ledger:
         self.simulation.restore(state)
         self._dt, self.now = self.simulation.last_dt, energy
 
-    def step(self, dt: float) -> Step:
+    def step(self, dt: float) -> EnergyStep:
         """Step by dt [s] and return the energy balance."""
         s = self.simulation
         before, momentum, self._dt = self.now, self._momentum(), dt
@@ -138,7 +138,7 @@ class Ledger:
                 body.properties.mass, body.properties.mass * (body.velocity - old)
             )
         self.now = self.energy() + gained
-        return Step(before, self.now, self._given, self._displaced)
+        return EnergyStep(before, self.now, self._given, self._displaced)
 
     def _free_fall(self, mass: float, change: np.ndarray) -> float:
         """Return the kinetic energy that free fall adds in half a step more.

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines, Record, Table
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordLines, RecordTable
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.validation.scenes import DEVICE
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 Curve = tuple[Sequence[float], Sequence[float]]
 ArrayCurve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
-Drawing = Callable[[Sequence["Trial"]], Lines]
+Drawing = Callable[[Sequence["ValidationTrial"]], RecordLines]
 COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 
@@ -72,7 +72,7 @@ def control(finding: Finding) -> Finding:
 
 
 @dataclass(frozen=True)
-class Trial:
+class ValidationTrial:
     """Check at one resolution."""
 
     check: str  # name of the check
@@ -96,7 +96,7 @@ class Trial:
         """Return a figure's value; NaN if there is none."""
         return next((f.value for f in self.findings if f.what == what), math.nan)
 
-    def record(self) -> Record:
+    def record(self) -> BenchmarkRecord:
         """Return the record for the file."""
         figures = {
             f.what: Figure(f.value, f.unit) for f in self.findings if not math.isnan(f.value)
@@ -110,7 +110,7 @@ class Trial:
             "controls_failed_as_they_must": all(f.passed for f in controls) if controls else None,
             "error": self.error or None,
         }
-        return Record(self.name, figures | {"seconds": Figure(self.seconds, "s")}, facts)
+        return BenchmarkRecord(self.name, figures | {"seconds": Figure(self.seconds, "s")}, facts)
 
     def failures(self) -> list[str]:
         """Return a line for each failure."""
@@ -124,18 +124,18 @@ class Trial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class ValidationCheck:
     """Check: what must hold, its trials and charts."""
 
     about: str  # what the check tests
     # Functions with their cases; a case is an argument, or a tuple of several.
-    trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]
+    trials: Sequence[tuple[Callable[..., ValidationTrial], Sequence[Any]]]
     # A comparison of the trials: its description and its function.
-    across: tuple[str, Callable[[Findings, Sequence[Trial]], None]] | None = None
+    across: tuple[str, Callable[[Findings, Sequence[ValidationTrial]], None]] | None = None
     charts: Sequence[Drawing] = ()
     known: str = ""  # known reason why it does not hold everywhere, for the report
 
-    def run(self, device: str) -> tuple[list[Trial], list[Lines]]:
+    def run(self, device: str) -> tuple[list[ValidationTrial], list[RecordLines]]:
         """Run all trials on a device, and draw them."""
         before = DEVICE.set(device)
         try:
@@ -152,7 +152,9 @@ class Check:
         return trials, [draw(trials) for draw in self.charts]
 
 
-def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Callable[..., Trial]]:
+def check_at(
+    check: str, resolution: str
+) -> Callable[[Callable[..., None]], Callable[..., ValidationTrial]]:
     """Make a function that adds findings into one that returns a trial.
 
     Args:
@@ -160,9 +162,9 @@ def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Cal
         resolution: resolution as text, with the function's arguments in braces.
     """
 
-    def decorated(run: Callable[..., None]) -> Callable[..., Trial]:
+    def decorated(run: Callable[..., None]) -> Callable[..., ValidationTrial]:
         @wraps(run)
-        def trial(*given: Any, **named: Any) -> Trial:
+        def trial(*given: Any, **named: Any) -> ValidationTrial:
             arguments = signature(run).bind(None, *given, **named)
             arguments.apply_defaults()
             return attempt(
@@ -176,7 +178,7 @@ def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Cal
     return decorated
 
 
-def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Trial:
+def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> ValidationTrial:
     """Run a check; a simulation that ends early fails the check, not the suite.
 
     Args:
@@ -189,7 +191,7 @@ def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Tri
         run(found)
     except (StepFailed, SimulationFailed, ValueError) as reason:
         error = str(reason)
-    return Trial(
+    return ValidationTrial(
         check, resolution, found.findings, time.perf_counter() - start_time, error, found.curves
     )
 
@@ -236,7 +238,7 @@ class Findings:
 
 
 def curves_of(
-    trials: Sequence[Trial], *labels: str, check: str = "", but: str = ""
+    trials: Sequence[ValidationTrial], *labels: str, check: str = "", but: str = ""
 ) -> dict[str, Curve]:
     """Return the curves of trials by resolution and label.
 
@@ -275,8 +277,8 @@ def plot(
         for label, (a, b) in (exact or {}).items()
     }
 
-    def draw(trials: Sequence[Trial]) -> Lines:
-        return Lines(
+    def draw(trials: Sequence[ValidationTrial]) -> RecordLines:
+        return RecordLines(
             name,
             title,
             x,
@@ -289,11 +291,11 @@ def plot(
     return draw
 
 
-def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:
+def table(check: str, remark: str, trials: Sequence[ValidationTrial]) -> RecordTable:
     """Return the table of a check's findings.
 
     A negative control must break its bound.
     """
     rows = [[t.name, *f.row()] for t in trials for f in sorted(t.findings, key=lambda f: f.control)]
     rows += [[t.name, "error", t.error, "none", "NO"] for t in trials if t.error]
-    return Table(check, COLUMNS, rows, remark)
+    return RecordTable(check, COLUMNS, rows, remark)

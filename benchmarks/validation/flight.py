@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.harness.record import RecordLines
 from warp_lcp.benchmarks.validation import scenes
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at
 from warp_lcp.benchmarks.validation.scenes import (
     GRAVITY,
     SHORTEST,
@@ -121,7 +121,7 @@ THROWN: dict[str, Callable[..., Any]] = {
     "body over liquid": partial(_liquid, numerics=SUB_CELL, liquid=POOL, solid=[CRATE]),
     "body over sand": partial(_sand, sand=POOL, solid=[CRATE]),
 }
-THROWING = Check(
+THROWING = ValidationCheck(
     about="What is thrown flies along its parabola: liquid, sand and a rigid body, at any CFL "
     "number, as long as nothing touches it.",
     trials=[(thrown, RESOLUTIONS)],
@@ -232,12 +232,12 @@ def parabolas(found: Findings, n: int) -> None:
     )
 
 
-SPINNING = Check(
+SPINNING = ValidationCheck(
     about="Liquid in flight: a spinning drop keeps its angular momentum, and what flies goes along "
     "its parabola.",
     trials=[(spinning, RESOLUTIONS), (parabolas, RESOLUTIONS[:1])],
     charts=[
-        lambda trials: Lines(
+        lambda trials: RecordLines(
             "spin",
             "Angular momentum of a spinning drop",
             "time [s]",

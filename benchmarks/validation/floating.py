@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at
 from warp_lcp.benchmarks.validation.scenes import (
     CORRECTED,
     DENSITY,
@@ -258,7 +258,7 @@ def _down(dimension: int) -> dict[str, Any]:
     return {"physics": {"gravity": [0.0, -GRAVITY, 0.0][:dimension]}}
 
 
-CHECK = Check(
+CHECK = ValidationCheck(
     about="Rigid bodies in a liquid: displacement at rest, added mass, momentum, and solves that "
     "do not depend on what bodies weigh.",
     trials=[

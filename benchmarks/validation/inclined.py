@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import (
     CORRECTED,
     GRAVITY,
@@ -258,7 +258,7 @@ STEADY_LAYERS = {
     f"Bagnold, {a:g} degrees": (HEIGHTS / DEPTH, bagnold_profile(HEIGHTS, a)) for a in STEADY
 }
 RUNNING = "inclined-layer", "Acceleration of a layer that runs", "slope [degrees]", "a / g"
-LAYERS = Check(
+LAYERS = ValidationCheck(
     about=__doc__ or "",
     trials=[(run, RESOLUTIONS) for run in (layer, slab, bagnold)],
     charts=[
@@ -414,7 +414,7 @@ def with_stairs(simulation: SandSimulation) -> SandSimulation:
     )
 
 
-OBLIQUE = Check(
+OBLIQUE = ValidationCheck(
     about="""
 Sand on walls that are inclined to the grid: a stiff block slides by Coulomb's law, and the rate of
 a smooth hopper does not depend on its place in the grid.

@@ -14,9 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.harness.record import RecordLines
 from warp_lcp.benchmarks.validation import scenes
-from warp_lcp.benchmarks.validation.finding import Check, Curve, Findings, Trial, check_at, plot
+from warp_lcp.benchmarks.validation.finding import (
+    Curve,
+    Findings,
+    ValidationCheck,
+    ValidationTrial,
+    check_at,
+    plot,
+)
 from warp_lcp.benchmarks.validation.scenes import (
     DENSITY,
     GRAVITY,
@@ -215,13 +222,15 @@ def _draw_profile(found: Findings, rest: Rest) -> None:
     found.curve("profile", y / LEVEL, pressure / (DENSITY * GRAVITY * LEVEL))
 
 
-def _profiles(trials: Sequence[Trial]) -> Lines:
+def _profiles(trials: Sequence[ValidationTrial]) -> RecordLines:
     curves: dict[str, Curve] = {"rho g (h - y)": ([0.0, 1.0], [1.0, 0.0])}
     curves |= {t.resolution: t.curves["profile"] for t in trials if "profile" in t.curves}
-    return Lines("pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", curves, log="")
+    return RecordLines(
+        "pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", curves, log=""
+    )
 
 
-RESTING = Check(
+RESTING = ValidationCheck(
     about="Liquids at rest: they stay there, and their pressure is that of their depth.",
     trials=[(run, RESOLUTIONS) for run in (whole_cells, sub_cell, tilted_surface)],
     charts=[
@@ -316,7 +325,7 @@ def write_wave(path: Path) -> None:
     path.write_text("\n".join([*vertices, *faces]) + "\n", encoding="utf-8")
 
 
-def finer(found: Findings, trials: Sequence[Trial]) -> None:
+def finer(found: Findings, trials: Sequence[ValidationTrial]) -> None:
     """Compare the errors of the period at both resolutions."""
     (coarse, _), (fine, stairs) = (
         [t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials
@@ -325,17 +334,17 @@ def finer(found: Findings, trials: Sequence[Trial]) -> None:
     found.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
 
 
-def _modes(trials: Sequence[Trial]) -> Lines:
+def _modes(trials: Sequence[ValidationTrial]) -> RecordLines:
     time = np.linspace(0.0, PERIODS * PERIOD, 400)
     curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
     for t in trials:
         curves |= t.curves
-    return Lines(
+    return RecordLines(
         "sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, log=""
     )
 
 
-SLOSHING = Check(
+SLOSHING = ValidationCheck(
     about="Sloshing of a small amplitude: omega^2 = g k tanh(k h), linear theory of waves on water "
     "of depth h.",
     trials=[(sloshing, WAVE_RESOLUTIONS)],

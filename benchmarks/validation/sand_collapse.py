@@ -9,9 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.harness.record import RecordLines
 from warp_lcp.benchmarks.validation import scenes
-from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, check_at, plot
+from warp_lcp.benchmarks.validation.finding import (
+    Findings,
+    ValidationCheck,
+    ValidationTrial,
+    check_at,
+    plot,
+)
 from warp_lcp.benchmarks.validation.scenes import (
     FRICTION_ANGLE,
     GRAVITY,
@@ -61,7 +67,7 @@ SLIPPERY = 5.0  # degrees, friction of a control
 DEEP, ALL = 1e-4, 1e-3  # [heights / s] drift of the inside, and of all
 
 
-class Collapse(NamedTuple):
+class SandCollapse(NamedTuple):
     """Result of a collapse."""
 
     runout: float  # place of the front, in widths
@@ -136,7 +142,12 @@ def runouts(
 
 
 def _compare(
-    found: Findings, label: str, c: Collapse, bounds: tuple[float, float], *, control: bool = False
+    found: Findings,
+    label: str,
+    c: SandCollapse,
+    bounds: tuple[float, float],
+    *,
+    control: bool = False,
 ) -> None:
     """Judge a runout by its bounds and a height by that of Lube et al."""
     judge = found.must_break if control else found.add
@@ -144,7 +155,7 @@ def _compare(
     judge(f"{label}: height over Lube's", c.height, low=1.0 - HEIGHT, high=1.0 + HEIGHT)
 
 
-def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -> Collapse:
+def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -> SandCollapse:
     """Let a column collapse.
 
     Args:
@@ -164,7 +175,7 @@ def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -
     outline = (scenes.profile(simulation)[1:-1] - scenes.FLOOR) / cells
     pile, x = outline > 0.0, (np.arange(len(outline)) + 0.5) / cells
     way, high = scenes.runout(simulation), scenes.height(simulation) / lube_height(aspect)
-    return Collapse(
+    return SandCollapse(
         way, high, way - before, _energy(rows), share_solved(rows), (x[pile], outline[pile])
     )
 
@@ -262,7 +273,7 @@ def _reach(x: np.ndarray) -> float:
     return float(np.percentile(np.linalg.norm(x, axis=1), 99.0))
 
 
-def _laws(trials: Sequence[Trial]) -> Lines:
+def _laws(trials: Sequence[ValidationTrial]) -> RecordLines:
     a = np.geomspace(0.4, 10.0, 60).tolist()
     laws = {"Lube et al. 2005": lube, "Lajeunesse et al. 2005": lajeunesse}
     curves: dict[str, Any] = {name: (a, [law(x) for x in a]) for name, law in laws.items()}
@@ -270,12 +281,12 @@ def _laws(trials: Sequence[Trial]) -> Lines:
         curves[label] = (a, [envelope(x)[side] for x in a])
     curves |= {t.resolution: t.curves.get("runout", ([], [])) for t in trials[:-1]}
     marked, title = frozenset(t.resolution for t in trials), "Runout of collapsing columns"
-    return Lines(
+    return RecordLines(
         "sand-runout", title, "a = height / width", "runout / width", curves, marked=marked
     )
 
 
-COLLAPSES = Check(
+COLLAPSES = ValidationCheck(
     about="Collapsing columns of sand against the runouts and heights that experiments found: Lube "
     "et al. 2005 and Lajeunesse et al. 2005.",
     trials=[(runouts, tuple(CASES)), (growing, [()]), (cube, [()])],
@@ -374,7 +385,7 @@ def watch(simulation: SandSimulation, duration: float) -> tuple[list[Row], float
     return rows, least, np.array(off)
 
 
-INVARIANTS = Check(
+INVARIANTS = ValidationCheck(
     about="What every step of sand must keep: its mass, pressures that push, what fits into a "
     "cell, and friction that takes energy.",
     trials=[(invariants, RESOLUTIONS)],
@@ -459,7 +470,7 @@ def models(found: Findings, cells: int) -> None:
     )
 
 
-RESTING = Check(
+RESTING = ValidationCheck(
     about="""
 A collapsed pile comes to rest: its inside does not move, and its surface moves less and less.
 

@@ -15,7 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, check_at, plot
+from warp_lcp.benchmarks.validation.finding import (
+    Findings,
+    ValidationCheck,
+    ValidationTrial,
+    check_at,
+    plot,
+)
 from warp_lcp.benchmarks.validation.scenes import box, create_sand, positions, share_solved, steps
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -203,7 +209,7 @@ def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float
     )
 
 
-def alike(found: Findings, trials: Sequence[Trial]) -> None:
+def alike(found: Findings, trials: Sequence[ValidationTrial]) -> None:
     """Compare the heaps of both resolutions."""
     for angle in ANGLES:
         coarse, fine = (t.value(f"{angle:g} degrees: heap") for t in trials[:2])
@@ -215,7 +221,7 @@ def alike(found: Findings, trials: Sequence[Trial]) -> None:
         )
 
 
-CHECK = Check(
+CHECK = ValidationCheck(
     about=__doc__ or "",
     trials=[(heaps, RESOLUTIONS), (wedges, RESOLUTIONS)],
     across=("both", alike),

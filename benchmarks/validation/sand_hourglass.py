@@ -13,9 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.harness.record import RecordLines
 from warp_lcp.benchmarks.validation import scenes
-from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, attempt, plot
+from warp_lcp.benchmarks.validation.finding import (
+    Findings,
+    ValidationCheck,
+    ValidationTrial,
+    attempt,
+    plot,
+)
 from warp_lcp.benchmarks.validation.scenes import (
     CORRECTED,
     GRAVITY,
@@ -53,7 +59,7 @@ class Discharge(NamedTuple):
         return 100.0 * float(np.ptp(self.rate) / self.rate.mean())
 
 
-def trial(refinement: int, openings: tuple[int, ...] = ()) -> Trial:
+def trial(refinement: int, openings: tuple[int, ...] = ()) -> ValidationTrial:
     """Measure the discharge of slots of several widths in cells.
 
     The control is a liquid.
@@ -200,14 +206,16 @@ def _rates(
     return 0.5 * (ends[1:] + ends[:-1]), -np.diff(ends) * WIDTH**2 / np.diff(at)
 
 
-def _law(trials: Sequence[Trial]) -> Lines:
+def _law(trials: Sequence[ValidationTrial]) -> RecordLines:
     laws: dict[str, Any] = {t.resolution: t.curves["law"] for t in trials if "law" in t.curves}
     laws["rate = sqrt(g D^3)"] = ([0.0, 0.09], [0.0, 0.09 * GRAVITY ** (1.0 / 3.0)])
     marked, y = frozenset(t.resolution for t in trials), "(rate)^(2/3) [m^(4/3) / s^(2/3)]"
-    return Lines("sand-slot", "Discharge over the slot", "D [m]", y, laws, log="", marked=marked)
+    return RecordLines(
+        "sand-slot", "Discharge over the slot", "D [m]", y, laws, log="", marked=marked
+    )
 
 
-CHECK = Check(
+CHECK = ValidationCheck(
     about=__doc__ or "",
     trials=[(trial, tuple(OPENINGS))],
     charts=[

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -326,7 +326,7 @@ LAWS = {
     f"Janssen, mu = 0.5, K = {ratio:.2g}": (DEPTHS, [janssen(z, 0.5, ratio) for z in DEPTHS])
     for ratio in RATIOS
 }
-CHECK = Check(
+CHECK = ValidationCheck(
     about=__doc__ or "",
     trials=[
         (trial, [(n, dimension) for dimension, cells in RESOLUTIONS.items() for n in cells]),

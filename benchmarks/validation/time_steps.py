@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.benchmarks.validation.energy import Ledger
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import (
     SHORTEST,
     SUB_CELL,
@@ -156,7 +156,7 @@ PUSHED_APART: dict[str, Watched] = {
     "liquid, unilateral": _push_liquid_apart,
 }
 
-CHECK = Check(
+CHECK = ValidationCheck(
     about="The energy of a collapse converges as its steps get shorter, and no step makes any, the "
     "first one from rest included.",
     trials=[(trial, [(n, what) for n in RESOLUTIONS for what in LONGEST])],

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.harness.record import Lines
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.harness.record import RecordLines
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at
 from warp_lcp.benchmarks.validation.scenes import DEVICE
 from warp_lcp.benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance
@@ -250,11 +250,11 @@ def carried(
     return np.asarray(position.numpy(), dtype=np.float64)
 
 
-CHECK = Check(
+CHECK = ValidationCheck(
     about="Particles and grid: what the transfers conserve, and the order of the advection.",
     trials=[(round_trip, RESOLUTIONS), (orders, [()])],
     charts=[
-        lambda ran: Lines(
+        lambda ran: RecordLines(
             "advection",
             "Error of the advection",
             "steps a turn, or cells a side",

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.benchmarks.validation import scenes
-from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at
 from warp_lcp.benchmarks.validation.scenes import (
     GRAVITY,
     SUB_CELL,
@@ -129,7 +129,7 @@ def _hold(simulation: LiquidSimulation) -> None:
     simulation.boundary.extrapolate_velocity = forgetful  # type: ignore[assignment, method-assign]
 
 
-CEILING = Check(
+CEILING = ValidationCheck(
     about="Letting go of the ceiling: a block that spans it from wall to wall falls freely, every "
     "particle of it.",
     trials=[
@@ -204,7 +204,7 @@ def slide(cells: int, numerics: Numerics, wall: str) -> tuple[float, float, floa
     )
 
 
-SLOPE = Check(
+SLOPE = ValidationCheck(
     about="Flow along a slanted wall: without gravity nothing may slow a layer that slides along "
     "it, and nothing may lift it.",
     trials=[(sliding, (10, 20))],

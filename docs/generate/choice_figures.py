@@ -18,7 +18,7 @@ from warp_lcp.benchmarks.choose import (
     over_best,
     rule_row,
 )
-from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
+from warp_lcp.benchmarks.harness.record import MACHINE, BenchmarkRecord, read_json
 from warp_lcp.rules import RULES
 
 ROOT = Path(__file__).parents[2]
@@ -61,7 +61,7 @@ def section() -> str:
     return "\n".join(lines) + "\n"
 
 
-def table(records: list[Record]) -> list[str]:
+def table(records: list[BenchmarkRecord]) -> list[str]:
     """Return the lines of the table: a row for each rule that applied to a problem."""
     columns = [RULE_COLUMNS.index(name) for name in SHOWN]
     rows = [rule_row(number, records) for number in range(1, len(RULES) + 1)]
@@ -73,7 +73,7 @@ def _row(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _is_slow(record: Record) -> bool:
+def _is_slow(record: BenchmarkRecord) -> bool:
     return over_best(record, DEFAULT) is not None and not is_right(record, DEFAULT)
 
 

@@ -11,11 +11,11 @@ import warp_lcp as wl
 from warp_lcp.benchmarks import book
 from warp_lcp.benchmarks.book import appendix_c, contact_scenes, outcome, studies
 from warp_lcp.benchmarks.book.outcome import Limits, Merit, Trace, follow
-from warp_lcp.benchmarks.book.problems import Scale, contact_matrix, dense, kinds
+from warp_lcp.benchmarks.book.problems import ProblemScale, contact_matrix, dense, kinds
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.gallery import contact_scenes as gallery
 
-SMALL = Scale.of(Options("cpu", (8,), 1, print))
+SMALL = ProblemScale.of(Options("cpu", (8,), 1, print))
 
 
 def test_the_suite_runs_every_experiment(monkeypatch, tmp_path):
@@ -82,7 +82,7 @@ def test_the_suite_runs_every_experiment(monkeypatch, tmp_path):
 @pytest.mark.parametrize("kind", list(kinds(SMALL)))
 def test_planted_solutions_are_solutions_and_those_of_the_recipes_are_not(kind):
     for k in range(5):
-        p = kinds(Scale(5, 4, 5, 12, (8,), (2,), 10))[kind](k)
+        p = kinds(ProblemScale(5, 4, 5, 12, (8,), (2,), 10))[kind](k)
         if p.solution is None:
             continue
         y = p.A @ p.solution + p.b
@@ -119,7 +119,7 @@ def test_the_contact_recipe_has_the_pattern_of_stewart_and_trinkle_on_its_diagon
 
 
 def test_the_book_s_test_of_sweeps_accepts_what_solves_nothing():
-    p = kinds(Scale(5, 4, 10, 12, (8,), (2,), 10))["contact, recipe"](0)
+    p = kinds(ProblemScale(5, 4, 10, 12, (8,), (2,), 10))["contact, recipe"](0)
     trace = follow(p, appendix_c.PGS, Merit.PRODUCT, "cpu")
     state, _, residual = trace.verdict(Merit.PRODUCT, Limits())
     assert state == "absolute"
@@ -129,7 +129,7 @@ def test_the_book_s_test_of_sweeps_accepts_what_solves_nothing():
 
 @pytest.mark.parametrize("zeros", [0.0, 0.6, 0.8])
 def test_the_recipe_with_many_zero_eigenvalues_has_no_solution(zeros):
-    scale = Scale(5, 4, 5, 60, (8,), (2,), 10)
+    scale = ProblemScale(5, 4, 5, 60, (8,), (2,), 10)
     for k in range(3):
         assert studies.solvable(dense("recipe", scale, k, zeros)) == (zeros == 0)
         planted = dense("planted", scale, k, zeros)

@@ -9,7 +9,7 @@ import pytest
 import warp_lcp as wl
 from warp_lcp.benchmarks import choose
 from warp_lcp.benchmarks.choose_problems import KINDS, RARE, draw
-from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.rules import RULES
 
@@ -47,7 +47,7 @@ def made(rule, name, status, seconds, alternatives=()):
         "status": status,
         "budgets": {"5 steps": "psor"},
     }
-    return Record(name, figures, {**facts, "iterations": dict.fromkeys(status, 5)})
+    return BenchmarkRecord(name, figures, {**facts, "iterations": dict.fromkeys(status, 5)})
 
 
 SOLVED, FAILED = "CONVERGED", "STAGNATED"
@@ -94,7 +94,7 @@ def test_the_suite_tries_every_method(monkeypatch, tmp_path):
     monkeypatch.setattr(choose, "KINDS", {"portfolio": KINDS["portfolio"]})
     monkeypatch.setattr(choose, "LONGEST", 0.2)
     monkeypatch.setattr(choose, "RARE", {"negative diagonal": RARE["negative diagonal"]})
-    monkeypatch.setattr(choose, "machine", lambda *a, **k: Record("machine"))
+    monkeypatch.setattr(choose, "machine", lambda *a, **k: BenchmarkRecord("machine"))
     results = choose.measure(Options("cpu", (), 1, lambda line: None, seed=901), tmp_path)
     records = results.records[1:]
     assert [r.facts["rule"] for r in records] == [12, 5]

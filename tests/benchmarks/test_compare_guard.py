@@ -3,13 +3,15 @@
 import pytest
 
 from warp_lcp.benchmarks.harness.compare import comparison, losses
-from warp_lcp.benchmarks.harness.record import Record, write_json
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord, write_json
 from warp_lcp.benchmarks.harness.timing import Figure
 
 
 def result(*samples, figure="pyamg_over_this"):
     return {
-        "64^3": Record("64^3", {figure: Figure.of(samples), "total": Figure(1.0 / samples[0], "s")})
+        "64^3": BenchmarkRecord(
+            "64^3", {figure: Figure.of(samples), "total": Figure(1.0 / samples[0], "s")}
+        )
     }
 
 

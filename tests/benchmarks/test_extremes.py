@@ -15,8 +15,8 @@ from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import bounds, broken, case, matrices, refused, shapes
 from warp_lcp.benchmarks.extremes.case import (
-    Attempt,
     Expected,
+    ExtremeAttempt,
     Promise,
     RefusalCase,
     SolveCase,
@@ -88,27 +88,33 @@ def test_what_wrong_solvers_are_given_passes_with_a_right_one(precision):
 
 def test_a_wrong_solver_that_passes_fails_the_suite():
     promise = Promise(Expected.CAUGHT)
-    assert violations(promise, Attempt("CONVERGED", 1e-9, met=True)) == ["a wrong solver passes"]
-    assert violations(promise, Attempt("CONVERGED", 1.0, faults=["found"])) == []
+    assert violations(promise, ExtremeAttempt("CONVERGED", 1e-9, met=True)) == [
+        "a wrong solver passes"
+    ]
+    assert violations(promise, ExtremeAttempt("CONVERGED", 1.0, faults=["found"])) == []
 
 
 @pytest.mark.parametrize(
     ("promise", "attempt", "expected"),
     [
-        (case.SOLVED, Attempt("CONVERGED", 1e-9, met=True), ""),
-        (case.SOLVED, Attempt("CONVERGED", 1e-2), "not solved"),
-        (case.SOLVED, Attempt("STAGNATED", 1e-2), "not solved"),
-        (case.SOLVED, Attempt("refused", message="b"), "refused: b"),
-        (case.refusal("b "), Attempt("refused", message="b holds 1 NaN"), ""),
-        (case.refusal("b "), Attempt("refused", message="something is wrong"), "does not name b "),
-        (case.refusal("b "), Attempt("CONVERGED", 0.0, met=True), "not refused"),
-        (case.INFEASIBLE, Attempt("INFEASIBLE", 1.0), ""),
-        (case.INFEASIBLE, Attempt("STAGNATED", 1.0), "not INFEASIBLE"),
-        (case.EITHER, Attempt("FLOOR", 1e-7), ""),
-        (case.EITHER, Attempt("DIVERGED", 1e7), "DIVERGED"),
+        (case.SOLVED, ExtremeAttempt("CONVERGED", 1e-9, met=True), ""),
+        (case.SOLVED, ExtremeAttempt("CONVERGED", 1e-2), "not solved"),
+        (case.SOLVED, ExtremeAttempt("STAGNATED", 1e-2), "not solved"),
+        (case.SOLVED, ExtremeAttempt("refused", message="b"), "refused: b"),
+        (case.refusal("b "), ExtremeAttempt("refused", message="b holds 1 NaN"), ""),
+        (
+            case.refusal("b "),
+            ExtremeAttempt("refused", message="something is wrong"),
+            "does not name b ",
+        ),
+        (case.refusal("b "), ExtremeAttempt("CONVERGED", 0.0, met=True), "not refused"),
+        (case.INFEASIBLE, ExtremeAttempt("INFEASIBLE", 1.0), ""),
+        (case.INFEASIBLE, ExtremeAttempt("STAGNATED", 1.0), "not INFEASIBLE"),
+        (case.EITHER, ExtremeAttempt("FLOOR", 1e-7), ""),
+        (case.EITHER, ExtremeAttempt("DIVERGED", 1e7), "DIVERGED"),
         (
             case.EITHER,
-            Attempt("FLOOR", 1e-7, faults=["says the residual is 0"]),
+            ExtremeAttempt("FLOOR", 1e-7, faults=["says the residual is 0"]),
             "says the residual is 0",
         ),
     ],

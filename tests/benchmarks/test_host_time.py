@@ -19,8 +19,8 @@ from warp_lcp.benchmarks.host import (
     StepRecorder,
     scene_records,
 )
-from warp_lcp.rows.program import Program
-from warp_lcp.rows.vectors import ADD, rows_of
+from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -39,7 +39,7 @@ def addition():
 
 def test_calls_are_counted_in_the_stage_that_makes_them(addition):
     x, bound = addition
-    program = Program(x.device)
+    program = CommandBuffer(x.device)
     bound.launch(program.launch)
     bound.launch(program.launch)
     timer = StageTimer()

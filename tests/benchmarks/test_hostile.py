@@ -11,7 +11,14 @@ import pytest
 import warp_lcp as wl
 from warp_lcp.benchmarks.hostile import KINDS, attempt, draw, draw_case, examine, judge
 from warp_lcp.benchmarks.hostile.__main__ import FAULTS, report, supervise
-from warp_lcp.benchmarks.hostile.case import Answer, Box, Case, Program, Refusal, Values
+from warp_lcp.benchmarks.hostile.case import (
+    HostileAnswer,
+    HostileBox,
+    HostileCase,
+    HostileProgram,
+    Refusal,
+    Values,
+)
 from warp_lcp.benchmarks.hostile.judge import exists, residual, scales
 
 qpsolvers = pytest.importorskip("qpsolvers")
@@ -22,11 +29,13 @@ A = np.array([[2.0, 1.0], [1.0, 2.0]])
 
 def box(b, **known):
     given = {"A": A, "lower": np.zeros(2), "upper": np.full(2, np.inf), "definite": True, **known}
-    return Box(b=np.array(b), **given)
+    return HostileBox(b=np.array(b), **given)
 
 
 def categories(truth, answer, method=None):
-    return [category for category, _ in judge(Case("", lambda: answer, truth, method), answer)]
+    return [
+        category for category, _ in judge(HostileCase("", lambda: answer, truth, method), answer)
+    ]
 
 
 @pytest.mark.parametrize("large", [1.0, 1e8, 1e16])
@@ -36,17 +45,19 @@ def test_a_wrong_x_is_a_false_convergence(large):
     b = (-1, large) has the solution x = (1/2, 0), however large the inactive row is.
     """
     truth = box([-1.0, large], solution=np.array([0.5, 0.0]), solvable=True, unique=True)
-    assert categories(truth, Answer("CONVERGED", np.array([0.5, 0.0]))) == ["converged"]
+    assert categories(truth, HostileAnswer("CONVERGED", np.array([0.5, 0.0]))) == ["converged"]
     for wrong in ([0.0, 0.0], [0.49, 0.0], [0.5, 0.01], [-0.5, 0.0], [np.nan, 0.0]):
-        assert categories(truth, Answer("CONVERGED", np.array(wrong))) == ["FALSE CONVERGED"], wrong
+        assert categories(truth, HostileAnswer("CONVERGED", np.array(wrong))) == [
+            "FALSE CONVERGED"
+        ], wrong
 
 
 def test_signs_at_upper_bounds_and_in_equations():
     truth = box([-9.0, 0.0], lower=np.array([0.0, -np.inf]), upper=np.array([1.0, np.inf]))
     # y = (-7.5, 0)
-    assert categories(truth, Answer("CONVERGED", np.array([1.0, -0.5]))) == ["converged"]
+    assert categories(truth, HostileAnswer("CONVERGED", np.array([1.0, -0.5]))) == ["converged"]
     assert categories(
-        replace(truth, b=np.array([9.0, 0.0])), Answer("CONVERGED", np.array([1.0, -0.5]))
+        replace(truth, b=np.array([9.0, 0.0])), HostileAnswer("CONVERGED", np.array([1.0, -0.5]))
     ) == ["FALSE CONVERGED"]
 
 
@@ -55,18 +66,18 @@ def test_a_row_that_others_hide_is_told():
 
     x_1 = 0 is wrong in its own row, but only 1e-12 of the norm to which the tolerance is relative.
     """
-    truth = Box(
+    truth = HostileBox(
         A=np.eye(2),
         b=np.array([-1.0, -1e12]),
         lower=np.zeros(2),
         upper=np.full(2, np.inf),
         definite=True,
     )
-    assert categories(truth, Answer("CONVERGED", np.array([0.0, 1e12]))) == [
+    assert categories(truth, HostileAnswer("CONVERGED", np.array([0.0, 1e12]))) == [
         "converged",
         "row hidden",
     ]
-    assert categories(truth, Answer("CONVERGED", np.array([1.0, 1e12]))) == ["converged"]
+    assert categories(truth, HostileAnswer("CONVERGED", np.array([1.0, 1e12]))) == ["converged"]
 
 
 def test_a_false_infeasible_is_seen():
@@ -74,7 +85,7 @@ def test_a_false_infeasible_is_seen():
 
     It is detected by the planted solution, by a linear program for monotone A, and by enumeration.
     """
-    claim = Answer("INFEASIBLE", np.zeros(2))
+    claim = HostileAnswer("INFEASIBLE", np.zeros(2))
     assert categories(box([-1.0, 1.0], solvable=True), claim) == ["FALSE INFEASIBLE"]
     assert categories(box([-1.0, 1.0]), claim) == ["FALSE INFEASIBLE"]
     assert categories(box([-1.0, 1.0], definite=False), claim) == ["FALSE INFEASIBLE"]
@@ -86,14 +97,16 @@ def test_a_false_infeasible_is_seen():
 
 def test_what_ends_honestly():
     known = box([-1.0, 1.0], solvable=True)
-    assert categories(known, Answer("STAGNATED", np.zeros(2))) == ["not solved"]
-    assert categories(known, Answer("STAGNATED", np.zeros(2)), "psor") == ["other method"]
-    assert categories(replace(known, solvable=False), Answer("STAGNATED", np.zeros(2))) == [
+    assert categories(known, HostileAnswer("STAGNATED", np.zeros(2))) == ["not solved"]
+    assert categories(known, HostileAnswer("STAGNATED", np.zeros(2)), "psor") == ["other method"]
+    assert categories(replace(known, solvable=False), HostileAnswer("STAGNATED", np.zeros(2))) == [
         "honest"
     ]
-    assert categories(known, Answer("REFUSED", None)) == ["refused"]
-    assert categories(Refusal("no matrix"), Answer("REFUSED", None)) == ["honest"]
-    assert categories(Refusal("no matrix"), Answer("CONVERGED", np.zeros(2))) == ["FALSE CONVERGED"]
+    assert categories(known, HostileAnswer("REFUSED", None)) == ["refused"]
+    assert categories(Refusal("no matrix"), HostileAnswer("REFUSED", None)) == ["honest"]
+    assert categories(Refusal("no matrix"), HostileAnswer("CONVERGED", np.zeros(2))) == [
+        "FALSE CONVERGED"
+    ]
 
 
 def test_scales_hardly_depend_on_units():
@@ -103,7 +116,7 @@ def test_scales_hardly_depend_on_units():
     """
     rng = np.random.default_rng(SEED)
     M, b, s = rng.standard_normal((5, 5)), rng.standard_normal(5), 10.0 ** rng.integers(-6, 6, 5)
-    plain = Box(A=M, b=b, lower=np.zeros(5), upper=np.full(5, np.inf))
+    plain = HostileBox(A=M, b=b, lower=np.zeros(5), upper=np.full(5, np.inf))
     other = replace(plain, A=draw.scaled(M, s, np.ones(5)), b=s * b)
     x = np.abs(rng.standard_normal(5))
     for one, two in (
@@ -118,30 +131,32 @@ def test_programs_are_judged_in_plain_units():
     pytest.importorskip("piqp")
     one = np.ones((1, 1))
     plain = qpsolvers.Problem(one, -np.ones(1), G=one, h=np.array([0.5]))  # minimum at x = 0.5
-    truth = Program(scaled=plain, plain=plain, expected="solvable", unique=True)
-    assert categories(truth, Answer("CONVERGED", np.array([0.5]))) == ["converged"]
+    truth = HostileProgram(scaled=plain, plain=plain, expected="solvable", unique=True)
+    assert categories(truth, HostileAnswer("CONVERGED", np.array([0.5]))) == ["converged"]
     for wrong in (0.4, 0.6, 0.0, 1.0):
-        assert categories(truth, Answer("CONVERGED", np.array([wrong]))) == ["FALSE CONVERGED"]
-    assert categories(truth, Answer("INFEASIBLE", None)) == ["FALSE INFEASIBLE"]
+        assert categories(truth, HostileAnswer("CONVERGED", np.array([wrong]))) == [
+            "FALSE CONVERGED"
+        ]
+    assert categories(truth, HostileAnswer("INFEASIBLE", None)) == ["FALSE INFEASIBLE"]
     assert categories(
-        replace(truth, expected="unbounded"), Answer("CONVERGED", np.array([0.5]))
+        replace(truth, expected="unbounded"), HostileAnswer("CONVERGED", np.array([0.5]))
     ) == ["FALSE CONVERGED"]
 
 
 def test_values_and_exceptions():
     truth = Values({"b": np.array([1.0, -2.0])}, 1e-6)
-    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, -2.0])})) == [
-        "converged"
-    ]
-    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, 2.0])})) == [
+    assert categories(
+        truth, HostileAnswer("CONVERGED", None, "", {"b": np.array([1.0, -2.0])})
+    ) == ["converged"]
+    assert categories(truth, HostileAnswer("CONVERGED", None, "", {"b": np.array([1.0, 2.0])})) == [
         "FALSE CONVERGED"
     ]
 
     def fail():
         raise np.linalg.LinAlgError("from inside")
 
-    assert attempt(Case("", fail, truth)).status == "EXCEPTION"
-    refused = attempt(Case("", lambda: wl.LCP(A, np.array([np.nan, 1.0])), truth))
+    assert attempt(HostileCase("", fail, truth)).status == "EXCEPTION"
+    refused = attempt(HostileCase("", lambda: wl.LCP(A, np.array([np.nan, 1.0])), truth))
     assert (refused.status, "b" in refused.note) == ("REFUSED", True)
 
 
@@ -187,9 +202,9 @@ def test_planted_solutions_solve():
     for kind in KINDS:
         for _ in range(8):
             case = KINDS[kind](rng)
-            if isinstance(case.truth, Box) and case.truth.solution is not None:
+            if isinstance(case.truth, HostileBox) and case.truth.solution is not None:
                 assert (
-                    categories(case.truth, Answer("CONVERGED", case.truth.solution))[0]
+                    categories(case.truth, HostileAnswer("CONVERGED", case.truth.solution))[0]
                     == "converged"
                 ), case.name
                 planted += 1

@@ -82,4 +82,6 @@ def test_headers_have_the_tests_of_who_names_them():
         "tests/multigrid/test_hierarchy.py"
         in chosen_for(ROOT, "warp_lcp/multigrid/headers/coarsen.h")[:4]
     )
-    assert "tests/rows/test_row_pass.py" in chosen_for(ROOT, "warp_lcp/rows/headers/piece.h")[:2]
+    assert (
+        "tests/kernels/test_row_pass.py" in chosen_for(ROOT, "warp_lcp/kernels/headers/piece.h")[:2]
+    )

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import warp_lcp as wl
 from warp_lcp.benchmarks import peers as suite
 from warp_lcp.benchmarks.peers import libraries, petsc
-from warp_lcp.benchmarks.peers.peer import Answer, Peer, PeerFailed, Question
+from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, Question
 from warp_lcp.benchmarks.peers.petsc import Worker
 from warp_lcp.benchmarks.peers.roster import roster
 from warp_lcp.benchmarks.problems import splash
@@ -163,7 +163,7 @@ def contest(question, errors):
     def solve(asked, tolerance):
         if errors is None:
             raise PeerFailed("it is made of cheese")
-        return Answer(x * (1 + errors * tolerance), 0.1, 0.2, 3)
+        return PeerAnswer(x * (1 + errors * tolerance), 0.1, 0.2, 3)
 
     return suite.Contest(Peer("stub", "none", solve), question)
 

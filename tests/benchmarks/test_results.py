@@ -12,11 +12,11 @@ from warp_lcp.benchmarks.harness.compare import bounds, comparison
 from warp_lcp.benchmarks.harness.machine import array_bytes, resident_bytes
 from warp_lcp.benchmarks.harness.record import (
     Bars,
-    Lines,
-    Record,
+    BenchmarkRecord,
+    RecordLines,
+    RecordTable,
+    RecordTarget,
     Results,
-    Table,
-    Target,
     read_json,
     write_json,
 )
@@ -24,7 +24,7 @@ from warp_lcp.benchmarks.harness.timing import Figure, in_turns, ratios, timed
 
 
 def record(name, *samples, **facts):
-    return Record(name, {"total": Figure.of(samples, "s")}, facts)
+    return BenchmarkRecord(name, {"total": Figure.of(samples, "s")}, facts)
 
 
 def test_figures():
@@ -117,17 +117,17 @@ def test_comparison_tells_change_from_noise(tmp_path):
 def test_report_and_charts(tmp_path):
     charts = [
         Bars("b", "bars", "s", {"one": 1.0, "two": 20.0}, limit=5.0, logarithmic=True),
-        Lines("l", "lines", "x", "y", {"c": ([1, 2], [1e-3, 1e-5])}),
+        RecordLines("l", "lines", "x", "y", {"c": ([1, 2], [1e-3, 1e-5])}),
     ]
     images = report.draw(charts, tmp_path, "x")
     assert [image.name for image in images] == ["x-b.png", "x-l.png"]
     assert all(image.read_bytes().startswith(b"\x89PNG") for image in images)
-    where = Record("machine", {}, {"date": "today", "hardware": {"cpu": "Z80"}})
+    where = BenchmarkRecord("machine", {}, {"date": "today", "hardware": {"cpu": "Z80"}})
     report.write_markdown(
         tmp_path / "x.md",
         "Title",
         where,
-        [Table("T", ["a", "b"], [["1", "2|3"]], "Remark.")],
+        [RecordTable("T", ["a", "b"], [["1", "2|3"]], "Remark.")],
         images,
     )
     text = (tmp_path / "x.md").read_text()
@@ -141,7 +141,7 @@ def test_no_charts_without_matplotlib(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "present", lambda name: False)
     assert report.draw([Bars("b", "bars", "s", {"one": 1.0})], tmp_path, "x") == []
     assert not machine.present("no-such-distribution")
-    where = Record("machine", {}, {"date": "today"})
+    where = BenchmarkRecord("machine", {}, {"date": "today"})
     said = report.write(
         "x", "Title", Results([where], [], [Bars("b", "bars", "s", {"one": 1.0})]), tmp_path
     )
@@ -150,10 +150,10 @@ def test_no_charts_without_matplotlib(tmp_path, monkeypatch):
 
 
 def test_targets():
-    assert Target("x", 2, Figure(1.5)).met
-    assert not Target("x", 2, Figure(1.5), at_least=True).met
-    assert Target("x", 2, None).row() == ["x", "<= 2", "not measured here", ""]
-    assert Target("x", 40, Figure.of([30.0, 41.0, 43.0]), " x", True).row() == [
+    assert RecordTarget("x", 2, Figure(1.5)).met
+    assert not RecordTarget("x", 2, Figure(1.5), at_least=True).met
+    assert RecordTarget("x", 2, None).row() == ["x", "<= 2", "not measured here", ""]
+    assert RecordTarget("x", 40, Figure.of([30.0, 41.0, 43.0]), " x", True).row() == [
         "x",
         ">= 40 x",
         "41 x (30 to 43)",

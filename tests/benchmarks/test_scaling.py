@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import warp_lcp as wl
 from warp_lcp.benchmarks import scaling
-from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import BOUNDS, natural, splash
 from warp_lcp.cli import commands as cli
@@ -109,7 +109,7 @@ def test_floors_grow_with_the_grid_and_shrink_with_the_precision():
 
 
 def test_a_solve_that_tells_another_residual_is_a_failure():
-    ended = Record(
+    ended = BenchmarkRecord(
         "floor 16^3 walls mixed",
         {"floor": Figure(1e-7), "told": Figure(1e-15)},
         {"precision": "mixed"},

@@ -13,7 +13,7 @@ import warp_lcp as wl
 from oracle import boxed, lemke
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import broken, unseen
-from warp_lcp.benchmarks.extremes.case import Attempt, Verdict, judge
+from warp_lcp.benchmarks.extremes.case import ExtremeAttempt, ExtremeVerdict, judge
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Pools, equality, solvable
 from warp_lcp.benchmarks.extremes.unseen import judging
 from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, changed
@@ -263,7 +263,9 @@ def verdict(kind, iterations, equations, *, status="CONVERGED"):
         "often": 2 * equations + 6,
     }
     case = UnseenCase(kind, 5)
-    return Verdict(case, "mixed", case.promise("mixed"), Attempt(status, 1e-7, facts=facts), [])
+    return ExtremeVerdict(
+        case, "mixed", case.promise("mixed"), ExtremeAttempt(status, 1e-7, facts=facts), []
+    )
 
 
 def test_summary_counts_those_within_twice_the_equations():

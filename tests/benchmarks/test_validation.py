@@ -14,14 +14,14 @@ from scipy.integrate import trapezoid
 
 import warp_lcp.benchmarks.__main__ as process
 from warp_lcp.benchmarks import validation
-from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.harness.record import RecordLines
 from warp_lcp.benchmarks.suite import VALIDATION
 from warp_lcp.benchmarks.validation import dam_break, rest, signals, transfers, walls
 from warp_lcp.benchmarks.validation.finding import (
-    Check,
     Finding,
     Findings,
-    Trial,
+    ValidationCheck,
+    ValidationTrial,
     attempt,
     control,
     table,
@@ -51,7 +51,7 @@ def test_a_finding_keeps_its_bound_and_a_control_breaks_it() -> None:
     assert Finding("x", 9.0, low=1.0, high=2.0).row() == ["x", "9", "1 to 2", "NO"]
 
 
-def found(value: float, broken: float) -> Trial:
+def found(value: float, broken: float) -> ValidationTrial:
     def run(findings: Findings) -> None:
         findings.add("error", value, high=1.0, unit="%")
         findings.must_break("whole cells: error", broken, high=1.0, unit="%")
@@ -283,8 +283,8 @@ def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
 def test_a_failed_check_ends_the_process_with_1_after_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
-    chart = Lines("waves", "waves", "t", "y", {"c": ([0.0, 1.0], [-1.0, 1.0])}, log="")
-    check = Check(
+    chart = RecordLines("waves", "waves", "t", "y", {"c": ([0.0, 1.0], [-1.0, 1.0])}, log="")
+    check = ValidationCheck(
         about="Waves.",
         trials=[(found, [(error, 3.0)])],
         charts=[lambda trials: chart],

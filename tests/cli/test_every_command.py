@@ -16,7 +16,7 @@ import tomli_w
 from command_line import succeed
 from particle_scenes import particle_scenes
 from scenes_of_every_table import MOTIONS, SHAPES, SIDES, scene_of_every_table
-from warp_lcp.cli import shown
+from warp_lcp.cli import view_commands as shown
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators

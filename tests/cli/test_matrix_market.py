@@ -13,7 +13,7 @@ import scipy.io
 import scipy.sparse
 
 from warp_lcp.cli.matrix_market import HEAD, MarketError, read_market, read_shape
-from warp_lcp.files.claims import ClaimError
+from warp_lcp.files.size_limits import ClaimError
 
 RANDOM = np.random.default_rng(733)
 FULL = RANDOM.standard_normal((5, 5))

@@ -22,7 +22,7 @@ import dots_on_ranks
 
 from warp_lcp.cli import commands as cli
 from warp_lcp.distributed import launch
-from warp_lcp.distributed.waiting import Waiting
+from warp_lcp.distributed.interruptible_wait import InterruptibleWait
 from warp_lcp.run import loop
 
 # Audit events are raised before the system call.
@@ -108,8 +108,8 @@ def lay_in_wait(place: str, fault: Fault) -> None:
         sys.addaudithook(audit)
         return
     where, name = {
-        "wait": (Waiting, "__enter__"),
-        "wait-end": (Waiting, "__exit__"),
+        "wait": (InterruptibleWait, "__enter__"),
+        "wait-end": (InterruptibleWait, "__exit__"),
         "step": (loop, "take_step"),
     }[place]
     real = getattr(where, name)

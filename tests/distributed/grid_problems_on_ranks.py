@@ -14,13 +14,13 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import Halo
+from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.distributed.waiting import waiting
+from warp_lcp.kernels.launch_graph import Task, run_table
+from warp_lcp.kernels.thread_pool import OperationTable
 from warp_lcp.multigrid import halo_levels
+from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.multigrid.stencil_level import StencilLevel
-from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.rows.program import Task, run_table
-from warp_lcp.rows.team import Table
 
 rng = np.random.default_rng(7301)
 
@@ -471,16 +471,16 @@ def messages_in_tables(ranks):
     nothing is sent after it.
     """
     sums = np.array([0.1, 10.0**ranks.rank])
-    run_table(Table([ranks.adding(sums)]))
+    run_table(OperationTable([ranks.adding(sums)]))
     expected = ranks.sum(np.array([0.1, 10.0**ranks.rank]))
     assert sums.tobytes() == expected.tobytes()
     waiting.native[1] = 15
     try:
-        run_table(Table([ranks.adding(np.ones(2))]))
+        run_table(OperationTable([ranks.adding(np.ones(2))]))
         raise AssertionError("no error")
     except RuntimeError as error:
         assert "error 15" in str(error), error
-    run_table(Table([ranks.adding(sums)]))
+    run_table(OperationTable([ranks.adding(sums)]))
     assert waiting.native[0] % 2 == 0
 
 

@@ -17,15 +17,15 @@ import small_sands
 from code_blocks import blocks
 from small_liquids import box
 from warp_lcp.distributed.balance import Balance
+from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.distributed.waiting import waiting
 from warp_lcp.fluids import SIMULATOR, viscosity_multigrid
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
-from warp_lcp.granular.coupled import HeavyBallProjectedGradient
+from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
+from warp_lcp.kernels.thread_pool import ThreadPool
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.rows.team import Team
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import SimulationFailed, StepFailed
@@ -581,7 +581,9 @@ def launches(ranks: Ranks, folder: Path) -> None:
             advance(simulation, 3)
             simulation.method = HeavyBallProjectedGradient(least=least, cold=least)
             with (
-                patch.object(Team, "run", autospec=True, side_effect=Team.run) as tables,
+                patch.object(
+                    ThreadPool, "run", autospec=True, side_effect=ThreadPool.run
+                ) as tables,
                 patch.object(wp, "launch", wraps=wp.launch) as single,
             ):
                 exchanges = waiting._count

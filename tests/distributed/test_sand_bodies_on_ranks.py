@@ -10,7 +10,7 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.yield_set import NUMBERS
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -27,7 +27,7 @@ def answers(
     It consists of sums of all kinds, and the resulting velocities.
     """
     grid, count, k = packing.grid, len(centers), bodies.freedoms
-    walls = Walls(grid, index, [0.5] * (1 + count), counted=packing.counted)
+    walls = SandWalls(grid, index, [0.5] * (1 + count), counted=packing.counted)
     bodies.place(index, centers, walls)
     speeds = [wp.array(fields["speed"][axis], dtype=wp.float32) for axis in range(grid.dimension)]
     packing.update(wp.array(fields["density"], dtype=wp.float32), speeds, DT, grid.faces())

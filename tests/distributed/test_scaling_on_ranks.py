@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from warp_lcp.benchmarks import ranks
-from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.cli import commands as cli
 
@@ -103,7 +103,7 @@ def measured(n, ranks, seconds, count, memory, over):
         "to_1e-06_over_single": over,
     }
     facts = {"n": n, "bounds": "walls", "ranks": ranks, "boxes": "1 x 1 x 1"}
-    return Record("", {name: Figure(value) for name, value in figures.items()}, facts)
+    return BenchmarkRecord("", {name: Figure(value) for name, value in figures.items()}, facts)
 
 
 def found(records):

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from warp_lcp.distributed.waiting import Waiting, finish
-from warp_lcp.distributed.watchdog import Board, Post, place_of, verdict
+from warp_lcp.distributed.interruptible_wait import InterruptibleWait, finish
+from warp_lcp.distributed.watchdog import HeartbeatMessages, HeartbeatTable, place_of, verdict
 
 INSIDE, OUTSIDE = (
-    Post(9, 31, "a sum", 12.0, "solver:7"),
-    Post(8, 30, "", 13.0, "build:3 from step:5"),
+    HeartbeatMessages(9, 31, "a sum", 12.0, "solver:7"),
+    HeartbeatMessages(8, 30, "", 13.0, "build:3 from step:5"),
 )
 LATE, SILENT = (
     "has been at build:3 from step:5 for 13 s",
@@ -40,7 +40,7 @@ VERDICTS = [
     ),
     ([None, OUTSIDE], f"rank 1 {LATE}; rank 0 {SILENT}"),
     (
-        [INSIDE, Post(9, 29, "a broadcast", 14.0, "solver:8")],
+        [INSIDE, HeartbeatMessages(9, 29, "a broadcast", 14.0, "solver:8")],
         "all ranks wait for each other in different operations: rank 0 in a sum (solver:7); rank 1 "
         "in a broadcast (solver:8)",
     ),
@@ -79,10 +79,10 @@ def test_the_late_one_is_named(posts, expected):
 
 
 def test_a_post_is_there_whole_or_not_at_all(tmp_path):
-    board = Board(tmp_path)
+    board = HeartbeatTable(tmp_path)
     assert board.read(3) is None
     board.write(3, INSIDE)
-    board.write(4, Post(1, 1, "x" * 50, 1.0, "y" * 5000))
+    board.write(4, HeartbeatMessages(1, 1, "x" * 50, 1.0, "y" * 5000))
     assert board.read(3) == INSIDE
     assert board.read(4) is not None
     board.path(3).write_bytes(board.path(3).read_bytes()[:20])
@@ -126,7 +126,7 @@ def test_a_long_wait_uses_no_core(monkeypatch):
 
 
 def test_operations_are_counted_in_order():
-    waiting = Waiting()
+    waiting = InterruptibleWait()
     with pytest.raises(KeyError), waiting("a sum"):
         assert (waiting.name, waiting.count) == ("a sum", 1)
         raise KeyError

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.files import claims
+from warp_lcp.files import size_limits as claims
 from warp_lcp.files.archive import Archive, ArchiveError
 
 ARRAYS = {

@@ -3,8 +3,8 @@
 import pytest
 
 from fuzz.told import limited
-from warp_lcp.files import claims
-from warp_lcp.files.claims import ClaimError, check_claim, free_host_memory
+from warp_lcp.files import size_limits as claims
+from warp_lcp.files.size_limits import ClaimError, check_claim, free_host_memory
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from small_liquids import box, create, scene
 from warp_lcp import fluids
 from warp_lcp.fluids import LiquidScene
-from warp_lcp.material import coverage
+from warp_lcp.material import domain_window as coverage
 from warp_lcp.scene.scene import Scene
 
 LIQUID = [box([0.0, 0.0], [0.5, 0.25])]

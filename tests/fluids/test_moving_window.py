@@ -12,8 +12,8 @@ import pytest
 from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
-from warp_lcp.grid.tally import WindowTally
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels.launch_graph import LaunchGraph
 
 TABLES: dict[str, dict[str, Any]] = {
     "apic": {},

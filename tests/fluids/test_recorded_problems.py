@@ -12,7 +12,7 @@ import warp_lcp as wl
 from command_line import invoke
 from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
-from warp_lcp.files import claims
+from warp_lcp.files import size_limits as claims
 from warp_lcp.gallery.recorded import FORMAT, cell_counts, files, load
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.problem_folder import ProblemFolder

@@ -7,7 +7,7 @@ import pytest
 
 from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.kernels.launch_graph import LaunchGraph
 
 # Different lengths reveal a number that is recorded only once.
 STEPS = (4e-3, 3e-3, 5e-3, 2e-3, 4e-3, 3e-3)

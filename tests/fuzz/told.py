@@ -14,7 +14,7 @@ from hypothesis import settings
 from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
-from warp_lcp.files.claims import visible
+from warp_lcp.files.size_limits import visible
 from warp_lcp.run.check import start
 from warp_lcp.scene.scene_file import load_scene
 

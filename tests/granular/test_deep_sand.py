@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from small_sands import GRAVITY, box, create, scene
-from warp_lcp.granular.coupled import HeavyBallProjectedGradient
+from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
 from warp_lcp.granular.simulator import SandSimulation
 
 

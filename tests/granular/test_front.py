@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.granular.front import Front
+from warp_lcp.granular.percentiles import ParticlePercentiles
 from warp_lcp.granular.simulator import percentile_place
 
 DEVICE = wp.get_device("cpu")
@@ -29,7 +29,7 @@ def particles(points: np.ndarray) -> Any:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_number_at_a_place_is_that_of_the_sorted_ones(seed: int) -> None:
-    rng, front = np.random.default_rng(7800 + seed), Front(DEVICE)
+    rng, front = np.random.default_rng(7800 + seed), ParticlePercentiles(DEVICE)
     for _ in range(4):
         n = int(rng.choice([1, 2, 99, 100, 101, 1500]))
         points = (rng.standard_normal((n, 3)) * 10.0 ** rng.integers(-30, 30, (n, 3))).astype(
@@ -43,6 +43,6 @@ def test_the_number_at_a_place_is_that_of_the_sorted_ones(seed: int) -> None:
 
 
 def test_no_particles_are_nowhere() -> None:
-    front = Front(DEVICE)
+    front = ParticlePercentiles(DEVICE)
     front.find(particles(np.zeros((0, 3))), percentile_place(0))
     assert front.read() == (0.0, 0.0)

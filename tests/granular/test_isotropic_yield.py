@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 
@@ -50,7 +50,9 @@ def borne(degrees: float, plane: tuple[int, int], dimension: int, *, box: bool) 
     )
     gradient = RATE * np.outer(along, across)
     packing.update(one, linear_flow(grid, gradient), 1.0)
-    stress = Stress(packing, Walls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]), box=box)
+    stress = Stress(
+        packing, SandWalls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]), box=box
+    )
     start = np.zeros(stress.now.shape, dtype=np.float32)
     start[0] = PRESSURE
     stress.now.assign(start)

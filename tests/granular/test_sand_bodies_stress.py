@@ -11,9 +11,9 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.coupled import HeavyBallProjectedGradient
+from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -106,7 +106,7 @@ def make(
     packing = Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32))
     u = [wp.full(grid.shape, float(g * DT), dtype=wp.float32) for g in GRAVITY[:dimension]]
     packing.update(wp.array(density, dtype=wp.float32), u, DT, grid.faces())
-    walls = Walls(grid, index, [friction] * (1 + len(blocks)))
+    walls = SandWalls(grid, index, [friction] * (1 + len(blocks)))
     bodies = None if ratio is None else SandBodies(grid, range(1, 1 + len(blocks)))
     if bodies is not None:
         bodies.place(index, np.array(centers), walls)

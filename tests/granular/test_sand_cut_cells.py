@@ -13,12 +13,12 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.validation import inclined
-from warp_lcp.granular.coupled import HeavyBallProjectedGradient
 from warp_lcp.granular.cut_walls import CutWalls
+from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.granular.solids import SandSolids, Walls
+from warp_lcp.granular.solids import SandSolids, SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solids import Plane
@@ -69,7 +69,7 @@ class Case:
         )
         ring = np.zeros(grid.shape, dtype=np.int32)
         ring[1:-1, 1:-1, 1:-1] = -1
-        self.stress = Stress(self.packing, Walls(grid, ring, [0.0, mu], rubbing_only=True))
+        self.stress = Stress(self.packing, SandWalls(grid, ring, [0.0, mu], rubbing_only=True))
         self.openings = self.walls.openings.numpy().astype(float)
 
     def begin(

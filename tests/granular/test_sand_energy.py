@@ -11,7 +11,7 @@ from test_sand_stress import Case, make, velocity
 from small_sands import advance, box, create, scene
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_kernels import DAMPED
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -73,7 +73,7 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     one = wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
     packing = Packing(grid, base, one)
     packing.update(one, grid.faces(), 0.01)
-    stress = Stress(packing, Walls(grid, index, [0.0]))
+    stress = Stress(packing, SandWalls(grid, index, [0.0]))
     k, j, i = np.indices(grid.shape)
     checkers = (-1.0) ** (i + j + (k if dimension == 3 else 0))
     start = np.zeros(stress.now.shape, dtype=np.float32)

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import Walls, wall_faces
+from warp_lcp.granular.solids import SandWalls, wall_faces
 from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
@@ -213,7 +213,7 @@ def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
     packing = Packing(grid, *arrays)
     index = np.full(grid.shape, -1, dtype=np.int32)
     index[0], index[-1], index[:, 0], index[:, -1], index[..., 0], index[..., -1] = [0] * 6
-    walls = Walls(grid, index, [0.5])
+    walls = SandWalls(grid, index, [0.5])
     density, velocity = grid.field(), grid.faces()
     for step in range(4):
         host = (

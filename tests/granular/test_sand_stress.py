@@ -13,7 +13,7 @@ import scipy.optimize
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -93,7 +93,7 @@ def make(
     packing.update(
         wp.array(density.astype(np.float32), dtype=wp.float32, device=grid.device), u, DT
     )
-    stress = Stress(packing, Walls(grid, index, FRICTIONS), box=box, rate=gain > 0.0)
+    stress = Stress(packing, SandWalls(grid, index, FRICTIONS), box=box, rate=gain > 0.0)
     start = random.normal(scale=0.4, size=stress.now.shape)
     start[0] = np.maximum(random.normal(0.4, 0.5, size=grid.shape), 0.0)
     start[:, index == 0] = 0.0  # the domain's ring is never written
@@ -505,6 +505,6 @@ def test_a_stress_free_fall_has_no_residual(dimension: int) -> None:
     packing = Packing(grid, base, one)
     u = [wp.full(grid.shape, -0.3, dtype=wp.float32, device=grid.device) for _ in range(dimension)]
     packing.update(wp.full(grid.shape, 0.2, dtype=wp.float32, device=grid.device), u, DT)
-    stress = Stress(packing, Walls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]))
+    stress = Stress(packing, SandWalls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]))
     stress.begin(YieldSet(0.5), GRAVITY, DT, DT)
     assert stress.residual() == (0.0, 0.0)

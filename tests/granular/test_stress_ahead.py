@@ -12,11 +12,11 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.granular.coupled import HeavyBallProjectedGradient, MomentumWorkspace
+from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient, MomentumWorkspace
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
-from warp_lcp.granular.stress_ahead import StressAhead
+from warp_lcp.granular.stress_device_iteration import StressDeviceIteration
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -52,7 +52,7 @@ class Twin:
         self.rate = bool(rng.random() < 0.3)
         self.stress = Stress(
             self.packing,
-            Walls(grid, index, [0.3, 1e6]),
+            SandWalls(grid, index, [0.3, 1e6]),
             box=bool(rng.random() < 0.2),
             rate=self.rate,
         )
@@ -113,7 +113,7 @@ def workspaces(
 ) -> tuple[MomentumWorkspace, MomentumWorkspace]:
     """Return one workspace led by the host and one led by the device."""
     with patch.context() as alone:
-        alone.setattr(StressAhead, "suits", lambda stress: False)
+        alone.setattr(StressDeviceIteration, "suits", lambda stress: False)
         host = method.init(stress)
     device = method.init(stress)
     assert host._ahead is None
@@ -219,7 +219,7 @@ def test_walls_that_change_have_loops_of_their_own(monkeypatch: pytest.MonkeyPat
     index[1:-1, 1:-1, 1:-1] = -1
     stopping = wl.StoppingCriteria(rtol=0.0, atol=1e-5 * SCALE, max_iterations=60)
     for friction in (0.3, 0.0, 1.0):
-        twin.stress.set_walls(Walls(twin.grid, index, [friction]))
+        twin.stress.set_walls(SandWalls(twin.grid, index, [friction]))
         expected, found = (twin.solve(work, method, stopping=stopping) for work in (host, device))
         assert found == expected
 

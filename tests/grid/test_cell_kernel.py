@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_below, cell_kernel
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.kernels import Rows, StencilKernel
 
 GRID = StaggeredGrid((5, 4, 3), 1.0, 3)
 WINDOW = GRID.window((2, 1, 2), (4, 3, 3))  # stored cells 2 <= k < 4, 1 <= j < 4, 2 <= i < 5
@@ -74,7 +74,7 @@ def test_the_cell_below_stays_in_the_array(axis: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def box_pass(tmp_path_factory) -> RowPass:
+def box_pass(tmp_path_factory) -> StencilKernel:
     header = tmp_path_factory.mktemp("headers") / "box.h"
     header.write_text(
         "double total = 0; const int n = 7;\n"  # a name in the pass itself
@@ -84,7 +84,7 @@ def box_pass(tmp_path_factory) -> RowPass:
     )
     real = wp.float32
     fields, sums = {"x": real, "y": real, "z": real}, {"sums": wp.float64}
-    return RowPass(
+    return StencilKernel(
         "tests.boxes.scaled",
         header,
         real,
@@ -98,7 +98,7 @@ def box_pass(tmp_path_factory) -> RowPass:
 @pytest.mark.cpu_form("threads take whole rows on the CPU")
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("given", [False, True])
-def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
+def test_a_pass_over_a_box(box_pass: StencilKernel, whole: bool, given: bool) -> None:
     x, y = wp.array(places(), dtype=wp.float32, device="cpu"), GRID.field()
     sums = wp.zeros(6, dtype=wp.float64, device="cpu")
     WINDOW.run(box_pass, whole=whole, x=x, y=y, z=x if given else None, sums=sums)
@@ -109,7 +109,7 @@ def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
 
 
 @pytest.mark.cpu_form("threads take whole rows on the CPU")
-def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> None:
+def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: StencilKernel) -> None:
     rows, fields = (
         Rows.box(WINDOW.low, WINDOW.high, GRID.device),
         {"x": GRID.field(), "y": GRID.field(), "z": None},
@@ -126,7 +126,7 @@ def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> N
     assert fields["y"].numpy().sum() == 4.0 * 18
 
 
-def test_what_is_said_of_a_box_that_is_wrong(box_pass: RowPass) -> None:
+def test_what_is_said_of_a_box_that_is_wrong(box_pass: StencilKernel) -> None:
     x, sums = GRID.field(), wp.zeros(6, dtype=wp.float64, device="cpu")
     with pytest.raises(
         ValueError, match=r"tests.boxes.scaled: fields have the shapes \(5, 6, 6\), \(5, 6, 7\)"
@@ -157,7 +157,7 @@ def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> 
         {"x": wp.float32, "y": wp.float32},
         wp.zeros((2, *GRID.shape), dtype=wp.float32, device="cpu"),
     )
-    listed = RowPass(
+    listed = StencilKernel(
         "tests.lists.mark",
         header,
         wp.float32,
@@ -191,7 +191,9 @@ def test_a_pass_over_entries(grain: int | None, tmp_path: Path) -> None:
     header.write_text(
         "for (int n = first; n < last; ++n) { y[n] = 2*x[n]; z[n] = last - first; }\n"
     )
-    passed = RowPass("tests.lists.double", header, wp.float32, box=dict.fromkeys("xyz", wp.float32))
+    passed = StencilKernel(
+        "tests.lists.double", header, wp.float32, box=dict.fromkeys("xyz", wp.float32)
+    )
     x, y, z = (wp.array(np.arange(10.0), dtype=wp.float32, device="cpu") for _ in range(3))
     passed.bind(Rows.entries(10, GRID.device, grain), x=x, y=y, z=z).launch()
     np.testing.assert_array_equal(y.numpy(), 2.0 * np.arange(10))

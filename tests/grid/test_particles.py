@@ -65,7 +65,7 @@ def test_keys_are_sorted_as_numpy_sorts_them(
     In parts of 100 keys, on any number of threads; memory beyond the keys is scratch.
     """
     monkeypatch.setattr("warp_lcp.grid.particles.CPU_GRAIN", 100)
-    monkeypatch.setattr("warp_lcp.rows.team.CELLS", 1)
+    monkeypatch.setattr("warp_lcp.kernels.thread_pool.CELLS", 1)
     rng, before = np.random.default_rng([count, bits]), wl.get_threads()
     keys = np.where(rng.random(count) < 0.1, 2**bits - 1, rng.integers(0, 2**bits, count))
     expected = np.argsort(keys, kind="stable")

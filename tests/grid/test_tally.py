@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.fluids.pressure import COUNT
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.grid.tally import WindowTally
+from warp_lcp.grid.window_reduction import WindowTally
 from warp_lcp.material.density_correction import CROWD
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 

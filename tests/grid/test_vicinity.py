@@ -5,12 +5,12 @@ import pytest
 import scipy.ndimage
 import warp as wp
 
-from warp_lcp.grid import vicinity as module
+from warp_lcp.grid import active_rows as module
+from warp_lcp.grid.active_rows import ActiveRows, spread
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, DirtyRegion, StaggeredGrid, Window, pieces_of
-from warp_lcp.grid.vicinity import Vicinity, spread
 
 GRID = StaggeredGrid((37, 20, 12), 0.1, 3, "cpu")
 PLANE = StaggeredGrid((61, 40, 1), 0.1, 2, "cpu")
@@ -98,7 +98,7 @@ def test_all_cells_that_particles_reach_are_near(grid: StaggeredGrid, small: Non
     Now and in the step before, however often a step is repeated; along x to the end of a segment.
     """
     random, grow = np.random.default_rng(3), 4
-    looked, box = Vicinity(grid), grid.everywhere
+    looked, box = ActiveRows(grid), grid.everywhere
     reached = []
     for step in (0, 1, 1, 2):
         position = random.random((6, 3)) * grid.extent * [1, 1, grid.dimension == 3]
@@ -127,9 +127,9 @@ def test_what_was_reached_goes_along_to_another_part_of_a_domain(small: None) ->
         for at in ((16, 8, 8), (24, 0, 16))
     )
     particles = Particles(old, np.array([[2.75, 1.25, 1.85]]), np.zeros((1, 3)), affine=False)
-    before = Vicinity(old)
+    before = ActiveRows(old)
     before.window(old.everywhere, particles, 2, 5)
-    after = Vicinity(new, before)
+    after = ActiveRows(new, before)
     particles.move_to(new)
     window = after.window(new.everywhere, particles, 2, 6)
     assert window.near is not None

@@ -9,6 +9,9 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
+from warp_lcp.kernels import launch_graph as program
+from warp_lcp.kernels import thread_pool as team
+from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.krylov.conjugate_gradient import (
     BEST,
@@ -23,8 +26,6 @@ from warp_lcp.krylov.conjugate_gradient import (
 )
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.reduced.active_set_kernels import DIVIDE
-from warp_lcp.rows import program, team
-from warp_lcp.rows.vectors import rows_of
 
 SHAPE = (5, 6, 7)
 
@@ -42,7 +43,7 @@ class Jacobi:
             rows_of(self.r), r=self.r, d=wp.array(d, dtype=wp.float64, device=A.device), z=self.z
         )
         if recorded:
-            self.program = program.Program(A.device)
+            self.program = program.CommandBuffer(A.device)
             self._divide.launch(self.program.launch)
 
     def apply(self):

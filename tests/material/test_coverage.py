@@ -10,10 +10,10 @@ import small_liquids
 import small_sands
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.grid import vicinity
+from warp_lcp.grid import active_rows as vicinity
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.material import coverage as module
-from warp_lcp.material.coverage import Coverage, carry_over
+from warp_lcp.material import domain_window as module
+from warp_lcp.material.domain_window import DomainWindow, carry_over
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.scene import MOST_CELLS
 from warp_lcp.scene.table import SceneError
@@ -166,7 +166,7 @@ def test_it_pays_for_what_there_is() -> None:
 
 
 def test_grids_are_laid_where_the_material_leaves_them() -> None:
-    laid = Coverage(DOMAIN)
+    laid = DomainWindow(DOMAIN)
     first = laid.around([40, 40, 20], [70, 60, 40])
     assert all(low % module.ALIGNED == 0 for low in first.origin)
     moving = laid.around([40, 40, 20], [70, 60, 40], pace=(np.zeros(3), np.array([0.25, 9.0, 0.0])))
@@ -180,8 +180,8 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
     assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of the domain
     # Beyond the domain.
     assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts
-    assert Coverage(DOMAIN, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
-    always = Coverage(DOMAIN, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])
+    assert DomainWindow(DOMAIN, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
+    always = DomainWindow(DOMAIN, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])
     kept = always.around([40, 40, 20], [50, 50, 30])
     assert kept.covers([40, 40, 0], [91, 91, 63])
     assert laid.at(first.part.where()["box"]) == first

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from warp_lcp import fluids, granular
-from warp_lcp.material import coverage
+from warp_lcp.material import domain_window as coverage
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.simulation import SimulationFailed, StepFailed
 

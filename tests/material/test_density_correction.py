@@ -15,11 +15,11 @@ import warp_lcp as wl
 from small_liquids import advance, box, create, dam, scene
 from warp_lcp.benchmarks.validation.signals import enclosed_cells
 from warp_lcp.grid.particles import Particles
+from warp_lcp.kernels import launch_graph as program
+from warp_lcp.kernels.kernel_variant import KernelVariant
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.density_correction import LONGEST, DensityCorrection
-from warp_lcp.rows import program
-from warp_lcp.rows.pass_form import Form
 
 BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
 
@@ -445,13 +445,13 @@ def test_a_scene_without_it_launches_none_of_its_kernels(
 
     It does not allocate either: fields are made with the simulation.
     """
-    launched, launch, entry, prepared = set(), wp.launch, Form.entry, program.prepared
+    launched, launch, entry, prepared = set(), wp.launch, KernelVariant.entry, program.prepared
 
     def note(kernel: wp.Kernel, *arguments: Any, **named: Any) -> Any:
         launched.add(kernel.module.name)
         return launch(kernel, *arguments, **named)
 
-    def note_entry(self: Form, *arguments: Any) -> Any:
+    def note_entry(self: KernelVariant, *arguments: Any) -> Any:
         launched.add(self.kernel.module.name)
         return entry(self, *arguments)
 
@@ -460,7 +460,7 @@ def test_a_scene_without_it_launches_none_of_its_kernels(
         return prepared(kernel, *arguments)
 
     monkeypatch.setattr(wp, "launch", note)
-    monkeypatch.setattr(Form, "entry", note_entry)
+    monkeypatch.setattr(KernelVariant, "entry", note_entry)
     monkeypatch.setattr(program, "prepared", note_prepared)
     simulation = dam(**tables)
     advance(simulation, 0.2)

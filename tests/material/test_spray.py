@@ -7,7 +7,8 @@ import pytest
 
 from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.material import coverage, spray
+from warp_lcp.material import domain_window as coverage
+from warp_lcp.material import spray
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 

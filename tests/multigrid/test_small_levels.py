@@ -11,11 +11,11 @@ import warp as wp
 
 import warp_lcp as wl
 from multigrid.test_hierarchy import level_matrix, masked_hierarchy
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.persistent_kernel import CUDA_THREADS
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
 from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, cells_of_one_launch
-from warp_lcp.rows import Rows
-from warp_lcp.rows.sequence import CUDA_THREADS
 
 TOGETHER = {"one_launch_cpu": 4096, "one_launch_cuda": 4096}
 APART = {"one_launch_cpu": 0, "one_launch_cuda": 0}

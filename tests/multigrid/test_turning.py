@@ -10,8 +10,8 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.multigrid.multiple_semicoarsening import MultipleSemicoarsening, make_hierarchy, turns
 from warp_lcp.multigrid.stencil_level import StencilLevel
-from warp_lcp.multigrid.turning import MultipleSemicoarsening, make_hierarchy, turns
 
 AXES = ("face_x", "face_y", "face_z")
 

@@ -6,7 +6,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
-from warp_lcp.rows.fields import CPU_CHUNK
+from warp_lcp.kernels.fields import CPU_CHUNK
 
 SHAPES = [(5, 4, 6), (6, 7), (1, 3, 4), (3, 1), (2, 2, 2), (1, 1, 1)]
 PERIODIC = [(False, False, False), (True, False, False), (True, True, True)]

@@ -13,8 +13,8 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import resident_bytes
 from warp_lcp.benchmarks.tank import Tank, record
+from warp_lcp.kernels import Rows
 from warp_lcp.operators import grid_operator
-from warp_lcp.rows import Rows
 
 SHAPES = (24, 150, 90), (8, 300, 150)  # planes of liquid; rows of liquid in each plane
 STOPPING = wl.StoppingCriteria(rtol=1e-6)

@@ -15,7 +15,15 @@ from warp_lcp.render.actors import shaded
 from warp_lcp.render.live import Live
 from warp_lcp.render.page import Page
 from warp_lcp.render.picture import Picture
-from warp_lcp.render.recording import Color, Recording, RenderError, Scale, Show, _round_up, spread
+from warp_lcp.render.recording import (
+    Color,
+    ColorScale,
+    Recording,
+    RenderError,
+    Show,
+    _round_up,
+    spread,
+)
 from warp_lcp.render.render import INSTALL, Looks, expected_seconds, parse_size, render_run
 from warp_lcp.render.solid_meshes import Outline
 from warp_lcp.scene.camera import MARGIN, viewpoint
@@ -553,7 +561,7 @@ def test_scales_end_at_round_numbers():
         10.0,
         5000.0,
     ]
-    scale = Scale("", 0.0, 2.0, ("#000000", "#643200"))
+    scale = ColorScale("", 0.0, 2.0, ("#000000", "#643200"))
     np.testing.assert_allclose(
         scale.colors(np.array([-1.0, 1.0, 2.0, 9.0])),
         [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]],
@@ -561,7 +569,7 @@ def test_scales_end_at_round_numbers():
     )
     # Colors of viridis.
     np.testing.assert_array_equal(
-        Scale("", 0.0, 1.0).colors(np.array([0.0, 1.0])), [[68, 1, 84], [253, 231, 36]]
+        ColorScale("", 0.0, 1.0).colors(np.array([0.0, 1.0])), [[68, 1, 84], [253, 231, 36]]
     )
 
 

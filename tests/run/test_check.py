@@ -11,7 +11,7 @@ import pytest
 from command_line import invoke
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak
 from warp_lcp.cli import commands as cli
-from warp_lcp.files import claims
+from warp_lcp.files import size_limits as claims
 from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp.run import check, devices
 from warp_lcp.run.check import check_memory, check_scene

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import warp_lcp as wl
 from warp_lcp.cli.commands import app
-from warp_lcp.run.driven import RunError
+from warp_lcp.run.api import RunError
 from warp_lcp.run.folder import OutputError
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError

@@ -9,13 +9,13 @@ from small_runs import run_into
 from warp_lcp.cli.commands import app
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.run.check import start
-from warp_lcp.run.foretell import (
+from warp_lcp.run.estimate import (
     doubts,
+    estimate_run,
     expected_bytes,
     expected_growth,
     expected_step,
     expected_steps,
-    foretold,
     in_words,
 )
 from warp_lcp.scene.scene_file import dump_scene, load_scene
@@ -67,7 +67,7 @@ def test_twice_the_cells_take_more_steps_and_more_frames_take_more_bytes() -> No
 
 def test_a_measured_step_makes_the_whole_run() -> None:
     scene = load_scene(POOL)
-    lines = dict(foretold(scene, start(scene, "cpu"), seconds=2.0))
+    lines = dict(estimate_run(scene, start(scene, "cpu"), seconds=2.0))
     assert "as measured, 2e+03 ms a step" in lines["whole run"]
     assert set(lines) == {"steps", "whole run", "disk"}
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from small_runs import run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.run.folder import OutputError
-from warp_lcp.run.gaps import spans
+from warp_lcp.run.missing_outputs import spans
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 

@@ -8,11 +8,11 @@ import pytest
 
 from command_line import invoke
 from warp_lcp.run.folder import OutputError
-from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
+from warp_lcp.run.resolve_scene import ResolvedScene, resolve_scene, scene_to_resume
 from warp_lcp.scene.scene_file import dump_scene, keys
 
 
-def ran(out: Path, given: GivenScene) -> None:
+def ran(out: Path, given: ResolvedScene) -> None:
     """Write the files of a run that matter here."""
     out.mkdir(exist_ok=True)
     (out / "scene.toml").write_text(dump_scene(given.scene))
@@ -100,7 +100,7 @@ def test_what_is_given_anew_changes_and_is_told(scene_file, tmp_path):
 
 def test_an_edit_of_what_was_overridden_counts(scene_file, tmp_path):
     out, source = tmp_path / "out", str(scene_file)
-    ran(out, given_scene(source, ["time.duration=1.0", "time.dt_max=0.01"]))
+    ran(out, resolve_scene(source, ["time.duration=1.0", "time.dt_max=0.01"]))
     edit(scene_file, duration="2.0")
     given = scene_to_resume(out, source, [])
     assert (given.scene.time.duration, given.scene.time.dt_max, given.kept) == (
@@ -112,7 +112,7 @@ def test_an_edit_of_what_was_overridden_counts(scene_file, tmp_path):
 
 def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
     out, source = tmp_path / "out", str(scene_file)
-    ran(out, given_scene(source, ["domain.resolution=16"]))
+    ran(out, resolve_scene(source, ["domain.resolution=16"]))
     (out / "run.json").write_text("{}")  # of a version that did not store it
     with pytest.raises(
         OutputError,
@@ -179,7 +179,9 @@ def test_the_last_word_counts(dots, scene_file, tmp_path, seed):
         settled = route == "scene"
         named = {"scene": source, "own": str(out / "scene.toml"), "none": None}[route]
         found = (
-            given_scene(source, overrides) if part == 0 else scene_to_resume(out, named, overrides)
+            resolve_scene(source, overrides)
+            if part == 0
+            else scene_to_resume(out, named, overrides)
         )
         values = keys(found.scene)
         assert {name: float(values[f"{TABLE[name]}.{name}"]) for name in VALUES} == {

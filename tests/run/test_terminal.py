@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from small_runs import MINIMAL, run_into
 from warp_lcp.cli import commands as cli
-from warp_lcp.files.claims import one_line, visible
+from warp_lcp.files.size_limits import one_line, visible
 from warp_lcp.run import folder as run_folder
 from warp_lcp.run.progress import Lines
 from warp_lcp.run.terminal import Terminal, say

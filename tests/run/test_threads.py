@@ -10,7 +10,7 @@ import pytest
 
 import warp_lcp as wl
 from particle_scenes import particle_scenes
-from warp_lcp.rows import team
+from warp_lcp.kernels import thread_pool as team
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -57,7 +57,7 @@ LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")
 )
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
     for module in ("team", "program", "wave"):
-        monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 100)
+        monkeypatch.setattr(f"warp_lcp.kernels.{module}.CELLS", 100)
     before = wl.get_threads()
     try:
         expected = digests(name, 1, 3)

@@ -16,7 +16,8 @@ import warp as wp
 
 import small_liquids
 import small_sands
-from warp_lcp.rows import pass_form, program
+from warp_lcp.kernels import kernel_variant as pass_form
+from warp_lcp.kernels import launch_graph as program
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
 ROOT = Path(__file__).parents[2]
@@ -46,7 +47,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     load, allocate, entry, make_array = (
         wp.Module.load,
         allocator.allocate,
-        pass_form.Form.entry,
+        pass_form.KernelVariant.entry,
         wp.array.__init__,
     )
 
@@ -85,7 +86,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     with patch.context() as patched:
         patched.setattr(wp.Module, "load", noting_load)
         patched.setattr(program, "prepared", noting_prepared)
-        patched.setattr(pass_form.Form, "entry", noting_entry)
+        patched.setattr(pass_form.KernelVariant, "entry", noting_entry)
         patched.setattr(allocator, "allocate", noting_allocate)
         patched.setattr(wp.array, "__init__", noting_array)
         yield traces
@@ -363,9 +364,9 @@ def test_walls_without_friction_are_not_launched(
         small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3}))
     )
     ran: list[str] = []
-    entry = pass_form.Form.entry
+    entry = pass_form.KernelVariant.entry
     monkeypatch.setattr(
-        pass_form.Form,
+        pass_form.KernelVariant,
         "entry",
         lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1],
     )

@@ -9,7 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, lemke, natural_residual
-from warp_lcp.reduced.low_rank_correction import LowRankCorrection
+from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
 from warp_lcp.reduced.multigrid_coupled import CoupledWorkspace
 
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=400)
@@ -204,7 +204,7 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
     work.residual.evaluate(x)
     work.start(warm=False, tolerance=0.0)
     work.rebuild(classify=work.residual.classified)
-    correction: LowRankCorrection = work.correction
+    correction: WoodburyCorrection = work.correction
     finest = work.hierarchy.finest
     rng = np.random.default_rng(59)
     inside = finest.stencil.d.numpy() != 0
@@ -324,13 +324,13 @@ def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, de
     after them.
     """
     taken, made = [], []
-    renew = LowRankCorrection.renew
+    renew = WoodburyCorrection.renew
 
     def noted(self, *, begins, **others):
         made.append((taken[-1], begins))
         return renew(self, begins=begins, **others)
 
-    monkeypatch.setattr(LowRankCorrection, "renew", noted)
+    monkeypatch.setattr(WoodburyCorrection, "renew", noted)
     grid, U, _, _ = small(device)
     A = wl.SumOperator(grid, wl.LowRankOperator(U, np.diag([1.0, 2.0, 3.0]), device=device))
     problem = wl.LCP(A, np.random.default_rng(53).standard_normal(grid.shape))

@@ -15,14 +15,14 @@ import warp as wp
 import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp.default_chain import PathCreeps
-from warp_lcp.problem.solve import IterateMemory, Step, method_name
+from warp_lcp.problem.solve import Step, WorkspaceBase, method_name
 from warp_lcp.solvers.fallback import FIRST, Progress
 
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 LINES = wl.StoppingCriteria(rtol=1e-12, max_iterations=60)
 
 
-class Memory(IterateMemory):
+class Memory(WorkspaceBase):
     """Memory of a toy method: each start, and its tolerance."""
 
     def start(self, *, warm, tolerance):

@@ -5,8 +5,9 @@ import pytest
 
 import warp_lcp as wl
 from warp_lcp.benchmarks import problems
+from warp_lcp.kernels import layout
+from warp_lcp.kernels import thread_pool as team
 from warp_lcp.multigrid.stencil_level import StencilLevel
-from warp_lcp.rows import layout, team
 
 BOUNDS = ["none", "walls", "everywhere"]
 

@@ -13,10 +13,10 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import splash
+from warp_lcp.kernels.readback import BYTES, LINE, DeviceScalar
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
-from warp_lcp.reduced.multigrid_ahead import RunAhead
-from warp_lcp.rows.readings import BYTES, LINE, Reading
+from warp_lcp.reduced.device_iteration import DeviceIteration
 
 emulated = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
@@ -91,7 +91,7 @@ def test_solves_are_those_of_the_host(
     solver = wl.ProjectedMultigrid(precision=precision)
     ahead = solver.init(problem)
     with monkeypatch.context() as patch:
-        patch.setattr(RunAhead, "suits", lambda work: False)
+        patch.setattr(DeviceIteration, "suits", lambda work: False)
         alone = solver.init(problem)
     guess, begun = problem.layout.zeros(wp.float64), 0
     for _ in range(5):
@@ -165,7 +165,7 @@ def test_solves_with_bodies_are_those_of_the_host(
     problem, b = random_problem(rng, bodies)
     ahead = SOLVER.init(problem)
     with monkeypatch.context() as patch:
-        patch.setattr(RunAhead, "suits", lambda work: False)
+        patch.setattr(DeviceIteration, "suits", lambda work: False)
         alone = SOLVER.init(problem)
     assert alone._ahead is None
     assert ahead._ahead is not None
@@ -217,7 +217,7 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     from benchmarks.emulated_cuda import meter
 
     device = wp.get_device("cpu")
-    a, c = Reading(device, 2), Reading(device, 3, wp.int32)
+    a, c = DeviceScalar(device, 2), DeviceScalar(device, 3, wp.int32)
     board = a._board
     assert board is not None
     assert c._board is board
@@ -235,17 +235,17 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     assert a.numpy().tolist() == [2.0, 2.0]
     end = board._end
     for _ in range(3):
-        Reading(device, 2)
+        DeviceScalar(device, 2)
     assert board._end <= end + LINE
-    circle: list[Any] = [Reading(device, 2)]
+    circle: list[Any] = [DeviceScalar(device, 2)]
     circle.append(circle)
     held = weakref.ref(circle[0])
     del circle
     # More than one board has room for: a second board has the rest.
-    many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]
+    many = [DeviceScalar(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]
     assert held() is None  # garbage was collected first
     assert many[-1]._board is many[-2]._board is not board
-    assert Reading(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a default board
+    assert DeviceScalar(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a default board
     for value in (3.0, 4.0):  # every read returns the current value
         many[-1].array.fill_(value)
         many[-1].changed()
@@ -264,7 +264,7 @@ def both(monkeypatch: pytest.MonkeyPatch) -> Any:
         problem, b = random_problem(rng)
         b.assign(np.where(problem.unknown.numpy() == 1, rng.standard_normal(b.size), 0.0))
         with monkeypatch.context() as patch:
-            patch.setattr(RunAhead, "suits", lambda work: False)
+            patch.setattr(DeviceIteration, "suits", lambda work: False)
             alone = SOLVER.init(problem)
         return problem, alone, SOLVER.init(problem)
 
@@ -315,7 +315,7 @@ def test_threads_take_the_steps_of_the_host(
     before = wl.get_threads()
     wl.set_threads(threads)
     for module in ("team", "wave", "program"):
-        monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 64)
+        monkeypatch.setattr(f"warp_lcp.kernels.{module}.CELLS", 64)
     try:
         problem, alone, ahead = both(4100 + threads)
         guess = problem.layout.zeros(wp.float64)

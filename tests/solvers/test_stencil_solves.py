@@ -11,7 +11,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.multigrid.line_hierarchy import BlackBoxMultigrid, takes_points
+from warp_lcp.multigrid.black_box_multigrid import BlackBoxMultigrid, takes_points
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.matrix_stencil import stencil_of
 

@@ -13,22 +13,22 @@ from typing import Annotated, Any
 import typer
 import warp as wp
 
-from warp_lcp.cli.ending import FAILED, WRONG_INPUT, end, wrong_input
-from warp_lcp.cli.shown import export, looked_on, render, serve, view
-from warp_lcp.cli.solve_file import Outcome, solve_files
+from warp_lcp.cli.exit_codes import FAILED, WRONG_INPUT, end, wrong_input
+from warp_lcp.cli.solve_file import FileOutcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks, suite_names
+from warp_lcp.cli.view_commands import export, looked_on, render, serve, view
 from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
+from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.protocol import families
 from warp_lcp.render.viewer import check_window
-from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.engines import launcher_of
+from warp_lcp.run.estimate import doubts, estimate_run
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
-from warp_lcp.run.foretell import doubts, foretold
 from warp_lcp.run.interruption import Interruption
 from warp_lcp.run.launcher import default_folder
 from warp_lcp.run.loop import RunRequest
@@ -309,7 +309,7 @@ def check(
                 [("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))]
             )
             if not calibrate:
-                _print_pairs(foretold(loaded, beginning))
+                _print_pairs(estimate_run(loaded, beginning))
         if not calibrate:
             return
         try:
@@ -318,7 +318,7 @@ def check(
             end(str(error), FAILED)
     _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
     if not force_memory:
-        _print_pairs(foretold(loaded, beginning, seconds))
+        _print_pairs(estimate_run(loaded, beginning, seconds))
     if isinstance(loaded, ParticleScene):
         _print_pairs(loaded.model_plan(seconds))
 
@@ -474,7 +474,7 @@ def solve(
             raise ProblemError(f"--out {out}: no such folder: {out.parent}")
         if out is not None and out.is_dir():
             raise ProblemError(f"--out {out}: is a folder; name a file")
-        outcome: Outcome
+        outcome: FileOutcome
         if problem.suffix == SUFFIX:
             check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
             outcome = solve_recorded(problem, device=chosen, ranks=launcher.ranks, **options)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.files.claims import ClaimError, check_claim, free_host_memory, read_whole
+from warp_lcp.files.size_limits import ClaimError, check_claim, free_host_memory, read_whole
 
 PACKED: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open}
 HEADER = re.compile(

@@ -32,7 +32,7 @@ FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FileOutcome:
     """Result of a solve and the problem solved.
 
     Attributes:
@@ -125,7 +125,7 @@ def solve_files(
     max_iterations: int,
     max_seconds: float,
     device: str,
-) -> Outcome:
+) -> FileOutcome:
     """Solve y = A x + b, lower <= x <= upper, from files.
 
     Args:
@@ -164,7 +164,7 @@ def solve_files(
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
-    return Outcome(problem, solver, method or str(result.method), result)
+    return FileOutcome(problem, solver, method or str(result.method), result)
 
 
 def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> StoppingCriteria:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.cli.solve_file import Outcome, criteria, method_named
+from warp_lcp.cli.solve_file import FileOutcome, criteria, method_named
 from warp_lcp.default import solve
 from warp_lcp.default_chain import default_chain
 from warp_lcp.files.atomic import replacing, replacing_by_name
@@ -34,7 +34,7 @@ FIELD = ".npy"  # suffix of their solutions
 
 
 @dataclass(frozen=True)
-class GridOutcome(Outcome):
+class GridOutcome(FileOutcome):
     """Result of a solve and the grid problem solved.
 
     Attributes:
@@ -200,7 +200,7 @@ def _write_boxes(
 
     The root rank holds one box at a time in memory.
     """
-    from warp_lcp.distributed.waiting import waiting
+    from warp_lcp.distributed.interruptible_wait import waiting
 
     comm, boxes = decomposition.ranks.comm, decomposition.boxes
     if not decomposition.ranks.is_root:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+from warp_lcp.distributed.interruptible_wait import finish, waiting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.distributed.waiting import finish, waiting
 from warp_lcp.distributed.watchdog import Watchdog
 
 # seconds that a rank waits for the others after a failure: they may be inside MPI, from where

@@ -17,8 +17,8 @@ from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, Task, launch_now
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.decomposition import Decomposition

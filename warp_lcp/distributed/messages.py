@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.launch import petsc
-from warp_lcp.distributed.waiting import waiting
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.team import Operation, launched_alone
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.thread_pool import Operation, launched_alone
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.halo import StarForest

@@ -12,9 +12,9 @@ import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.grid.particles import MOST_A_CELL, Particles
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.memory import Scalar, Slot
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.launch_graph import LaunchGraph
+from warp_lcp.kernels.memory import Scalar, Slot
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain

@@ -17,13 +17,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.launch import petsc
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import zeros
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import zeros
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
@@ -203,7 +203,7 @@ class PetscGrid:
         copies: between vectors and stored fields.
 
     Example:
-        >>> from warp_lcp.distributed import PetscGrid  # doctest: +SKIP
+        >>> from warp_lcp.distributed import PetscGrid# doctest: +SKIP
         >>> grid = PetscGrid(A)  # doctest: +SKIP
         >>> b, x, ksp = grid.vector(values), grid.vector(), grid.solver()  # doctest: +SKIP
         >>> ksp.solve(b, x)  # doctest: +SKIP

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import adding
-from warp_lcp.distributed.waiting import waiting
-from warp_lcp.rows.team import Operation
+from warp_lcp.kernels.thread_pool import Operation
 
 
 @dataclass(frozen=True)

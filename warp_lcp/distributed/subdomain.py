@@ -15,24 +15,24 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.extension import Refill, too_far
 from warp_lcp.distributed.flight import TreesAtCuts
 from warp_lcp.distributed.halo import StarForest, star_forest
+from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchanging_all
 from warp_lcp.distributed.migration import cuts_of, migrate
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
 from warp_lcp.distributed.solids import boundary_of_part
-from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.cell_box import CellBox
 from warp_lcp.grid.part import BodyNumbers, Corner, GridPart
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import Task, is_recording, launch, run_table
+from warp_lcp.kernels.thread_pool import Operation, OperationTable, team
+from warp_lcp.kernels.vectors import Communicator, convert
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Task, is_recording, launch, run_table
-from warp_lcp.rows.team import Operation, Table, team
-from warp_lcp.rows.vectors import Across, convert
 
 DEFAULT_BALANCE = Balance()
 MOST_KEPT = 32  # exchanges of fields that are filled again and again
@@ -146,7 +146,7 @@ class Subdomain(GridPart):
             tuple(decomposition.joined),
         )
         self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
-        self._fillings: dict[Any, Table] = {}
+        self._fillings: dict[Any, OperationTable] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         self._trees: TreesAtCuts | None = None
@@ -186,7 +186,7 @@ class Subdomain(GridPart):
                 self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
 
     @property
-    def across(self) -> Across | None:
+    def across(self) -> Communicator | None:
         """The other processes, as reductions take them; None: there are none."""
         return self.ranks if self.ranks.size > 1 else None
 
@@ -432,7 +432,9 @@ class Subdomain(GridPart):
             if len(self._fillings) >= MOST_KEPT:
                 self._fillings.clear()
             hosts = [field.numpy() for field in fields]
-            self._fillings[key] = Table([exchanging_all(forest, [(host, host) for host in hosts])])
+            self._fillings[key] = OperationTable(
+                [exchanging_all(forest, [(host, host) for host in hosts])]
+            )
         run_table(self._fillings[key])
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:

@@ -17,8 +17,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Self
 
+from warp_lcp.distributed.interruptible_wait import InterruptibleWait, waiting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.distributed.waiting import Waiting, waiting
 from warp_lcp.files.atomic import SUFFIX, open_in_place
 
 LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
@@ -43,7 +43,7 @@ PASSING = {
 
 
 @dataclass(frozen=True)
-class Post:
+class HeartbeatMessages:
     """What a rank's thread tells of its main thread.
 
     Args:
@@ -61,7 +61,7 @@ class Post:
     place: str
 
 
-class Board:
+class HeartbeatTable:
     """Where ranks tell each other what they do while MPI cannot: a small file a rank.
 
     Args:
@@ -76,17 +76,17 @@ class Board:
         """Return the file of a rank."""
         return self._folder / f".{self._label}waits_{rank:04d}{SUFFIX}"
 
-    def write(self, rank: int, post: Post) -> None:
+    def write(self, rank: int, post: HeartbeatMessages) -> None:
         """Put up a post."""
         line = (json.dumps({**asdict(post), "place": post.place[: ROOM // 2]}) + "\n").encode()
         descriptor = open_in_place(self.path(rank), os.O_WRONLY | os.O_CREAT, 0o600)
         with open(descriptor, "wb") as file:  # closed each time: that is when other machines see it
             file.write(line.ljust(ROOM))
 
-    def read(self, rank: int) -> Post | None:
+    def read(self, rank: int) -> HeartbeatMessages | None:
         """Return the post of a rank; None if there is none, or a half-written one."""
         with suppress(OSError, ValueError, TypeError):
-            return Post(**json.loads(self.path(rank).read_bytes().split(b"\n")[0]))
+            return HeartbeatMessages(**json.loads(self.path(rank).read_bytes().split(b"\n")[0]))
         return None
 
     def clear(self, ranks: Sequence[int]) -> None:
@@ -121,12 +121,12 @@ class Watchdog:
         limit: float,
         end: Callable[[str], object],
         *,
-        watched: Waiting = waiting,
+        watched: InterruptibleWait = waiting,
     ) -> None:
         """Agree on a label; collective."""
         self._ranks, self._limit, self._end, self._watched = ranks, limit, end, watched
         self._beat = min(limit / BEATS, LONGEST_BEAT)
-        self._board = Board(
+        self._board = HeartbeatTable(
             Path(tempfile.gettempdir()), f"warp-lcp-{ranks.share(secrets.token_hex(8))}-"
         )
         self._posting = threading.Lock()
@@ -134,7 +134,7 @@ class Watchdog:
         self._main = threading.main_thread().ident
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         # of ranks: since when they stay, the last post, its age in beats
-        self._seen: dict[int, tuple[Post | None, Post | None, int]] = {}
+        self._seen: dict[int, tuple[HeartbeatMessages | None, HeartbeatMessages | None, int]] = {}
 
     def __enter__(self) -> Self:
         if self._limit and self._ranks.size > 1:
@@ -156,10 +156,12 @@ class Watchdog:
         """Tell in a folder, which all ranks see, from now on."""
         with self._posting:
             self._board.clear([self._ranks.rank])
-            self._board = Board(folder)
+            self._board = HeartbeatTable(folder)
             if self._thread.is_alive():
                 # while the disk has room
-                self._board.write(self._ranks.rank, Post(0, 0, "", 0.0, "its beginning"))
+                self._board.write(
+                    self._ranks.rank, HeartbeatMessages(0, 0, "", 0.0, "its beginning")
+                )
 
     def _watch(self) -> None:
         beat, count, idle, then = 0, self._watched.count, 0.0, time.monotonic()
@@ -169,7 +171,7 @@ class Watchdog:
             beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now
             if count != self._watched.count:
                 count, idle = self._watched.count, 0.0
-            mine = Post(
+            mine = HeartbeatMessages(
                 beat,
                 count,
                 self._watched.name,
@@ -190,11 +192,11 @@ class Watchdog:
                 self._end(f"{text}\nall ranks are aborted: --rank-timeout {self._limit:g}")
                 return
 
-    def _look(self, mine: Post) -> str:
+    def _look(self, mine: HeartbeatMessages) -> str:
         """Return what is wrong; "" while ranks go on, or have not yet told twice that they do not."""
         # a rank that computes waits for nobody
         patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)
-        posts: dict[int, Post | None] = {self._ranks.rank: mine}
+        posts: dict[int, HeartbeatMessages | None] = {self._ranks.rank: mine}
         certain = True
         for rank in (rank for rank in range(self._ranks.size) if rank != self._ranks.rank):
             post = self._board.read(rank)
@@ -211,7 +213,7 @@ class Watchdog:
         return verdict(posts) if certain else ""
 
 
-def verdict(posts: Mapping[int, Post | None]) -> str:
+def verdict(posts: Mapping[int, HeartbeatMessages | None]) -> str:
     """Return which ranks keep the others waiting, in a line; "" if none does.
 
     Args:

@@ -21,7 +21,7 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from warp_lcp.files.claims import ClaimError, check_claim
+from warp_lcp.files.size_limits import ClaimError, check_claim
 
 SUFFIX = ".npy"  # suffix of an archive's members
 HEADER = re.compile(  # as NumPy writes it; NumPy's reader evaluates the text

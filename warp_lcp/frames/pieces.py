@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from warp_lcp.files.atomic import write_text
-from warp_lcp.files.claims import read_whole
+from warp_lcp.files.size_limits import read_whole
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end
 from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable, writable_fields
 from warp_lcp.frames.vtu import Mesh
@@ -31,7 +31,7 @@ Image = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 
 @dataclass(frozen=True)
-class Piece:
+class VtkPiece:
     """Metadata of a part in the file of a whole frame.
 
     Args:
@@ -53,7 +53,7 @@ class Piece:
     spacing: float = 0.0
 
 
-def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
+def describe(part: Points | Cells | Surface, kind: Kind) -> VtkPiece:
     """Return the metadata of a part in a file of a kind."""
     cells = isinstance(part, Cells)
     size, written = writable_fields(part)
@@ -62,14 +62,14 @@ def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
         low, counts = image_box(part)
         end = image_end(low, counts, part.dimension)
         fields = (*fields, attributes(GHOSTS, np.zeros(0, dtype=np.uint8)))
-        return Piece(kind, size, fields, "", cells, (_triple(low), _triple(end)), part.spacing)
+        return VtkPiece(kind, size, fields, "", cells, (_triple(low), _triple(end)), part.spacing)
     points = np.zeros((0, 3), dtype=np.float32) if isinstance(part, Cells) else part.points
-    return Piece(
+    return VtkPiece(
         kind, size, fields, attributes("Points", writable("points", points, len(points))), cells
     )
 
 
-def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
+def write_whole(path: Path, pieces: Sequence[tuple[str, VtkPiece]]) -> None:
     """Write the file that lists the parts of a frame, atomically.
 
     Args:
@@ -214,7 +214,7 @@ def _sewn(mesh: Mesh) -> Mesh:
     return Mesh(mesh.points[first_points], number[place][mesh.corners], fields, mesh.on_cells)
 
 
-def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
+def _mesh(pieces: Sequence[tuple[str, VtkPiece]], first: VtkPiece) -> Iterator[str]:
     yield opening("PUnstructuredGrid").decode()
     yield '<PUnstructuredGrid GhostLevel="0">\n'
     yield from _arrays("PCellData" if first.on_cells else "PPointData", first.fields)
@@ -223,7 +223,7 @@ def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
     yield "</PUnstructuredGrid>\n</VTKFile>\n"
 
 
-def _image(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
+def _image(pieces: Sequence[tuple[str, VtkPiece]], first: VtkPiece) -> Iterator[str]:
     """Yield a PVTI file.
 
     The boxes of the parts must fill the image, so that parts without shown cells are included.

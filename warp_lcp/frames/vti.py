@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.files.atomic import replacing
-from warp_lcp.files.claims import read_whole
+from warp_lcp.files.size_limits import read_whole
 from warp_lcp.frames.vtk_xml import (
     LENGTH_BYTES,
     array_values,

@@ -208,7 +208,7 @@ class InverseKinematics(Settings):
             unsolved, overshoot = unsolved + (not solved), max(overshoot, beyond)
             trial = np.clip(theta + d, lower, upper)
             new = (goals - figure.positions(trial)).ravel()
-            fall, foretold = (
+            fall, estimate_run = (
                 0.5 * float((error - new) @ (error + new)),
                 model.decrease(trial - theta),
             )
@@ -217,7 +217,7 @@ class InverseKinematics(Settings):
             else:
                 rejected += 1
             history.append(0.5 * float(error @ error))
-            radius = self._radius(radius, fall, foretold, float(np.abs(d).max()))
+            radius = self._radius(radius, fall, estimate_run, float(np.abs(d).max()))
         return ReachedPose(
             theta,
             history[-1],
@@ -268,15 +268,15 @@ class InverseKinematics(Settings):
         inside = np.clip(d, model.lower, model.upper)
         return inside, bool(result), float(np.abs(d - inside).max())
 
-    def _radius(self, radius: float, fall: float, foretold: float, length: float) -> float:
+    def _radius(self, radius: float, fall: float, estimate_run: float, length: float) -> float:
         """Return the next radius of the trust region.
 
         Half of the step if the model was wrong, twice the radius if it was right and the step was
         short.
         """
-        if foretold <= 0 or fall < DISAGREES * foretold:
+        if estimate_run <= 0 or fall < DISAGREES * estimate_run:
             return 0.5 * min(radius, max(length, LEAST_RADIUS))
-        if fall > AGREES * foretold and length > 0.9 * radius:
+        if fall > AGREES * estimate_run and length > 0.9 * radius:
             return min(2 * radius, np.pi)
         return radius
 

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.files.archive import Archive
-from warp_lcp.files.claims import check_claim
+from warp_lcp.files.size_limits import check_claim
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
 from warp_lcp.problem.lcp import LCP

@@ -11,10 +11,10 @@ import warp as wp
 from warp_lcp.default import solve as solve_problem
 from warp_lcp.gradients.names import flat
 from warp_lcp.gradients.vjp import vjp
+from warp_lcp.kernels.vectors import ADD, convert, rows_of
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rows.vectors import ADD, convert, rows_of
 
 
 def solve(

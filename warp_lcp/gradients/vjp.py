@@ -18,6 +18,9 @@ import warp as wp
 
 from warp_lcp.default import solve
 from warp_lcp.gradients.names import flat
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import Array
+from warp_lcp.kernels.vectors import ADD, Sums, Tally, rows_of
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import (
@@ -35,9 +38,6 @@ from warp_lcp.problem.protocol import (
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import Array
-from warp_lcp.rows.vectors import ADD, Sums, Tally, rows_of
 
 f64, i8 = wp.float64, wp.int8
 KERNELS = KernelFile(Path(__file__).parent / "headers/vjp.h")

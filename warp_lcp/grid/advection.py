@@ -36,10 +36,10 @@ import warp as wp
 
 from warp_lcp.grid.particle_loops import MARGIN, launch
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
+from warp_lcp.kernels import KernelFile, StencilKernel
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.memory import Scalar, scaled
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import KernelFile, RowPass
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.memory import Scalar, scaled
 
 # cells; a particle that moves further in a step takes the careful way, which is always right
 MAX_CLEARANCE = 6
@@ -80,7 +80,7 @@ PUSH_OUT = KernelFile(
 
 
 @functools.cache
-def advect_pass(endless: int) -> RowPass:
+def advect_pass(endless: int) -> StencilKernel:
     """Return the kernel of `advect` for a set of periodic axes (bit n: axis n)."""
     module = "warp_lcp.grid.advection" + f"_{endless}" * (endless > 0)
     return KERNELS.kernel(
@@ -89,7 +89,7 @@ def advect_pass(endless: int) -> RowPass:
 
 
 @functools.cache
-def distance_pass(endless: int) -> RowPass:
+def distance_pass(endless: int) -> StencilKernel:
     """Return the kernel of `advect_with_distance` for a set of periodic axes."""
     module = "warp_lcp.grid.distance_advection" + f"_{endless}" * (endless > 0)
     name = "warp_lcp.grid.distance_advection.advect_with_distance"
@@ -97,7 +97,7 @@ def distance_pass(endless: int) -> RowPass:
 
 
 @functools.cache
-def carry_pass(axis: int) -> RowPass:
+def carry_pass(axis: int) -> StencilKernel:
     """Return the kernel of `carry_field` for the faces of an axis or `CENTERS`."""
     module = f"warp_lcp.grid.semi_lagrangian_{axis}"
     return KERNELS.kernel(

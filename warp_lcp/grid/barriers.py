@@ -26,8 +26,8 @@ from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.grid.thin_walls import ThinWalls
+from warp_lcp.kernels.launch_graph import copy
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.rows.program import copy
 
 # Cells. The level set and velocities are continued two layers into what is thicker and cuts cells;
 # in thinner solids they would reach the layers of the other side.

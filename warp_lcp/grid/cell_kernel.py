@@ -11,8 +11,8 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
-from warp_lcp.rows.compiler import forward_kernel, project_module
-from warp_lcp.rows.program import Launch, call, is_recording, launch, launch_ranges
+from warp_lcp.kernels.compiler import forward_kernel, project_module
+from warp_lcp.kernels.launch_graph import Launch, call, is_recording, launch, launch_ranges
 
 # fields
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))

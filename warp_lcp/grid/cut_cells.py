@@ -31,9 +31,9 @@ from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import LaunchGraph, clear, copy
 
 CLOSE = 1.0  # cells from a solid within which the sides of a periodic axis must be alike
 NOWHERE: NodeBox = (0, 0, 0), (0, 0, 0)  # a box without nodes

@@ -9,11 +9,11 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
 from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import launch
+from warp_lcp.kernels.native import text
 from warp_lcp.operators.grid_poisson import AIR, SOLID
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.native import text
-from warp_lcp.rows.program import launch
 
 # open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the
 # condition number

@@ -9,7 +9,7 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel, next_to
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.rows import KernelFile
+from warp_lcp.kernels import KernelFile
 
 BLOCKED = -1  # not to be filled
 UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start

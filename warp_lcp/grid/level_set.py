@@ -12,8 +12,8 @@ from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.particle_loops import scatter, touched_planes
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import COPY, ActiveWindow, StaggeredGrid, Window
-from warp_lcp.grid.tally import WindowTally
-from warp_lcp.rows.program import LaunchGraph, clear
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 
 REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
 QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL

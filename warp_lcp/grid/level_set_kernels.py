@@ -11,8 +11,8 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.kernels import KernelFile
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import KernelFile
 
 # Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and
 # an empty wedge deep in the liquid would count as air, into which the liquid falls. Such a cell is

@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.rows import KernelFile
+from warp_lcp.kernels import KernelFile
 
 MOST = 5  # triangles of a cell
 EDGES = tuple(

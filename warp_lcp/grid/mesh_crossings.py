@@ -14,7 +14,7 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 
 MODULE = "warp_lcp.grid.mesh_crossings"
 # half diagonals of the mesh: closer than rounding of float64 coordinates tells

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.files.claims import check_claim
+from warp_lcp.files.size_limits import check_claim
 
 FORMATS = (".obj", ".ply", ".stl")
 MARK = b"\xef\xbb\xbf"  # that some editors write before UTF-8 text

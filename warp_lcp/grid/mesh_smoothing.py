@@ -12,8 +12,8 @@ from warp_lcp.grid.cell_kernel import F32, POINTS, interpolated
 from warp_lcp.grid.marching_cubes import DeviceMesh
 from warp_lcp.grid.particle_loops import chunks
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
 
 # lattice cells from the domain's side: points that close the surface there are 0.01 off its other
 # sides

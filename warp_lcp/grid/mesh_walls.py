@@ -35,7 +35,7 @@ TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.
 TRIANGLE = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi / 3.0 * np.arange(3)])
 
 
-class Walls:
+class MeshWalls:
     """Signed distance to solids where they are.
 
     Args:
@@ -82,7 +82,11 @@ class Walls:
 
 
 def fit_to_walls(
-    points: np.ndarray, corners: np.ndarray, on_solid: np.ndarray, fixed: np.ndarray, walls: Walls
+    points: np.ndarray,
+    corners: np.ndarray,
+    on_solid: np.ndarray,
+    fixed: np.ndarray,
+    walls: MeshWalls,
 ) -> np.ndarray:
     """Return the points of a surface with those on solids moved onto the solids' shapes.
 
@@ -131,7 +135,7 @@ def _sharp_edges(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def _sharpened(
-    x: np.ndarray, normal: np.ndarray, free: np.ndarray, corners: np.ndarray, walls: Walls
+    x: np.ndarray, normal: np.ndarray, free: np.ndarray, corners: np.ndarray, walls: MeshWalls
 ) -> np.ndarray:
     """Move points onto edges of the solid, then onto its corners.
 
@@ -183,7 +187,7 @@ def _nearest_ends(x: np.ndarray, simplices: np.ndarray, target: np.ndarray) -> n
 
 
 def _move(
-    x: np.ndarray, chosen: np.ndarray, target: np.ndarray, free: np.ndarray, walls: Walls
+    x: np.ndarray, chosen: np.ndarray, target: np.ndarray, free: np.ndarray, walls: MeshWalls
 ) -> None:
     """Move points (updated) to their targets, where these are on the wall, near, and along the sides that the points lie on."""
     way = target - x[chosen]

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.spatial import transform
 
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.host_kernel import HostKernel
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.host_kernel import HostKernel
 
 Vector = Sequence[float] | np.ndarray
 

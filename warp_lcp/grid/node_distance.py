@@ -21,10 +21,10 @@ from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.solids_kernels import block_of, item_points
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.host_kernel import HostKernel
-from warp_lcp.rows.program import clear, copy
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.host_kernel import HostKernel
+from warp_lcp.kernels.launch_graph import clear, copy
 
 NodeBox = tuple[Sequence[int], Sequence[int]]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes

@@ -16,7 +16,7 @@ from warp_lcp.grid.solids_kernels import (
     to_plane,
     to_sphere,
 )
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 
 FAR = 4.0  # cells: distances below it are exact, others at least this large
 COARSE = 3  # nodes along an axis of a block in which one distance may stand for all

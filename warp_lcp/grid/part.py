@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.launch_graph import Task
+from warp_lcp.kernels.vectors import convert
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.rows.program import Task
-from warp_lcp.rows.vectors import convert
 
 if TYPE_CHECKING:
     from warp_lcp.grid.particles import Particles, ParticleTotals
     from warp_lcp.grid.staggered import StaggeredGrid, Window
-    from warp_lcp.rows.vectors import Across
+    from warp_lcp.kernels.vectors import Communicator
 
 
 class OneProcess:
@@ -199,7 +199,7 @@ class GridPart:
         self.grid = grid
 
     @property
-    def across(self) -> Across | None:
+    def across(self) -> Communicator | None:
         """The other processes, as reductions take them; None: there are none."""
         return None
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from warp_lcp.rows import KernelFile, RowPass, Rows
-from warp_lcp.rows.memory import Scalar, Slot, rows_memory
-from warp_lcp.rows.program import is_recording
-from warp_lcp.rows.team import get_threads
+from warp_lcp.kernels import KernelFile, Rows, StencilKernel
+from warp_lcp.kernels.launch_graph import is_recording
+from warp_lcp.kernels.memory import Scalar, Slot, rows_memory
+from warp_lcp.kernels.thread_pool import get_threads
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -86,7 +86,7 @@ class ListMemory:
             self.slot("touched of").point_to(self.touched)
 
 
-TOUCHED: dict[Any, RowPass] = {
+TOUCHED: dict[Any, StencilKernel] = {
     vector: KERNELS.kernel(
         "warp_lcp.grid.touched.touched",
         module=f"warp_lcp.grid.touched_{real.__name__}",
@@ -111,7 +111,7 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
 
 
 def scatter(
-    passed: RowPass,
+    passed: StencilKernel,
     grid: "StaggeredGrid",
     position: wp.array[Any],
     touched: wp.array[wp.int32] | None,
@@ -127,7 +127,7 @@ def scatter(
         position: theirs.
         touched: what `touched_planes` returns for them.
         runs: of `Particles`.
-        structs: what else the pass takes, see `RowPass.bind`.
+        structs: what else the pass takes, see `StencilKernel.bind`.
         given: likewise.
     """
     count, shares = len(position), 1
@@ -180,9 +180,13 @@ def chunks(count: int, device: wp.Device) -> Rows:
 
 
 def launch(
-    passed: RowPass, count: int, grid: "StaggeredGrid", *structs: "DataclassInstance", **given: Any
+    passed: StencilKernel,
+    count: int,
+    grid: "StaggeredGrid",
+    *structs: "DataclassInstance",
+    **given: Any,
 ) -> None:
-    """Launch a pass, bound as by `RowPass.bind` with the grid's placement, over the first particles of a list.
+    """Launch a pass, bound as by `StencilKernel.bind` with the grid's placement, over the first particles of a list.
 
     A launch that is recorded takes as many as the list has when it runs, if one of its arrays is of
     a `ListMemory`.

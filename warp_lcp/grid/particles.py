@@ -13,13 +13,13 @@ from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, MARGIN, ListMemory, launch
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.rows import Rows
-from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.memory import RowsMemory, Scalar, Slot, rows_memory
-from warp_lcp.rows.program import LaunchGraph, call, clear
-from warp_lcp.rows.program import launch as launch_recorded
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Tally
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.launch_graph import LaunchGraph, call, clear
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.memory import RowsMemory, Scalar, Slot, rows_memory
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Tally
 
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
@@ -205,7 +205,7 @@ class Particles:
             LaunchGraph(device, launch) for launch in launches
         )
         self._removal = LaunchGraph(device, self._launch_removal)
-        self._removed = Reading(device, 2, wp.int32)
+        self._removed = DeviceScalar(device, 2, wp.int32)
         # of the memory and the count that they are for
         self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None
         self._stays: wp.array | None = None  # beside them
@@ -214,7 +214,7 @@ class Particles:
             self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
         else:
             self._partials = wp.zeros(columns * THREADS, dtype=wp.float64, device=device)
-            self._found, self._places = Reading(device, columns), Scalar()
+            self._found, self._places = DeviceScalar(device, columns), Scalar()
             self._sort_rows, self._sort_pieces = RowsMemory(), Scalar()
             self._counts = wp.zeros(0, dtype=wp.int32, device=device)
         self._last: ParticleTotals | None = None

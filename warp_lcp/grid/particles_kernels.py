@@ -6,8 +6,8 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 NUMBER = KERNELS["warp_lcp.grid.particles.number"]

@@ -32,7 +32,7 @@ from warp_lcp.grid.solids_kernels import (
     to_mesh_surface,
 )
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
-from warp_lcp.rows.host_array import HostArray
+from warp_lcp.kernels.host_array import HostArray
 
 MODULE = "warp_lcp.grid.placed_mesh"
 _FAR, _ROUNDING, _HOLLOW = wp.constant(FAR), wp.constant(ROUNDING), wp.constant(wp.int8(HOLLOW))

@@ -15,8 +15,8 @@ from warp_lcp.grid.cell_kernel import F32, cell_kernel, launch_list, list_kernel
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, launch
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import Launch, launch
 
 # at low x, high x, low y, high y, low z, high z; bit n is side n
 SIDES = ("left", "right", "bottom", "top", "back", "front")

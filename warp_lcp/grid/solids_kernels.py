@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 
 MODULE = "warp_lcp.solids"
 Points, Distances = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)

@@ -22,18 +22,18 @@ import warp as wp
 
 from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.particle_loops import GridPlacement
-from warp_lcp.rows import KernelFile, RowPass, Rows
-from warp_lcp.rows.fields import checked_device, zeros
-from warp_lcp.rows.layout import grain
-from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot, larger, rows_memory
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch_ranges
+from warp_lcp.kernels import KernelFile, Rows, StencilKernel
+from warp_lcp.kernels.fields import checked_device, zeros
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, launch_ranges
+from warp_lcp.kernels.layout import grain
+from warp_lcp.kernels.memory import DeviceRows, RowsMemory, Scalar, Slot, larger, rows_memory
 from warp_lcp.settings import renamed_names
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
-CLEAR: dict[typing.Any, RowPass] = {
+CLEAR: dict[typing.Any, StencilKernel] = {
     dtype: KERNELS.kernel(
         "warp_lcp.grid.clear.clear", module=f"warp_lcp.grid.clear_{dtype.__name__}", compute=dtype
     )
@@ -95,7 +95,7 @@ class Window:
         low: first (k, j, i), ring included.
         high: one past the last (k, j, i).
         device: where kernels run.
-        near: active segments of rows, see `warp_lcp.grid.vicinity`; the rest of the box need not be
+        near: active segments of rows, see `warp_lcp.grid.active_rows`; the rest of the box need not be
             visited; None: all. Sums over rows visit what lies between the first and the last of a
             row.
     """
@@ -173,7 +173,7 @@ class Window:
 
     def run(
         self,
-        passed: RowPass,
+        passed: StencilKernel,
         *structs: "DataclassInstance",
         whole: bool = False,
         launch: Launch | None = None,
@@ -183,7 +183,7 @@ class Window:
 
         Args:
             passed: with fields of a `box`.
-            structs: with fields and numbers, see `RowPass.bind`.
+            structs: with fields and numbers, see `StencilKernel.bind`.
             whole: a thread takes a whole row, for counts of a row.
             launch: of a program.
             given: fields and numbers by name.

@@ -18,7 +18,7 @@ from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
 from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
 from warp_lcp.grid.mesh_smoothing import ON_SOLID, TOUCHING
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
-from warp_lcp.grid.mesh_walls import Walls, fit_to_walls
+from warp_lcp.grid.mesh_walls import MeshWalls, fit_to_walls
 from warp_lcp.grid.particle_loops import MARGIN, launch, scatter, touched_planes
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -270,7 +270,7 @@ class SurfaceMesh:
         place = points * (spacing / lattice.spacing)
         fixed = (place < TOUCHING) | (place > np.array(lattice.domain_counts) - TOUCHING)
         fixed[:, lattice.dimension :] = True
-        walls = Walls(shapes, spacing, lattice.dimension, lattice.device)
+        walls = MeshWalls(shapes, spacing, lattice.dimension, lattice.device)
         on_solid = (held & ON_SOLID) > 0
         fitted = fit_to_walls(points, mesh.corners.numpy(), on_solid, fixed, walls)
         # along a side a point could leave the domain beyond a corner

@@ -6,9 +6,9 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
 
 FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
 # of a kernel: where less of it is open the distance is continued from outside the solid

@@ -22,7 +22,7 @@ from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
-from warp_lcp.rows.program import copy
+from warp_lcp.kernels.launch_graph import copy
 
 THIN = 3.0  # cells: what is thinner is met as its exact shape
 SHEET = 1.0  # cells: rigid bodies of at least that cut cells

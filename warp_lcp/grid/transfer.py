@@ -28,8 +28,8 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.particle_loops import launch, scatter, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.memory import Scalar, value_of
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.memory import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # below it a face counts as untouched
 # A particle that lies exactly on the boundary between cells would leave one face of its own cell

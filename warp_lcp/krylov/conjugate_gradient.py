@@ -12,14 +12,14 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, clear
-from warp_lcp.rows.program import launch as launch_recorded
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Across, Reduction, rows_of
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, LaunchGraph, clear
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Communicator, Reduction, rows_of
 
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
 # The slots of the decision to continue begin here, with the square of the residual.
@@ -112,7 +112,7 @@ class LinearMap(Protocol):
         """Write q = A p."""
 
 
-class Preconditioner(Protocol):
+class KrylovPreconditioner(Protocol):
     """Preconditioner z = M r, M symmetric positive definite.
 
     It reads its own field `r` and writes its own field `z`.
@@ -154,11 +154,11 @@ class ConjugateGradient:
     def __init__(
         self,
         product: LinearMap,
-        preconditioner: Preconditioner,
+        preconditioner: KrylovPreconditioner,
         *,
         weight: wp.array[Any] | None = None,
         rows: Rows | None = None,
-        across: Across | None = None,
+        across: Communicator | None = None,
     ) -> None:
         self._product, self._preconditioner, self._rows, r = (
             product,
@@ -196,12 +196,12 @@ class ConjugateGradient:
         From slot `square` on these are r'r and the numbers of `next_iteration`.
         """
         self.device, self.x, self._p = r.device, zeros_like(r), zeros_like(r)
-        self._scalars, self._square, self._shared = Reading(r.device, slots), square, False
+        self._scalars, self._square, self._shared = DeviceScalar(r.device, slots), square, False
         # Tolerance, limit of iterations, whether the error decides.
         self._goal = [Scalar() for _ in range(3)]
         self._beginning = LaunchGraph(r.device, self._launch_beginning)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
-        self._program: Program | None = None
+        self._program: CommandBuffer | None = None
 
     def solve(
         self, tolerance: float, max_iterations: int, *, by_error: bool = False
@@ -263,12 +263,12 @@ class ConjugateGradient:
         if self._loops_with_beginning and self._program is not None:
             self._program.run_while(self._going)
 
-    def _recorded(self) -> Program | None:
+    def _recorded(self) -> CommandBuffer | None:
         """Return an iteration as a program; None if the preconditioner is not recorded."""
         cycle = getattr(self._preconditioner, "program", None)
         if cycle is None:
             return None
-        program = Program(self.device)
+        program = CommandBuffer(self.device)
         program.extend(cycle)
         self._advance(program.launch)
         return program

@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.krylov.conjugate_gradient import LinearMap, Preconditioner
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.fields import zeros, zeros_like
-from warp_lcp.rows.vectors import ADD, Sums, rows_of
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.fields import zeros, zeros_like
+from warp_lcp.kernels.vectors import ADD, Sums, rows_of
+from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
 RESIDUAL = KERNELS["gmres.residual"]
@@ -46,7 +46,7 @@ class GMRES:
     def __init__(
         self,
         product: LinearMap,
-        preconditioner: Preconditioner,
+        preconditioner: KrylovPreconditioner,
         *,
         restart: int = 30,
         weight: wp.array[Any] | None = None,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.vectors import Across, Sums, rows_of
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.vectors import Communicator, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
 NORM = KERNELS["krylov.norm"]
@@ -25,7 +25,7 @@ class KrylovSystem:
         method: Any,
         weight: wp.array[Any] | None,
         rows: Rows | None = None,
-        across: Across | None = None,
+        across: Communicator | None = None,
     ) -> None:
         """Set the Krylov method.
 

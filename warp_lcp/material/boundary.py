@@ -22,11 +22,11 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.grid.voxelize import VoxelSolids
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy, launch
+from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear, copy, launch
-from warp_lcp.rows.readings import Reading
 
 Faces = list[wp.array]  # one field a component
 
@@ -193,7 +193,7 @@ class WholeCells:
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)
-        self._stopped, self._dt = Reading(grid.device, dtype=wp.int32), Scalar()
+        self._stopped, self._dt = DeviceScalar(grid.device, dtype=wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
 
@@ -327,7 +327,7 @@ class CutBoundary:
         self._scratch = grid.faces()
         # distance where particles may go within a step
         self._reachable = grid.field() if cut.moves else cut.distance
-        self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
+        self._counts, self._dt = DeviceScalar(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
         ranks = grid.part.ranks

@@ -6,8 +6,8 @@ import typing
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_below, cell_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import AIR, SOLID
-from warp_lcp.rows.compiler import forward_kernel
 
 TOUCHES_NOTHING = 0  # no solid face
 HELD = 1  # a wall cell whose material stays on its walls

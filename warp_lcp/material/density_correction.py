@@ -17,15 +17,15 @@ import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
-from warp_lcp.grid.tally import WindowTally
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels import KernelFile, StencilKernel
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import LaunchGraph, launch
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
-from warp_lcp.rows import KernelFile, RowPass
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, launch
 from warp_lcp.settings import renamed_names
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
@@ -43,7 +43,7 @@ CROWD = KERNELS["warp_lcp.material.crowding.crowd"]
 
 
 @functools.cache
-def displacement_pass(cut: bool) -> RowPass:
+def displacement_pass(cut: bool) -> StencilKernel:
     """Return the kernel of the displacement; `cut`: faces have open fractions."""
     name = "warp_lcp.material.density_correction"
     return KERNELS.kernel(f"{name}.displace", module=name + "_cut" * cut, constants={"CUT": cut})

@@ -11,9 +11,9 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated, list_kernel
 from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.kernels import KernelFile
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import KernelFile
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -46,10 +46,10 @@ KERNELS = KernelFile(
     Path(__file__).parent / "headers/flight.h",
     {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
 )
-UNITE = KERNELS["warp_lcp.material.flight.unite"]
-ALONE = KERNELS["warp_lcp.material.flight.alone"]
-NUMBER = KERNELS["warp_lcp.material.flight.number"]
-HOLD = KERNELS["warp_lcp.material.flight.hold"]
+UNITE = KERNELS["warp_lcp.material.ballistic_fragments.unite"]
+ALONE = KERNELS["warp_lcp.material.ballistic_fragments.alone"]
+NUMBER = KERNELS["warp_lcp.material.ballistic_fragments.number"]
+HOLD = KERNELS["warp_lcp.material.ballistic_fragments.hold"]
 
 
 @wp.func
@@ -90,7 +90,7 @@ def add_up(flight: Flight, rate: float, q: wp.float64, velocity: Vectors, n: int
     put(flight.sums, b, 16, q, wp.dot(v, v))
 
 
-@list_kernel("warp_lcp.material.flight")
+@list_kernel("warp_lcp.material.ballistic_fragments")
 def board_kernel(
     i,
     key: Integers,
@@ -108,7 +108,7 @@ def board_kernel(
         body[n] = b
 
 
-@list_kernel("warp_lcp.material.flight")
+@list_kernel("warp_lcp.material.ballistic_fragments")
 def lift_kernel(
     i,
     who: Integers,
@@ -174,7 +174,7 @@ def is_near(base: Kinds, touch: U8, planes: int, origin: wp.vec3i, x: wp.vec3):
     return near
 
 
-@list_kernel("warp_lcp.material.flight")
+@list_kernel("warp_lcp.material.ballistic_fragments")
 def fly_kernel(
     i,
     who: Integers,
@@ -224,7 +224,7 @@ def fly_kernel(
     near[i] = met
 
 
-@list_kernel("warp_lcp.material.flight")
+@list_kernel("warp_lcp.material.ballistic_fragments")
 def arrive_kernel(
     i,
     who: Integers,
@@ -241,7 +241,7 @@ def arrive_kernel(
         wp.atomic_add(flight.sums, flight.body[i], LEAVES, wp.int64(1))
 
 
-@list_kernel("warp_lcp.material.flight")
+@list_kernel("warp_lcp.material.ballistic_fragments")
 def land_kernel(
     i,
     who: Integers,

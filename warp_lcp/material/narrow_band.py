@@ -47,12 +47,12 @@ from warp_lcp.grid.cell_kernel import launch_list, scan
 from warp_lcp.grid.particles import MOST_A_CELL, Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.transfer import faces_to_particles
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, is_recording
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material import narrow_band_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.resample import PLASTIC
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear, is_recording
 
 # cells below the band that depths are told apart: what is carried into it must have a slope
 BEYOND = 3.0

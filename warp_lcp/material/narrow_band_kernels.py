@@ -6,9 +6,9 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel, list_kernel
+from warp_lcp.kernels import KernelFile
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.rows import KernelFile
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces

@@ -28,10 +28,10 @@ from warp_lcp.grid.thin_walls import (
     is_thin,
 )
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
+from warp_lcp.material.ballistic_fragments import BallisticFragments
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
-from warp_lcp.material.coverage import Coverage
 from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
-from warp_lcp.material.flight import Flights
+from warp_lcp.material.domain_window import DomainWindow
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_volume import ParticleVolume
@@ -250,7 +250,7 @@ class Parts:
 
 
 def make_spray(
-    scene: ParticleScene, coverage: Coverage | None, placed: Sequence[PlacedSolid]
+    scene: ParticleScene, coverage: DomainWindow | None, placed: Sequence[PlacedSolid]
 ) -> Spray | None:
     """Return what carries particles that are alone, if they need no grid: where one follows the material, and no surface is wrapped."""
     if (
@@ -265,10 +265,12 @@ def make_spray(
     )
 
 
-def make_flights(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Flights | None:
+def make_flights(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+) -> BallisticFragments | None:
     """Return what gives bodies in flight their momenta back, if any can be told."""
     return (
-        Flights(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up)
+        BallisticFragments(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up)
         if scene.flies
         else None
     )

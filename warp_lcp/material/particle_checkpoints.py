@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.material.coverage import Coverage, carry_over
+from warp_lcp.material.domain_window import DomainWindow, carry_over
 from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_frames import ParticleFrames
 from warp_lcp.material.particle_pieces import Piece, piece_of, state_of
-from warp_lcp.material.particle_rearrangement import Rearrangement
+from warp_lcp.material.particle_redistribution import ParticleRedistribution
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, signature
 from warp_lcp.material.resample import resampled, resampling_notes
@@ -26,14 +26,14 @@ class ParticleCheckpoints(ParticleFrames):
 
     scene: ParticleScene
     spray: Spray
-    rearrangement: Rearrangement
+    rearrangement: ParticleRedistribution
     sources: Sources | None
     outlets: Outlets | None
     time: float
     step_count: int
     last_dt: float
     added = 0  # particles, by a program
-    _coverage: Coverage | None
+    _coverage: DomainWindow | None
 
     @abstractmethod
     def mark(self) -> None:

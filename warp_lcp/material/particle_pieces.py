@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from warp_lcp.material.particle_rearrangement import STATE
+from warp_lcp.material.particle_redistribution import STATE
 
 # what one rank has of a simulation's state; the last axes of what lies in cells are z, y, x
 Piece = Mapping[str, np.ndarray]

@@ -11,14 +11,14 @@ import numpy as np
 from pydantic import Field
 
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
-from warp_lcp.material.coverage import start_of
+from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_volume import VOLUME_BYTES
 from warp_lcp.scene.models import Model, model_lines, prices
 from warp_lcp.scene.presets import preset_values
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import Drain, MaterialProperties, Source, SourceProperties
+from warp_lcp.scene.suspicious_settings import material_notes
 from warp_lcp.scene.table import Complaint, Table
-from warp_lcp.scene.unusual import material_notes
 from warp_lcp.settings import Count, CountOrZero, Part, Share
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.

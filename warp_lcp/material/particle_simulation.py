@@ -11,11 +11,13 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.grid.active_rows import ActiveRows
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
-from warp_lcp.grid.vicinity import Vicinity
-from warp_lcp.material.coverage import Coverage, carry_over, cells_between, pace_of, travel
+from warp_lcp.kernels.launch_graph import LaunchGraph, copy
+from warp_lcp.kernels.memory import Scalar
+from warp_lcp.material.domain_window import DomainWindow, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.particle_assembly import (
     Parts,
     make_flights,
@@ -24,15 +26,13 @@ from warp_lcp.material.particle_assembly import (
 )
 from warp_lcp.material.particle_checkpoints import ParticleCheckpoints
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
-from warp_lcp.material.particle_rearrangement import Rearrangement
+from warp_lcp.material.particle_redistribution import ParticleRedistribution
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import particle_trouble
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
 from warp_lcp.material.wall import Join
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
 # relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and
@@ -105,7 +105,7 @@ class ParticleSimulation(ParticleCheckpoints):
         vicinity: finds the cells that a step must visit; None: all around the particles.
     """
 
-    vicinity: Vicinity | None = None
+    vicinity: ActiveRows | None = None
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class ParticleSimulation(ParticleCheckpoints):
         make_parts: Callable[[StaggeredGrid], Parts] | None = None,
         outlets: Outlets | None = None,
         bodies: RigidBodies | None = None,
-        coverage: Coverage | None = None,
+        coverage: DomainWindow | None = None,
         spray: Spray | None = None,
         notes: Sequence[str] = (),
     ) -> None:
@@ -175,9 +175,9 @@ class ParticleSimulation(ParticleCheckpoints):
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
         # without an interior, and ends where the grid does
         if not (grid.part.shared or self.band is not None or scene.endless):
-            self.vicinity = Vicinity(grid, self.vicinity)
+            self.vicinity = ActiveRows(grid, self.vicinity)
         self.flights = make_flights(scene, grid, self.boundary)
-        self.rearrangement = Rearrangement(scene, grid, self.boundary)
+        self.rearrangement = ParticleRedistribution(scene, grid, self.boundary)
         self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
         self.particle_volume = make_particle_volume(scene, grid, self.boundary)
 

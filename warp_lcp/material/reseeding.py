@@ -13,10 +13,10 @@ from warp_lcp.grid.particle_loops import PARTICLE, ListMemory
 from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.particles_kernels import offset_kernel
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, launch
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material import reseeding_kernels as kernels
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 COST = 8 * PARTICLE  # of a cell that wants particles, in cells of a usual pass
 

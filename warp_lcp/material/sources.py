@@ -14,13 +14,13 @@ from warp_lcp.grid.particles import GROWTH, MARGIN, Particles
 from warp_lcp.grid.sides import mark_gone
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear
+from warp_lcp.kernels.memory import Slot
 from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.memory import Slot
-from warp_lcp.rows.program import LaunchGraph, clear
 
 NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
 GRAZED = 1e-9  # of a way: less than that in a cell is rounding

@@ -16,8 +16,8 @@ from warp_lcp.grid.cell_kernel import (
     list_kernel,
 )
 from warp_lcp.grid.staggered import cell_index
+from warp_lcp.kernels import KernelFile
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.rows import KernelFile
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))

@@ -13,8 +13,8 @@ from warp_lcp.grid.cell_kernel import launch_list, list_kernel
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
-from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.kernels.launch_graph import LaunchGraph
+from warp_lcp.kernels.memory import Scalar
 
 EVERY = 8  # steps between looks for particles that have left the others
 TILE = 8  # cells: clusters of particles are told apart by empty tiles between them

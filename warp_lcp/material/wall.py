@@ -35,9 +35,9 @@ from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
 from warp_lcp.grid.staggered import Window, three_components
 from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.kernels import KernelFile
 from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.rows import KernelFile
 
 Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
 

@@ -14,10 +14,10 @@ from pyamg.classical.interpolate import classical_interpolation
 from pyamg.classical.split import RS
 from pyamg.strength import classical_strength_of_connection, symmetric_strength_of_connection
 
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import CommandBuffer
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Program
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
@@ -244,7 +244,7 @@ class MonotoneAggregation:
 
     def __init__(self, A: SparseOperator) -> None:
         self.A, self._version, self._levels = A, -1, list[AggregateLevel]()
-        self._program: Program | None = None
+        self._program: CommandBuffer | None = None
         self._fields: tuple[Any, ...] = ()
 
     def refresh(self) -> bool:

@@ -18,6 +18,9 @@ from pyamg.aggregation.smooth import jacobi_prolongation_smoother
 from pyamg.aggregation.tentative import fit_candidates
 from pyamg.strength import symmetric_strength_of_connection
 
+from warp_lcp.kernels import BoundKernel, KernelFile, Rows
+from warp_lcp.kernels.fields import kept, zeros
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import (
     densify_kernel,
@@ -31,9 +34,6 @@ from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.compressed_rows import RowEntries
 from warp_lcp.operators.sparse import GATHER, PRODUCT, SparseOperator
-from warp_lcp.rows import Bound, KernelFile, Rows
-from warp_lcp.rows.fields import kept, zeros
-from warp_lcp.rows.program import Launch, Program, launch_now
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/algebraic.h")
 FILL = KERNELS["algebraic.fill"]
@@ -58,14 +58,14 @@ class DeviceMatrix:
             RowEntries(self.indptr, self.indices, self.values),
         )
 
-    def multiplying(self, x: wp.array[Any], y: wp.array[Any], *, add: bool = False) -> Bound:
+    def multiplying(self, x: wp.array[Any], y: wp.array[Any], *, add: bool = False) -> BoundKernel:
         """Return the kernel y = A x, or y + A x."""
         return PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y)
 
 
 def product_pass(
     left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]
-) -> Bound:
+) -> BoundKernel:
     """Return what computes A B into a known pattern.
 
     Args:
@@ -137,7 +137,7 @@ class AlgebraicLevel:
 
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False
-    ) -> Bound:
+    ) -> BoundKernel:
         """Return the sweep y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
         A = self.A
         return SMOOTH.bind(
@@ -253,7 +253,7 @@ class AlgebraicHierarchy:
         self.levels[0].A.multiplying(p, q).launch(launch)
 
     @cached_property
-    def program(self) -> Program:
+    def program(self) -> CommandBuffer:
         """One cycle: z = an approximation of M^-1 r, symmetric positive (semi-)definite if M is."""
         return recorded(self.device, Cycle(self.levels, self._solve).stages())
 
@@ -262,8 +262,8 @@ class AlgebraicHierarchy:
         self.program.run()
 
     @cached_property
-    def _coarsening(self) -> Program:
-        program = Program(self.device)
+    def _coarsening(self) -> CommandBuffer:
+        program = CommandBuffer(self.device)
         launch = program.launch
         for depth, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
             P = fine.P

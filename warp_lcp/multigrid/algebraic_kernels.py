@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 
 INDICES, MATRIX = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.float64)
 

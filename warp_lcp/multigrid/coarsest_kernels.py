@@ -11,9 +11,9 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.layout import RowLayout, stencil_struct
-from warp_lcp.rows.sequence import CUDA_THREADS, meet
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.layout import RowLayout, stencil_struct
+from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, meet
 
 square = wp.array2d(dtype=wp.float64)
 # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a

@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.rows.fields import Padding, zeros
-from warp_lcp.rows.layout import Pattern
+from warp_lcp.kernels.fields import Padding, zeros
+from warp_lcp.kernels.layout import Pattern
 
 Counts = tuple[int, int, int]
 

@@ -5,7 +5,7 @@ Every level holds the same problem on fewer unknowns. If A is symmetric positive
     minimize  x'Ax / 2 - b'x   over   lower <= x <= upper,                                (1)
 
 without bounds A x = b. `Cycle` knows no matrix, grid or device: it takes the stages of Algorithm 1
-from the levels, in order. They are recorded once, in one `Program`. With bounds the method is
+from the levels, in order. They are recorded once, in one `CommandBuffer`. With bounds the method is
 monotone multigrid (Kornhuber 1994): no iterate leaves its bounds.
 
 Algorithm 1, one cycle on level l; P maps coarse to fine vectors, alpha is the over-correction.
@@ -26,15 +26,15 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from warp_lcp.rows import Bound, Wave
-from warp_lcp.rows.program import Launch, Program, launch_now
+from warp_lcp.kernels import BoundKernel, FusedKernel
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 
 
 class CycleStage(Protocol):
     """Launches of a cycle, now or recorded: a bound kernel, a wave of them, an exchange."""
 
     def launch(self, launch: Launch = ...) -> None:
-        """Launch now, or record by `Program.launch`."""
+        """Launch now, or record by `CommandBuffer.launch`."""
 
 
 class CycleLevel(Protocol):
@@ -98,13 +98,13 @@ class Cycle:
             yield from fine.ascend(coarse, projected=self.projected)  # 5, 6
 
 
-def recorded(device: wp.Device, stages: Iterable[CycleStage]) -> Program:
+def recorded(device: wp.Device, stages: Iterable[CycleStage]) -> CommandBuffer:
     """Return the launches of stages; one that comes again, as in a W-cycle, is prepared once."""
-    program, prepared = Program(device), dict[int, tuple[CycleStage, Program]]()
+    program, prepared = CommandBuffer(device), dict[int, tuple[CycleStage, CommandBuffer]]()
     for stage in stages:
         known = prepared.get(id(stage))
         if known is None:
-            known = prepared[id(stage)] = stage, Program(device)
+            known = prepared[id(stage)] = stage, CommandBuffer(device)
             stage.launch(known[1].launch)
         program.extend(known[1])
     return program
@@ -119,8 +119,8 @@ class Leg:
         passes: its bound kernels.
     """
 
-    wave: Wave
-    passes: tuple[Bound, ...]
+    wave: FusedKernel
+    passes: tuple[BoundKernel, ...]
 
     def launch(self, launch: Launch = launch_now) -> None:
         """Launch the wave, or record it."""

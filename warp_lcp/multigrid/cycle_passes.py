@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.rows import KernelFile, Wave
+from warp_lcp.kernels import FusedKernel, KernelFile
 
 UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections are of order one
 
@@ -30,12 +30,12 @@ SWEEP_OUT_OF_RING = KERNELS["cycle.out_of_ring"]
 RESTRICT = KERNELS["cycle.restrict"]
 CORRECT = KERNELS["cycle.correct"]
 COARSE_BOUNDS = KERNELS["cycle.bounds"]
-DESCEND = Wave("cycle.descend", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 1), (RESTRICT, 2))
-ASCEND = Wave("cycle.ascend", (CORRECT, 0), (SWEEP_INTO_RING, 1), (SWEEP_OUT_OF_RING, 2))
+DESCEND = FusedKernel("cycle.descend", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 1), (RESTRICT, 2))
+ASCEND = FusedKernel("cycle.ascend", (CORRECT, 0), (SWEEP_INTO_RING, 1), (SWEEP_OUT_OF_RING, 2))
 # On a box of cells among those of other processes: the first sweep from zero is made in ghost
 # cells, too, where it needs only their right-hand side. So what follows waits for no exchange, but
 # for the residual beside others' cells, which is found again.
-DESCEND_FROM_GHOSTS = Wave(
+DESCEND_FROM_GHOSTS = FusedKernel(
     "cycle.descend_from_ghosts", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2), (RESTRICT, 3)
 )
 COARSEN = LEVELS["coarsen.aggregates"]

@@ -8,13 +8,13 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels import BoundKernel, Rows
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.persistent_kernel import CUDA_THREADS
 from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
 from warp_lcp.multigrid.cycle import CycleStage
 from warp_lcp.multigrid.cycle_passes import ASSEMBLE, ELIMINATE, INVERT, SOLVE
-from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.program import Program
-from warp_lcp.rows.sequence import CUDA_THREADS
 
 
 class DenseInverse:
@@ -40,7 +40,7 @@ class DenseInverse:
         m = math.prod(self._counts)
         self.matrix, self.inverse = (zeros((m, m), wp.float64, self._device) for _ in range(2))
         self._own = zeros(m, wp.float64, self._device)
-        self.product: Bound = SOLVE.bind(
+        self.product: BoundKernel = SOLVE.bind(
             Rows.flat(m, self._device),
             inverse=self.inverse,
             b=level.b,
@@ -50,7 +50,7 @@ class DenseInverse:
             nz=nz,
         )
 
-    def record(self, program: Program, *, by_block: bool) -> None:
+    def record(self, program: CommandBuffer, *, by_block: bool) -> None:
         """Record the inversion of the matrix as it will be.
 
         Args:
@@ -63,7 +63,7 @@ class DenseInverse:
         else:
             self._record_compact(program)
 
-    def _record_compact(self, program: Program) -> None:
+    def _record_compact(self, program: CommandBuffer) -> None:
         """Record Gauss-Jordan elimination: the matrix need not be symmetric."""
         s, (nz, ny, nx) = self.level.stencil, self._counts
         (px, py, pz), least = s.periodic, PINNED[self.level.x.dtype]
@@ -87,7 +87,7 @@ class DenseInverse:
             one, matrix=matrix, inverse=inverse, own=self._own, m=nz * ny * nx, least=least
         ).launch(program.launch)
 
-    def _record_seven_points(self, program: Program, *, by_block: bool) -> None:
+    def _record_seven_points(self, program: CommandBuffer, *, by_block: bool) -> None:
         """Record L D L' and the columns of the inverse; on CUDA, Gauss-Jordan elimination by one block."""
         s, changed, real, m = (
             self.level.stencil,

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from warp_lcp.kernels import PersistentKernel
+from warp_lcp.kernels.persistent_kernel import has_clusters
 from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle
-from warp_lcp.rows import Sequence
-from warp_lcp.rows.sequence import has_clusters
 
 if TYPE_CHECKING:
     from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -35,25 +35,25 @@ class FusedCoarseLevels:
 
     def __init__(self, levels: Listed[StencilLevel], solve: CoarsestSolver) -> None:
         self.levels, self._solve = levels, solve
-        self._sequences = dict[tuple[int, bool, bool], Sequence]()
+        self._sequences = dict[tuple[int, bool, bool], PersistentKernel]()
         for level in levels:
             level.in_one_launch = True
 
     @functools.cached_property
-    def coarsening(self) -> Sequence:
+    def coarsening(self) -> PersistentKernel:
         """The making of all levels from the first one."""
         stages: list[Any] = [
             s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)
         ]
-        return Sequence("small_levels.coarsen", stages)
+        return PersistentKernel("small_levels.coarsen", stages)
 
-    def solve(self, visits: int, *, projected: bool, from_zero: bool) -> tuple[Sequence]:
+    def solve(self, visits: int, *, projected: bool, from_zero: bool) -> tuple[PersistentKernel]:
         """Return the stages of a `CoarsestSolver`: one launch."""
         key = visits, projected, from_zero
         if key not in self._sequences:
             cycle = Cycle(self.levels, self._solve, projected)
             stages: list[Any] = list(cycle.stages(visits=visits, from_zero=from_zero))
-            self._sequences[key] = Sequence(
+            self._sequences[key] = PersistentKernel(
                 "small_levels.projected" if projected else "small_levels.cycle", stages
             )
         return (self._sequences[key],)

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, no_type_check
 
 import warp as wp
 
+from warp_lcp.kernels import BoundKernel, Rows
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import Launch
+from warp_lcp.kernels.vectors import CONVERT
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.cycle import CycleStage, Leg
 from warp_lcp.operators.padded_stencil import PaddedStencil
-from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch
-from warp_lcp.rows.vectors import CONVERT
 
 if TYPE_CHECKING:
     from warp_lcp.multigrid.stencil_level import StencilLevel
@@ -174,7 +174,7 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
 
 def _sweeps_beside(
     level: StencilLevel, y: Any, x: Any, depth: int, *, projected: bool
-) -> Iterator[Bound]:
+) -> Iterator[BoundKernel]:
     """Yield one of a leg's sweeps, from x to y, in cells within `depth` of others'."""
     for low, high in beside_cuts(level.stencil, depth):
         rows = Rows.part(level.stencil.padding, level.stencil.device, low, high)

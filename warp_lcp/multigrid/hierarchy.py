@@ -10,6 +10,11 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels import BoundKernel, FusedKernel, Rows
+from warp_lcp.kernels.fields import Padding, zeros
+from warp_lcp.kernels.launch_graph import CommandBuffer, copy, recording
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.vectors import convert
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.compact_levels import coarser_pattern, weights_block
@@ -29,11 +34,6 @@ from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, cells_of_one_laun
 from warp_lcp.multigrid.halo_levels import share_changes, whole_counts
 from warp_lcp.multigrid.stencil_level import Pair, StencilLevel
 from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kernel
-from warp_lcp.rows import Bound, Rows, Wave
-from warp_lcp.rows.fields import Padding, zeros
-from warp_lcp.rows.program import Program, copy, recording
-from warp_lcp.rows.program import launch as launch_recorded
-from warp_lcp.rows.vectors import convert
 
 
 class Hierarchy:
@@ -198,8 +198,8 @@ class Hierarchy:
         return s.spans is not None and s.pattern is None and s.ghosts is None
 
     @cached_property
-    def _renewal(self) -> Program:
-        program = Program(self.device)
+    def _renewal(self) -> CommandBuffer:
+        program = CommandBuffer(self.device)
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             f, c, (fx, fy, fz) = fine.stencil, coarse.stencil, coarse.factors
             if f.spans is not None:
@@ -237,9 +237,9 @@ class Hierarchy:
         self.rebuilding.run()
 
     @cached_property
-    def rebuilding(self) -> Program:
+    def rebuilding(self) -> CommandBuffer:
         """Launches of `rebuild_changed`."""
-        program = Program(self.device)
+        program = CommandBuffer(self.device)
         alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
         for fine, coarse in zip(self.levels, self.levels[1:alone], strict=False):
             if fine.stencil.ghosts is not None:
@@ -257,7 +257,7 @@ class Hierarchy:
             self._rebuild_gathered(program)
         return program
 
-    def _rebuild_gathered(self, program: Program) -> None:
+    def _rebuild_gathered(self, program: CommandBuffer) -> None:
         """Record what gathers the last level's stencil, and builds the levels below it."""
         assert self._gathered is not None
         ours, finest = self.levels[-1].stencil, self._gathered.finest
@@ -272,12 +272,12 @@ class Hierarchy:
         program.extend(self._gathered.rebuilding)
 
     @cached_property
-    def cycle(self) -> Program:
+    def cycle(self) -> CommandBuffer:
         """Linear cycle: symmetric positive (semi-)definite approximate inverse."""
         return recorded(self.device, self._stages(projected=False))
 
     @cached_property
-    def monotone_cycle(self) -> Program:
+    def monotone_cycle(self) -> CommandBuffer:
         """Projected cycle on all levels.
 
         Every sweep is clipped, and coarse bounds keep the finer iterate within its own.
@@ -288,9 +288,9 @@ class Hierarchy:
         return recorded(self.device, self._stages(projected=True))
 
     @cached_property
-    def projected_sweep(self) -> Program:
+    def projected_sweep(self) -> CommandBuffer:
         """Projected Jacobi sweep of the finest level; it never increases the energy."""
-        program, L = Program(self.device), self.finest
+        program, L = CommandBuffer(self.device), self.finest
         L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(
             program.launch
         )
@@ -304,7 +304,7 @@ class Hierarchy:
         """
         return len(self.cycles[False].levels) > 1 and self.finest.fuses
 
-    def cycle_with(self, wave: Wave, *more: Bound) -> Program:
+    def cycle_with(self, wave: FusedKernel, *more: BoundKernel) -> CommandBuffer:
         """Return the linear cycle whose last leg does more, if `ends_in_wave`.
 
         Args:

@@ -9,6 +9,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels import BoundKernel, Rows, StencilKernel
+from warp_lcp.kernels.fields import nothing, zeros
+from warp_lcp.kernels.launch_graph import Task
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.compact_levels import mask
@@ -16,9 +19,6 @@ from warp_lcp.multigrid.cycle import CycleStage, Leg
 from warp_lcp.multigrid.cycle_passes import Coarsening
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
-from warp_lcp.rows import Bound, RowPass, Rows
-from warp_lcp.rows.fields import nothing, zeros
-from warp_lcp.rows.program import Task
 
 # cells up to which a launch on a GPU costs more than work that is done again: by the counts of
 # `benchmarks/gpu_counts.py`, two sweeps in one issue 119 instructions a cell, not 82, and a
@@ -79,7 +79,7 @@ class StencilLevel:
         # of the fields' contents
         self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)
 
-    def renewing(self, *, keeps_weights: bool) -> Bound:
+    def renewing(self, *, keeps_weights: bool) -> BoundKernel:
         """Return the pass that clears the fields outside the rows' new spans and marks rows whose span has changed.
 
         Args:
@@ -104,7 +104,7 @@ class StencilLevel:
             changed=self.changed,
         )
 
-    def signing(self, signs: wp.array[Any]) -> Bound:
+    def signing(self, signs: wp.array[Any]) -> BoundKernel:
         """Return the pass that marks rows whose weights hash to other 64 bits than before."""
         s = self.stencil
         assert s.weights is not None
@@ -119,7 +119,7 @@ class StencilLevel:
             changed=self.changed,
         )
 
-    def coarsening(self, coarse: StencilLevel, stiffen: float, held: float) -> Bound:
+    def coarsening(self, coarse: StencilLevel, stiffen: float, held: float) -> BoundKernel:
         """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
         s, c = self.stencil, coarse.stencil
         shared = Coarsening(
@@ -140,7 +140,7 @@ class StencilLevel:
             self._coarser_rows(coarse), shared, stencil=s, coarse_wx=wx, coarse_wy=wy, coarse_wz=wz
         )
 
-    def restricting(self, coarse: StencilLevel, rows: Rows | None = None) -> Bound:
+    def restricting(self, coarse: StencilLevel, rows: Rows | None = None) -> BoundKernel:
         """Return the pass that sums the residual over aggregates, all unless told."""
         there = rows or self._coarser_rows(coarse)
 
@@ -159,7 +159,7 @@ class StencilLevel:
         projected: bool,
         rows: Rows | None = None,
         x: wp.array[Any] | None = None,
-    ) -> Bound:
+    ) -> BoundKernel:
         """Return the pass that adds `scale` times the coarse correction to x, or another field, clipped if projected."""
         there = rows or self._finer_rows(coarse)
         lower, upper = self._sides(projected)
@@ -175,7 +175,7 @@ class StencilLevel:
         )
         return self._once((coarse, projected, id(rows)), make)  # which keeps the rows
 
-    def filling(self, name: str) -> list[Bound | Task]:
+    def filling(self, name: str) -> list[BoundKernel | Task]:
         """Return what fills the ghost cells of a field, x or t."""
         return self._once(name, lambda: self.stencil.fillings(getattr(self, name)))
 
@@ -199,7 +199,7 @@ class StencilLevel:
 
     def pair(
         self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False
-    ) -> Iterator[Bound | Task]:
+    ) -> Iterator[BoundKernel | Task]:
         """Yield two sweeps, x to t and back; x is taken for 0 if from_zero."""
         if from_zero and self.joins_sweeps:
             yield self._two_sweeps(weights, projected=projected)
@@ -216,7 +216,7 @@ class StencilLevel:
         projected: bool,
         from_zero: bool = False,
         ring: wp.array[Any] | None = None,
-    ) -> tuple[Bound, Bound]:
+    ) -> tuple[BoundKernel, BoundKernel]:
         """Return the same for one wave: what is between the sweeps lies in a ring of planes, of t unless told."""
         between = self.t if ring is None else ring
         into = self.sweeping(
@@ -275,7 +275,7 @@ class StencilLevel:
             sweeps = self.ring_pair(weights, projected=projected, from_zero=from_zero)
             yield Leg(passes.DESCEND, (*sweeps, self.restricting(coarse)))
 
-    def coarsen_bounds(self, coarse: StencilLevel) -> tuple[Bound]:
+    def coarsen_bounds(self, coarse: StencilLevel) -> tuple[BoundKernel]:
         """Return step 3: the member nearest to its bound limits its aggregate."""
         make = lambda: passes.COARSE_BOUNDS.bind(  # noqa: E731
             self._coarser_rows(coarse),
@@ -311,7 +311,7 @@ class StencilLevel:
             yield correcting
             yield from self.pair(weights, projected=projected)
 
-    def _two_sweeps(self, weights: tuple[float, float], *, projected: bool) -> Bound:
+    def _two_sweeps(self, weights: tuple[float, float], *, projected: bool) -> BoundKernel:
         """Return the pass x = two sweeps of 0."""
         lower, upper = self._sides(projected)
         make = lambda: passes.TWO_SWEEPS.bind(  # noqa: E731
@@ -327,7 +327,9 @@ class StencilLevel:
         )
         return self._once(("two sweeps", weights, projected), make)
 
-    def _correct_and_sweep(self, coarse: StencilLevel, omega: float, *, projected: bool) -> Bound:
+    def _correct_and_sweep(
+        self, coarse: StencilLevel, omega: float, *, projected: bool
+    ) -> BoundKernel:
         """Return the pass t = a sweep of x and the coarse correction of it."""
         lower, upper = self._sides(projected)
         make = lambda: passes.CORRECT_AND_SWEEP.bind(  # noqa: E731
@@ -345,7 +347,7 @@ class StencilLevel:
         )
         return self._once(("correct and sweep", coarse, omega, projected), make)
 
-    def coarsened(self, coarse: StencilLevel) -> Iterator[Bound | Task]:
+    def coarsened(self, coarse: StencilLevel) -> Iterator[BoundKernel | Task]:
         """Yield the making of the next level."""
         yield self.coarsening(
             coarse, self.settings.over_correction, self.settings.dirichlet_scaling
@@ -378,9 +380,9 @@ class StencilLevel:
         *,
         projected: bool,
         from_zero: bool = False,
-        kind: RowPass = passes.SWEEP,
+        kind: StencilKernel = passes.SWEEP,
         rows: Rows | None = None,
-    ) -> Bound:
+    ) -> BoundKernel:
         """Return the pass y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero.
 
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.

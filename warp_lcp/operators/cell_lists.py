@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.kernels.fields import real_array
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows.fields import real_array
 
 TOGETHER = 1 << 20  # cells of a list that are processed together
 

@@ -15,11 +15,11 @@ import scipy.sparse.csgraph
 import scipy.sparse.linalg
 import warp as wp
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import Launch, clear, together
+from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.problem.protocol import FLUID
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, clear, together
-from warp_lcp.rows.readings import Reading
 
 options: dict[str, Any] = {"module": "warp_lcp.components"}
 F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
@@ -87,8 +87,8 @@ for _T in (wp.float32, wp.float64):
 
 
 if TYPE_CHECKING:
+    from warp_lcp.kernels.vectors import Communicator
     from warp_lcp.operators.grid_poisson import GridPoisson
-    from warp_lcp.rows.vectors import Across
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
@@ -143,7 +143,7 @@ class FloatingComponents:
         self,
         label: np.ndarray,
         device: wp.Device,
-        across: Across | None = None,
+        across: Communicator | None = None,
         *,
         left: np.ndarray | None = None,
         right: np.ndarray | None = None,
@@ -337,7 +337,7 @@ class ComponentFinder:
         self._A, device = A, A.device
         self._own: Scratch | None = None
         self._none_at = -1  # the operator's version that had no floating components
-        self._count = Reading(device, dtype=wp.int32)
+        self._count = DeviceScalar(device, dtype=wp.int32)
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, None if there are none.

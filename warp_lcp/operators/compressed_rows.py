@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.rows.layout import make_struct
+from warp_lcp.kernels.layout import make_struct
 
 
 @functools.cache

@@ -9,12 +9,8 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.operators.compressed_rows import CompressedRows
-from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, made_again
-from warp_lcp.problem.scale import scale_of_matrix
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import (
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import (
     Layout,
     check_kept,
     check_storable,
@@ -22,6 +18,10 @@ from warp_lcp.rows.fields import (
     real_array,
     relative_rounding,
 )
+from warp_lcp.operators.compressed_rows import CompressedRows
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.scale import scale_of_matrix
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
 PRODUCT = KERNELS["dense.product"]

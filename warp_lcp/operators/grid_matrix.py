@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from warp_lcp.kernels.layout import Pattern
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.rows.layout import Pattern
 
 
 def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:

@@ -14,12 +14,8 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.cell_lists import cells_of
-from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
-from warp_lcp.problem.pickling import Pickled
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import Bound, KernelFile, Rows
-from warp_lcp.rows.fields import (
+from warp_lcp.kernels import BoundKernel, KernelFile, Rows
+from warp_lcp.kernels.fields import (
     CPU_CHUNK,
     LARGE,
     PaddedLayout,
@@ -30,9 +26,13 @@ from warp_lcp.rows.fields import (
     relative_rounding,
     zeros,
 )
-from warp_lcp.rows.program import LaunchGraph
-from warp_lcp.rows.program import copy as copy_array
-from warp_lcp.rows.vectors import Across
+from warp_lcp.kernels.launch_graph import LaunchGraph
+from warp_lcp.kernels.launch_graph import copy as copy_array
+from warp_lcp.kernels.vectors import Communicator
+from warp_lcp.operators.cell_lists import cells_of
+from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
+from warp_lcp.problem.pickling import Pickled
+from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COPY_CELLS = KERNELS["grid_poisson.copy_cells"]
@@ -67,7 +67,7 @@ class GridOperator(Pickled):
     symmetric = True
     stencil: PaddedStencil
     _ghosts: Ghosts | None = None  # of a box of cells among others
-    _across: Across | None = None
+    _across: Communicator | None = None
     _finder: Any = None  # of floating components
     _rounding = 0.0  # largest relative rounding of coefficients that were given as arrays
     outside = SOLID  # cell type beyond the array
@@ -402,7 +402,7 @@ class GridOperator(Pickled):
         self._search.launch()
 
     @cached_property
-    def _search(self) -> Bound:
+    def _search(self) -> BoundKernel:
         """Kernel that finds the spans of `cells`; its arrays do not change."""
         rows = Rows.of(self.layout.padding, self.device, whole=True)
         return FIND_SPANS.bind(

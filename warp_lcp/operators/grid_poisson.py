@@ -14,6 +14,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import overwrite, real_array
+from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import (
     ComponentFinder,
     FaceCoefficients,
@@ -24,9 +27,6 @@ from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import CellDecomposition, PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import overwrite, real_array
-from warp_lcp.rows.vectors import Sums
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COUNT_FACES = KERNELS["grid_poisson.count_faces"]

@@ -13,11 +13,11 @@ import numpy as np
 import scipy.sparse.linalg
 import warp as wp
 
+from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
-from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 
 Product = Callable[[np.ndarray], Any]
 ASYMMETRY = 1e-5  # relative to ||u|| ||A v||: larger than float32 products leave of u'Av = v'Au

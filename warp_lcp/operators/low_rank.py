@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real_array
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Communicator, Reduction, add_across
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import layout_of
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Across, Reduction, add_across
 
 
 @forward_kernel(module="warp_lcp.low_rank")
@@ -87,7 +87,7 @@ class BlockColumns:
         across: communicator if other ranks have rows of U; None if serial.
     """
 
-    across: Across | None = None
+    across: Communicator | None = None
 
     def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
         self.size, self.width, self.rank, self.dtype, self.device = (
@@ -97,7 +97,7 @@ class BlockColumns:
             dtype,
             device,
         )
-        self._count, self._sums = Reading(device, 2, wp.int32), Reading(device, self.rank)
+        self._count, self._sums = DeviceScalar(device, 2, wp.int32), DeviceScalar(device, self.rank)
         self.count, self.sums = self._count.array, self._sums.array
         self.reserve(0)
 
@@ -452,7 +452,7 @@ class LowRankOperator(Pickled):
         self._weights.send()
         self._turned.send()
         self.weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
-        self.products, self.products_of = Reading(self.device, self.rank), None
+        self.products, self.products_of = DeviceScalar(self.device, self.rank), None
 
     def _checked_weights(self, weights: Any) -> np.ndarray:
         """Return W as a host matrix."""

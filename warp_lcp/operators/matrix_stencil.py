@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import Padding, zeros
+from warp_lcp.kernels.layout import Pattern
+from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import StoredStencil
 from warp_lcp.problem.protocol import FLUID
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import Padding, zeros
-from warp_lcp.rows.layout import Pattern
-from warp_lcp.rows.vectors import Sums
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 RECOGNIZE = KERNELS["matrix_stencil.recognize"]

@@ -22,12 +22,12 @@ from typing import Any, Protocol, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows import Bound, KernelFile, Rows
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import Padding
-from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
-from warp_lcp.rows.program import Launch, Task, launch_now
-from warp_lcp.rows.vectors import Across
+from warp_lcp.kernels import BoundKernel, KernelFile, Rows
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.fields import Padding
+from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
+from warp_lcp.kernels.layout import Pattern, check_memory, put, stencil_struct
+from warp_lcp.kernels.vectors import Communicator
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 PRODUCT = KERNELS["stencil.product"]
@@ -132,7 +132,7 @@ class CellDecomposition(Protocol):
     @property
     def ghosts(self) -> Ghosts | None: ...  # noqa: D102
     @property
-    def across(self) -> Across | None: ...  # noqa: D102
+    def across(self) -> Communicator | None: ...  # noqa: D102
 
     def together(self) -> AbstractContextManager[Any]:
         """Return a block that raises an exception of one process on all processes."""
@@ -243,11 +243,11 @@ class PaddedStencil:
         for filling in self.fillings(x):
             filling.launch(launch)
 
-    def fillings(self, x: wp.array[Any]) -> list[Bound | Task]:
+    def fillings(self, x: wp.array[Any]) -> list[BoundKernel | Task]:
         """Return the launches of `wrap`."""
         strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
         axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
-        made: list[Bound | Task] = [
+        made: list[BoundKernel | Task] = [
             WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes
         ]
         return made if self.ghosts is None else [*made, self.ghosts.filling(x)]

@@ -13,13 +13,13 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.kernels.fields import Array
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.rows.fields import Array
 
 MOST_DENSE = 600  # up to so many unknowns LAPACK factors a dense matrix in 10 ms
 LEAST_GRID = 2000  # number of unknowns from which a matrix is tested for being a grid's

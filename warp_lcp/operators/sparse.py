@@ -11,15 +11,9 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
-from warp_lcp.operators.dense import is_rounding
-from warp_lcp.operators.renumbering import Renumbering, renumbering
-from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, made_again
-from warp_lcp.problem.scale import scale_of_matrix
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import (
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.fields import (
     Layout,
     check_kept,
     check_storable,
@@ -30,8 +24,14 @@ from warp_lcp.rows.fields import (
     zeros,
     zeros_like,
 )
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.vectors import Sums
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.vectors import Sums
+from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
+from warp_lcp.operators.dense import is_rounding
+from warp_lcp.operators.renumbering import Renumbering, renumbering
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.scale import scale_of_matrix
 
 INDICES = wp.array(dtype=wp.int32)
 

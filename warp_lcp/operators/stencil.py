@@ -16,16 +16,16 @@ import numpy as np
 import scipy
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import check_kept, check_storable, real_array
+from warp_lcp.kernels.layout import Pattern
+from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import check_kept, check_storable, real_array
-from warp_lcp.rows.layout import Pattern
-from warp_lcp.rows.vectors import Sums
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 DIAGONAL = KERNELS["stencil.diagonal"]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled
@@ -22,7 +23,6 @@ from warp_lcp.problem.protocol import (
     layout_of,
     version_of,
 )
-from warp_lcp.rows.vectors import ADD, rows_of
 
 FELT = 1e-5  # relative to a column's sizes over a component: open fractions are float32
 

@@ -12,8 +12,8 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import Layout, real_array
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.fields import Layout, real_array
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import LARGE, Array, Layout, nothing, overwrite, real_array
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.vectors import Sums
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, nothing, overwrite, real_array
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 # A bound of this magnitude is infinite in files and for users of SciPy and qpsolvers, as in OSQP

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import LARGE, Array, Layout, overwrite, real_array
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import ADD, Sums, rows_of
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.pickling import OnHost, Pickled
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, overwrite, real_array
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 CHECK = KERNELS["problem.check"]
@@ -217,7 +217,7 @@ class LCP(Pickled):
         """Return the number of unknowns of a stored field that are not finite."""
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
-    def look_at(self, field: wp.array[Any], launch: Launch = launch_now) -> Reading:
+    def look_at(self, field: wp.array[Any], launch: Launch = launch_now) -> DeviceScalar:
         """Launch the check of `not_finite`; return the reading of its result.
 
         Its first number counts the values that are not finite. For a problem in one process.

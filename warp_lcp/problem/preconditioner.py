@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.rows.fields import Layout
+from warp_lcp.kernels.fields import Layout
 
 # Relative to ||u|| ||M v||: a larger asymmetry than rounding leaves, with which conjugate gradients
 # fail sooner or later.

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeGuard, TypeVar, ru
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.fields import Layout
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
-from warp_lcp.rows.fields import Layout
 
 if TYPE_CHECKING:
+    from warp_lcp.kernels.fields import PaddedLayout
     from warp_lcp.operators.compressed_rows import CompressedRows
-    from warp_lcp.rows.fields import PaddedLayout
 
 AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding of a number in float32

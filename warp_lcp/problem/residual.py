@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, PrecomputedProduct, Rows
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Sums
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import estimated_scale
-from warp_lcp.rows import KernelFile, Known, Rows
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Sums
 
 EPS = float(np.finfo(np.float64).eps)
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
@@ -67,9 +67,9 @@ class NaturalResidual:
         return self.problem.layout.zeros(wp.float64)
 
     @cached_property
-    def known(self) -> Known:
+    def known(self) -> PrecomputedProduct:
         """Kernel argument with the precomputed y, in place of a stencil."""
-        return Known(self.diagonal, self.unit, self.y)
+        return PrecomputedProduct(self.diagonal, self.unit, self.y)
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""
@@ -173,7 +173,7 @@ class NaturalResidual:
         return float(np.sqrt(self.square_of_b.numpy()[0]))
 
     @property
-    def square_of_b(self) -> Reading:
+    def square_of_b(self) -> DeviceScalar:
         """||b||^2 over the unknowns as last launched, in the first entry."""
         return self._sums.reading
 

@@ -24,7 +24,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.rows.fields import Layout
+from warp_lcp.kernels.fields import Layout
 
 # Relative excess of entries over those of the diagonal that storage in float32 causes in
 # semi-definite matrices of low rank.

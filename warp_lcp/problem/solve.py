@@ -19,6 +19,9 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import Deadline, TimeIsUp
+from warp_lcp.kernels.fields import Array
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.vectors import convert
 from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.merits import Merits, merits_at
@@ -26,9 +29,6 @@ from warp_lcp.problem.protocol import NamesComponents, asks_beyond_storage, has,
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria, limit_of_steps
-from warp_lcp.rows.fields import Array
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.vectors import convert
 
 # Least norm for which residuals 16 digits smaller have squares that float64 can hold.
 SMALLEST = 1e-138
@@ -165,7 +165,7 @@ class Workspace(Protocol):
         """Set x to the best iterate."""
 
 
-class BeginsAhead(Protocol):
+class BeginsOnDevice(Protocol):
     """A workspace whose device can begin a solve without the host."""
 
     def begin_ahead(
@@ -183,7 +183,7 @@ class BeginsAhead(Protocol):
         """
 
 
-class IterateMemory:
+class WorkspaceBase:
     """Base of workspaces: x, its residual, and the best iterate.
 
     x is moved in place and rounded to its precision; the best iterate is a copy.
@@ -529,7 +529,7 @@ class _Loop:
     def _begin_ahead(self, x0: Array | None) -> float | None:
         """Begin a solve on the device if the workspace supports that.
 
-        Returns the value of `BeginsAhead.begin_ahead`. With a callback, merits or a deadline the
+        Returns the value of `BeginsOnDevice.begin_ahead`. With a callback, merits or a deadline the
         host takes each step.
         """
         work: Any = self.work

@@ -10,10 +10,10 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any
 
+from warp_lcp.kernels.thread_pool import get_threads, team
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver
-from warp_lcp.rows.team import get_threads, team
 
 # Largest workspace that is kept, in cells with ghost cells: 45 bytes each, 140 in float64 with
 # fields of faces and bounds.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.kernels import KernelFile, Rows
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
 CLASSIFY = KERNELS["active_set.classify"]

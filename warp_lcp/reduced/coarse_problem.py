@@ -31,7 +31,7 @@ CREEP = 0.92
 STEPS = 3  # creeping steps before the correction
 
 
-class CoarseProblem:
+class FullApproximationCorrection:
     """Solve for a correction P e of x on coarse points: P'A P e + P'(A x + b).
 
     The bounds of e are those that x leaves at the coarse points. These are unknowns of the fine
@@ -103,11 +103,13 @@ class CoarseProblem:
             b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
             self._work = self._settings.init(LCP(A, b, lower, upper))
             if self._work.system.coarse is not None:
-                self._work.system.coarse = CoarseProblem(A, self._settings, coarse=True)
+                self._work.system.coarse = FullApproximationCorrection(
+                    A, self._settings, coarse=True
+                )
         return self._work is not None
 
 
-class CoarseStencilProblem(CoarseProblem):
+class CoarseStencilProblem(FullApproximationCorrection):
     """Coarse problem on every second cell of a compact stencil's grid.
 
     It uses the transfers of the stencil's hierarchy; each solve begins with a correction. With

@@ -9,13 +9,13 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels.vectors import Sums
 from warp_lcp.multigrid.aggregates import MonotoneAggregation
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.reduced.active_set_kernels import projected_move
 from warp_lcp.reduced.grid_system import GridSystem, projected_cycle
-from warp_lcp.rows.vectors import Sums
 
 LARGE = 1000  # least number of unknowns of a sparse matrix for projected cycles at a cold start
 # From this number of unknowns on, six cycles replace each cycle on a grid. One costs a fifth of a
@@ -64,7 +64,7 @@ class GridCycles:
         return RISEN * size
 
 
-class AggregateCycles:
+class AggregateColdStart:
     """Projected cycles on the aggregates of a large sparse matrix.
 
     The matrix must be nearly a diagonally dominant M-matrix.
@@ -104,11 +104,11 @@ class AggregateCycles:
 
 def cold_cycles(
     problem: LCP, system: Any, sums: Sums, count: int
-) -> GridCycles | AggregateCycles | None:
+) -> GridCycles | AggregateColdStart | None:
     """Return the cycles for a bounded problem, None for unsuitable operators."""
     if not problem.bounded:
         return None
     if isinstance(system, GridSystem):
         return GridCycles(problem, system, sums, count)
     large = isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
-    return AggregateCycles(problem, count) if large else None
+    return AggregateColdStart(problem, count) if large else None

@@ -12,20 +12,20 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.deadline import check_time
+from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.active_set_kernels import CLASSIFY, ON_FREE, projected_move
-from warp_lcp.reduced.coarse_problem import CoarseProblem, CoarseStencilProblem
+from warp_lcp.reduced.coarse_problem import CoarseStencilProblem, FullApproximationCorrection
 from warp_lcp.reduced.cold_cycles import LARGE, cold_cycles
 from warp_lcp.reduced.dense_system import DampedSteps, DenseSystem
 from warp_lcp.reduced.grid_step_kernels import SLOTS
 from warp_lcp.reduced.line_system import LineSystem
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.sparse_system import SparseSystem
-from warp_lcp.rows.vectors import Sums, rows_of
 
 
 class CorrectionSystem:
@@ -55,9 +55,9 @@ class CorrectionSystem:
 
     whole = False
 
-    def __init__(self, problem: LCP, settings: Any, iterate: IterateMemory | None = None) -> None:
+    def __init__(self, problem: LCP, settings: Any, iterate: WorkspaceBase | None = None) -> None:
         self._problem, self._settings, layout = problem, settings, problem.layout
-        self.iterate = IterateMemory(problem, settings.precision) if iterate is None else iterate
+        self.iterate = WorkspaceBase(problem, settings.precision) if iterate is None else iterate
         real, x = self.iterate.precision.correction, self.iterate.x
         self.start_of_step = layout.zeros(wp.float64)
         self.principal = principal_system(
@@ -288,7 +288,7 @@ class CorrectionSystem:
         self.iterate.round_iterate()
 
 
-def _coarse_problem(problem: LCP, system: Any, settings: Any) -> CoarseProblem | None:
+def _coarse_problem(problem: LCP, system: Any, settings: Any) -> FullApproximationCorrection | None:
     """Return the coarse problem of an operator, None if it has none.
 
     A large sparse matrix has one, and a stencil that needs lines.
@@ -297,7 +297,7 @@ def _coarse_problem(problem: LCP, system: Any, settings: Any) -> CoarseProblem |
     if isinstance(system, LineSystem):
         return CoarseStencilProblem(A, system, settings)
     return (
-        CoarseProblem(A, settings)
+        FullApproximationCorrection(A, settings)
         if isinstance(A, SparseOperator) and A.unknowns >= LARGE
         else None
     )

@@ -21,7 +21,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.problem.solve import EPS, IterateMemory, Precision, Step
+from warp_lcp.problem.solve import EPS, Precision, Step, WorkspaceBase
 
 # Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.
 SEMIDEFINITE = 1e-10
@@ -542,7 +542,7 @@ def check_size(problem: LCP, method: str, most: int) -> int:
     return n
 
 
-class DenseWorkspace(IterateMemory):
+class DenseWorkspace(WorkspaceBase):
     """Workspace of a method that works on a DenseProblem and writes x back.
 
     Attributes:

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.reduced.active_set_kernels import DIVIDE, MASK, SHIFT
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.vectors import rows_of
 
 
 class DiagonalSystem(KrylovSystem):

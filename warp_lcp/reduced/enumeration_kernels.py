@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.kernels.compiler import forward_kernel
 
 EXACT = 64.0  # units of rounding: a candidate with a smaller measure is accepted at once
 RANK = 1e3  # units of rounding: smaller pivots, relative to A's largest entry, are zero

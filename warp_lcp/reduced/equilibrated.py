@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scaled
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.dense_problem import (
     DenseProblem,
     power_of_two,
@@ -28,8 +30,6 @@ from warp_lcp.reduced.dense_problem import (
     within_reach,
     without_contact,
 )
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
 UNITS = KERNELS["equilibrated.units"]
@@ -45,7 +45,7 @@ GROWN = 1e4  # growth of the residual after which the proof is tried too
 EARLY = 10  # steps in which the residual may rise: a path is joined far from the start
 
 
-class EquilibratedWorkspace(IterateMemory):
+class EquilibratedWorkspace(WorkspaceBase):
     """Workspace of a method for the scaled problem.
 
     The scaled problem is R A C x' + R b with bounds l / C and u / C; the problem's own iterate is x

@@ -7,16 +7,16 @@ from typing import no_type_check
 
 import warp as wp
 
+from warp_lcp.kernels import FusedKernel, KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.launch_graph import Launch, launch
+from warp_lcp.kernels.vectors import Reduction
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.reduced.grid_step_kernels import BETA, CARRY, NORM, SIZE, STEP
 from warp_lcp.reduced.grid_step_kernels import SLOTS as STEP_SLOTS
-from warp_lcp.rows import KernelFile, Wave
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, launch
-from warp_lcp.rows.vectors import Reduction
 
 # Slots of the device scalars after those of a step, from the square of the residual on.
 SQUARE = wp.constant(STEP_SLOTS)
@@ -30,7 +30,7 @@ KERNELS = KernelFile(
 DIRECT = KERNELS["grid_conjugate_gradient.direct"]
 STEP_ALONG = KERNELS["grid_conjugate_gradient.step"]
 # Both planes are in the cache.
-ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))
+ADVANCE = FusedKernel("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))
 
 f64 = wp.array(dtype=wp.float64)
 

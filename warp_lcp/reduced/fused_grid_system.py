@@ -19,13 +19,13 @@ from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as engine
-from warp_lcp.reduced.multigrid_residual import AssessedResidual
 from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
+from warp_lcp.reduced.residual_and_active_set import ResidualAndActiveSet
 
 IDLE = StoppingCriteria.patience  # iterations of one linear solve without a smaller residual
 
 
-class MinimumMapResidual(AssessedResidual):
+class MinimumMapResidual(ResidualAndActiveSet):
     """Natural residual with the free set of the minimum map.
 
     Free are the unknowns with x - y / A_ii within their bounds.

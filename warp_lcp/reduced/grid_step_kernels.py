@@ -10,10 +10,10 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels import BoundKernel, FusedKernel, KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.multigrid.cycle_passes import ASCEND
 from warp_lcp.multigrid.stencil_level import StencilLevel
-from warp_lcp.rows import Bound, KernelFile, Wave
-from warp_lcp.rows.compiler import forward_kernel
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, as are ZAZ ... GP.
 NORM = wp.constant(0)  # squared norm of the natural residual
@@ -43,11 +43,11 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/grid_step.h", SLOT)
 UPDATE = KERNELS["projected_multigrid.update"]
 ASSESS = KERNELS["projected_multigrid.assess"]
 # A plane is evaluated when the one above it has moved.
-ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))
+ADVANCE = FusedKernel("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))
 MEASURE = KERNELS["projected_multigrid.measure"]
 MEASURE_AGAIN = KERNELS["projected_multigrid.measure_again"]
 # The last part of a cycle: z is still in the cache.
-CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))
+CLIMB = FusedKernel("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))
 HOLD = KERNELS["projected_multigrid.hold"]
 RIGHT_SIDE = KERNELS["projected_multigrid.right_side"]
 GAPS = KERNELS["projected_multigrid.gaps"]
@@ -55,7 +55,7 @@ MASK = KERNELS["projected_multigrid.mask"]
 UNDO = KERNELS["projected_multigrid.undo"]
 
 
-def measuring(finest: StencilLevel, direction: Any, out: Any) -> Bound:
+def measuring(finest: StencilLevel, direction: Any, out: Any) -> BoundKernel:
     """Return the kernel that sums the products of a cycle's correction."""
     return MEASURE.bind(
         finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out

@@ -10,21 +10,21 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.reduced.active_set_kernels import ALL_FREE, ON_FREE, SHIFT
 from warp_lcp.reduced.fused_conjugate_gradient import FusedConjugateGradient
 from warp_lcp.reduced.grid_step_kernels import GAPS, SIZE
 from warp_lcp.reduced.sparse_system import GuardedSystem, MatrixSystem
-from warp_lcp.rows import Rows
-from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.program import Program
-from warp_lcp.rows.vectors import Reduction, rows_of
 
 
 class GridSystem(GuardedSystem):
@@ -97,7 +97,7 @@ class GridSystem(GuardedSystem):
             self.hierarchy.rebuild()
 
     @property
-    def program(self) -> Program:
+    def program(self) -> CommandBuffer:
         """The preconditioner: z = one cycle on r."""
         return self.hierarchy.cycle
 

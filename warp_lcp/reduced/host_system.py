@@ -19,7 +19,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateMemory, Precision, Step
+from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.dense_problem import factored
 from warp_lcp.reduced.nested_iteration import nested_iteration
@@ -184,7 +184,7 @@ class HostResidual(NaturalResidual):
         return math.sqrt(self.b @ self.b)
 
 
-class HostIterate(IterateMemory):
+class HostIterate(WorkspaceBase):
     """An iterate whose residual and best values are computed on the host.
 
     Args:

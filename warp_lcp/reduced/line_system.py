@@ -7,14 +7,14 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.launch_graph import CommandBuffer
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.multigrid.black_box_multigrid import BlackBoxMultigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.multigrid.line_hierarchy import BlackBoxMultigrid
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.reduced.sparse_system import GuardedSystem, MatrixSystem
-from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.program import Program
 
 
 class LineSystem(GuardedSystem):
@@ -55,7 +55,7 @@ class LineSystem(GuardedSystem):
         self.hierarchy.restrict(free, shift, self._weight)
 
     @property
-    def program(self) -> Program:
+    def program(self) -> CommandBuffer:
         """The preconditioner: z = one cycle on r."""
         return self.hierarchy.cycle
 

@@ -12,16 +12,16 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.host_array import HostArray
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Reduction
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.reduced.grid_step_kernels import ENERGY, ZAP, ZAZ
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
-from warp_lcp.rows.program import launch as launch_recorded
-from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import Reduction
 
 # Ratio of added to own inertia, as estimated, from which a column is corrected: the other columns
 # move eigenvalues by a small factor.
@@ -139,7 +139,7 @@ DOTS = KERNELS["low_rank_correction.dots"]
 SUBTRACT = KERNELS["low_rank_correction.subtract"]
 
 
-class LowRankCorrection:
+class WoodburyCorrection:
     """Make a linear cycle B ~ A^-1 a preconditioner M of A + U W U'.
 
     With Z = B U, S = U'Z and E = S + S W S,
@@ -176,7 +176,7 @@ class LowRankCorrection:
         self._sums, self._kept, self._force, self._t = (
             wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4)
         )
-        self.noted = Reading(device, n + n // low.columns.width)
+        self.noted = DeviceScalar(device, n + n // low.columns.width)
         self.calm = wp.zeros(1, dtype=wp.int32, device=device) if device.is_cuda else None
         self._power = wp.float64(
             1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1)
@@ -193,7 +193,7 @@ class LowRankCorrection:
         self._slot_columns = list[int]()
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
         few = n * n <= MOST_READ  # U'Z, a slot after another
-        self._read_products = Reading(device, n * n) if few else None
+        self._read_products = DeviceScalar(device, n * n) if few else None
         self._products = (
             self._read_products.array
             if self._read_products is not None
@@ -232,7 +232,7 @@ class LowRankCorrection:
         return self.calm is not None and self.slots > 0
 
     @property
-    def readings(self) -> tuple[Reading, ...]:
+    def readings(self) -> tuple[DeviceScalar, ...]:
         """Arrays that `note`, `note_products` and `make_potentials` write."""
         return (self.noted,) if self._read_products is None else (self.noted, self._read_products)
 

@@ -9,6 +9,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -17,10 +20,7 @@ from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.reduced.active_set_kernels import SHIFT
 from warp_lcp.reduced.grid_system import GridSystem
-from warp_lcp.reduced.low_rank_correction import LowRankCorrection
-from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.vectors import rows_of
+from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
 
 
 class CoupledGridSystem(KrylovSystem):
@@ -45,7 +45,7 @@ class CoupledGridSystem(KrylovSystem):
             A,
         )
         self.r, self.z = self._grid.r, self._grid.z
-        self._correction, self._begins = LowRankCorrection(low, self._grid.hierarchy), True
+        self._correction, self._begins = WoodburyCorrection(low, self._grid.hierarchy), True
         self._extra = zeros_like(self.r)
         self._free: wp.array[Any] | None = None
         self._weight = zeros_like(self.r) if shifted else None

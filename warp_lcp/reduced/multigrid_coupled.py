@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, LaunchGraph, launch_now
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.vectors import CONVERT, rows_of
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.low_rank import LowRankOperator
@@ -18,19 +21,16 @@ from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
 from warp_lcp.reduced import low_rank_correction as coupling
-from warp_lcp.reduced.low_rank_correction import LowRankCorrection
-from warp_lcp.reduced.multigrid_ahead import RunAhead
-from warp_lcp.reduced.multigrid_residual import AssessedResidual
+from warp_lcp.reduced.device_iteration import DeviceIteration
+from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
 from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, launch_now
-from warp_lcp.rows.program import launch as launch_recorded
-from warp_lcp.rows.vectors import CONVERT, rows_of
+from warp_lcp.reduced.residual_and_active_set import ResidualAndActiveSet
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
 
-class CoupledResidual(AssessedResidual):
+class CoupledResidual(ResidualAndActiveSet):
     """Natural residual of y = A x + (b + U W U' x).
 
     The term in brackets changes on U's rows only and replaces b. Its d_i are the diagonal of A
@@ -95,7 +95,7 @@ class CoupledWorkspace(MultigridWorkspace):
     """Workspace of the method for one problem of a grid and bodies."""
 
     residual: CoupledResidual
-    correction: LowRankCorrection
+    correction: WoodburyCorrection
     # The projection changes the force on a very light body by a large factor each time, and the
     # projected cycles of the grid hardly reduce the energy of grid and bodies.
     most_runs = 3
@@ -107,8 +107,8 @@ class CoupledWorkspace(MultigridWorkspace):
             problem, A, settings, residual=partial(CoupledResidual, low=low), ahead=False
         )
         self._low = low
-        self.correction = LowRankCorrection(low, self.hierarchy)
-        self._ahead = RunAhead(self, rebuilds=False) if RunAhead.suits(self) else None
+        self.correction = WoodburyCorrection(low, self.hierarchy)
+        self._ahead = DeviceIteration(self, rebuilds=False) if DeviceIteration.suits(self) else None
         self._evaluation = LaunchGraph(
             problem.device, self._launch_evaluation, at_once=problem.layout.across is not None
         )
@@ -203,7 +203,7 @@ class CoupledWorkspace(MultigridWorkspace):
         """Return the key of the launches of a truncated cycle, with the correction's."""
         return (*super().program_key(), *self.correction.key)
 
-    def _correct(self, program: Program) -> None:
+    def _correct(self, program: CommandBuffer) -> None:
         """Record a cycle, its correction, its products and the choice of the step."""
         self.correction.begin(launch=program.launch)
         program.extend(self.hierarchy.cycle)

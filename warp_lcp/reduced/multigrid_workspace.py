@@ -12,31 +12,31 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.fields import nothing
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, as_one_table, launch_now
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.halo_levels import beside_cuts
-from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.problem.solve import IterateMemory, Precision, Step
+from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
 from warp_lcp.reduced.descent import Descent
-from warp_lcp.reduced.multigrid_ahead import RunAhead
-from warp_lcp.reduced.multigrid_residual import AssessedResidual
-from warp_lcp.rows import Rows
-from warp_lcp.rows.fields import nothing
-from warp_lcp.rows.program import Launch, Program, as_one_table, launch_now
-from warp_lcp.rows.program import launch as launch_recorded
-from warp_lcp.rows.readings import Reading
+from warp_lcp.reduced.device_iteration import DeviceIteration
+from warp_lcp.reduced.residual_and_active_set import ResidualAndActiveSet
 
 if TYPE_CHECKING:
-    from warp_lcp.reduced.low_rank_correction import LowRankCorrection
+    from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
 
 AHEAD = 20  # steps that the device may take without the host, which then examines their pace
 
 
-class MultigridWorkspace(IterateMemory):
+class MultigridWorkspace(WorkspaceBase):
     """Workspace of `ProjectedMultigrid`; its cycles also serve other grid methods.
 
     x is moved in place. The best iterate is not stored while it is x, nor when x is one step past
@@ -57,13 +57,13 @@ class MultigridWorkspace(IterateMemory):
             creeps.
     """
 
-    residual: AssessedResidual
-    readings: tuple[Reading, ...] = ()  # written by evaluations besides the residual's
-    correction: LowRankCorrection | None = None  # of the cycle, for bodies
+    residual: ResidualAndActiveSet
+    readings: tuple[DeviceScalar, ...] = ()  # written by evaluations besides the residual's
+    correction: WoodburyCorrection | None = None  # of the cycle, for bodies
     # Limit of runs of projected cycles: after those, the free set is considered to cycle.
     most_runs: float = math.inf
     cycles_against_creeping = True
-    # Whether `LowRankCorrection.note` has been launched for the current free set.
+    # Whether `WoodburyCorrection.note` has been launched for the current free set.
     free_set_noted = False
 
     def __init__(
@@ -72,7 +72,7 @@ class MultigridWorkspace(IterateMemory):
         A: HasStencil,
         settings: Any,
         *,
-        residual: Callable[..., AssessedResidual] = AssessedResidual,
+        residual: Callable[..., ResidualAndActiveSet] = ResidualAndActiveSet,
         shifted: bool = False,
         ahead: bool = True,
     ) -> None:
@@ -102,14 +102,14 @@ class MultigridWorkspace(IterateMemory):
             residual=residual(problem, A, self.hierarchy, rounded=precision is Precision.SINGLE),
         )
         self.flat = Rows.of_fields(problem.layout)
-        self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
+        self._programs: dict[tuple[Any, ...], CommandBuffer] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
         # Steps since the best iterate; whether it has memory of its own.
         self._past, self._stored = 0, False
         self.cycles_left, self.descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._taken = 0.0, 0  # steps of this solve
-        self._ahead = RunAhead(self) if ahead and RunAhead.suits(self) else None
+        self._ahead = DeviceIteration(self) if ahead and DeviceIteration.suits(self) else None
         self._one_table = self._ahead is not None  # whether nothing is read back within a step
         self._built = 0  # the version of the free set that the hierarchy was built for
         # Steps that the device may take without the host; whether it has begun the solve.
@@ -406,7 +406,7 @@ class MultigridWorkspace(IterateMemory):
         """Run a cycle on the right-hand side."""
         self.hierarchy.cycle.run()
 
-    def step_program(self) -> Program:
+    def step_program(self) -> CommandBuffer:
         """Return the launches of a truncated cycle.
 
         They are stored by key: bounds in place may be coded now and not in the next solve.
@@ -414,7 +414,7 @@ class MultigridWorkspace(IterateMemory):
         key = self.program_key()
         program = self._programs.get(key)
         if program is None:
-            program = self._programs[key] = Program(self.A.device)
+            program = self._programs[key] = CommandBuffer(self.A.device)
             self._correct(program)
             self._advance(classify=True, launch=program.launch)
         return program
@@ -428,7 +428,7 @@ class MultigridWorkspace(IterateMemory):
         """Return the key of the launches of a truncated cycle."""
         return self.problem_key()
 
-    def _correct(self, program: Program) -> None:
+    def _correct(self, program: CommandBuffer) -> None:
         """Record a cycle, the products of its correction and the choice of the step.
 
         On the CPU the last part of the cycle sums the products.

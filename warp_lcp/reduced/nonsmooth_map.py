@@ -19,17 +19,17 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import FusedKernel, KernelFile, Rows, StencilKernel
+from warp_lcp.kernels.fields import PaddedLayout
+from warp_lcp.kernels.host_kernel import HostKernel
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.vectors import Sums, convert, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.reduced.dense_problem import DenseProblem
-from warp_lcp.rows import KernelFile, RowPass, Rows, Wave
-from warp_lcp.rows.fields import PaddedLayout
-from warp_lcp.rows.host_kernel import HostKernel
-from warp_lcp.rows.program import Launch, launch_now
-from warp_lcp.rows.vectors import Sums, convert, rows_of
 
 # Least q as a divisor: measured; a smaller one makes D needlessly large, a larger one slows
 # convergence.
@@ -49,7 +49,7 @@ MOVE = KERNELS["nonsmooth_map.move"]
 CONDENSE_AT_ROWS = KERNELS["nonsmooth_map.condense_at_rows"]
 HOST = HostKernel(KERNELS["nonsmooth_map.host"])
 # A plane is condensed when the one above it has moved.
-STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))
+STEP = FusedKernel("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))
 DIFFERENCE = KERNELS["finite_difference.difference"]
 SCALE = KERNELS["finite_difference.scale"]
 # Distance of the two points of a difference, relative to ||x|| / ||p||: half the digits of float64.
@@ -419,7 +419,7 @@ class NonsmoothMap:
         ).launch()
 
     def _half_sum(
-        self, declared: RowPass, x: wp.array[Any], *more: MapSystem | MapWeights
+        self, declared: StencilKernel, x: wp.array[Any], *more: MapSystem | MapWeights
     ) -> float:
         """Run a kernel of the map at x; return half of its first sum."""
         sums = self._sums.of(

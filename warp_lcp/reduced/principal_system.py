@@ -13,9 +13,9 @@ from typing import Any, Protocol
 
 import warp as wp
 
+from warp_lcp.multigrid.black_box_multigrid import needs_lines
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.multigrid.line_hierarchy import needs_lines
 from warp_lcp.operators.banded_matrix import NARROW
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Protocol
 
-from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.fused_grid_system import FusedGridSystem
 from warp_lcp.reduced.host_system import HostSystem
@@ -27,7 +27,7 @@ class ReducedSystem(Protocol):
     whole: bool
 
     @property
-    def iterate(self) -> IterateMemory:
+    def iterate(self) -> WorkspaceBase:
         """x, which `move` changes in place, its residual, and the best x so far."""
 
     def start(

@@ -15,7 +15,9 @@ import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
 
-from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, Preconditioner
+from warp_lcp.kernels.fields import zeros, zeros_like
+from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, KrylovPreconditioner
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.aggregates import suits_multigrid
@@ -24,8 +26,6 @@ from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.protocol import FLUID, HasStencil
-from warp_lcp.rows.fields import zeros, zeros_like
-from warp_lcp.rows.program import Launch, launch_now
 
 # For symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations
 # of the usual settings, .8 on elastic blocks.
@@ -99,7 +99,7 @@ class GuardedSystem(KrylovSystem):
         return done + iterations, norm
 
 
-class SparsePreconditioner(Preconditioner, Protocol):
+class SparsePreconditioner(KrylovPreconditioner, Protocol):
     """An approximate inverse of M = P A P + P D P, and M itself."""
 
     weight: wp.array[Any]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from warp_lcp.render.recording import Frame, Recording, RenderError
+from warp_lcp.render.recording import RecordedFrame, Recording, RenderError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,7 +20,7 @@ DOTS_AN_INCH, POINTS_AN_INCH = 100, 72
 class Painter(Protocol):
     """Renderer of the pictures on a page."""
 
-    def draw(self, frame: Frame) -> np.ndarray:
+    def draw(self, frame: RecordedFrame) -> np.ndarray:
         """Return a picture of a frame."""
 
     def close(self) -> None:

@@ -14,7 +14,14 @@ import numpy as np
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import SHADES, Actors, Drawn, body_meshes, shaded, surface_meshes
 from warp_lcp.render.grains import grains
-from warp_lcp.render.recording import WITH_PARTICLES, WITH_SURFACE, Color, Frame, Recording, Show
+from warp_lcp.render.recording import (
+    WITH_PARTICLES,
+    WITH_SURFACE,
+    Color,
+    RecordedFrame,
+    Recording,
+    Show,
+)
 from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescribed_solids
 from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
 from warp_lcp.scene.camera import Viewpoint, viewpoint
@@ -111,7 +118,7 @@ class Picture:
         )
         camera.view_angle = view.angle
 
-    def place(self, frame: Frame) -> None:
+    def place(self, frame: RecordedFrame) -> None:
         """Replace the actors of the last frame with those of a frame."""
         moving = [(solid, motion.pose(frame.time)) for solid, motion in self._moving]
         size, width = self.scene.domain.size, self.samples
@@ -141,7 +148,7 @@ class Picture:
             actor.mapper.SetSplatShaderCode(DISC if self.flat else GRAIN if self.grainy else BALL)
             actor.mapper.scale_factor = radius
 
-    def draw(self, frame: Frame) -> np.ndarray:
+    def draw(self, frame: RecordedFrame) -> np.ndarray:
         """Return an image of a frame."""
         from PIL import Image
 
@@ -233,7 +240,7 @@ class Picture:
             ]
         )
 
-    def _particles(self, frame: Frame, sun: Sunlight | None) -> tuple[list[Drawn], float]:
+    def _particles(self, frame: RecordedFrame, sun: Sunlight | None) -> tuple[list[Drawn], float]:
         """Return particles as discs, balls or grains, shaded, and their radius [m]."""
         import pyvista
 

@@ -63,7 +63,7 @@ LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"
 
 
 @dataclass(frozen=True)
-class Frame:
+class RecordedFrame:
     """Data of an image of a frame.
 
     Args:
@@ -84,7 +84,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColorScale:
     """Color scale from `low` to `high`, the same in every image of a run.
 
     A scale without a label has no legend.
@@ -211,7 +211,7 @@ class Recording:
             selected.add(number)
         return sorted(selected) or self.numbers
 
-    def frame(self, number: int) -> Frame:
+    def frame(self, number: int) -> RecordedFrame:
         """Return the data of an image of a frame.
 
         Raises:
@@ -226,7 +226,7 @@ class Recording:
         filled = (
             self._cells(number) if self.cells and self._file("grid", number).is_file() else None
         )
-        return Frame(
+        return RecordedFrame(
             self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled
         )
 
@@ -283,14 +283,14 @@ class Recording:
         return points[finite], values[finite]
 
     @cached_property
-    def scale(self) -> Scale:
+    def scale(self) -> ColorScale:
         """Return the color scale of the whole run.
 
         It ends at the 98th percentile of the particles, rounded up; larger values have the last
         color.
         """
         if self.color is Color.PLAIN or not self._numbers("particles"):
-            return Scale("", -1.0, 1.0, PALETTES[self.scene.palette])
+            return ColorScale("", -1.0, 1.0, PALETTES[self.scene.palette])
         samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
         low, high = np.percentile(
             np.concatenate(
@@ -302,8 +302,8 @@ class Recording:
         # Liquid that a wall holds has negative pressure.
         low = -_round_up(-low) if low < -0.01 * high else 0.0
         if self.color is Color.SPEED:
-            return Scale("speed [m/s]", low, high, PALETTES[self.scene.palette])
-        return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high)
+            return ColorScale("speed [m/s]", low, high, PALETTES[self.scene.palette])
+        return ColorScale(LABELS.get(self.color, "pressure [Pa]"), low, high)
 
     def particle_spacing(self) -> float:
         """Return the initial distance of neighboring particles [m].

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import BODY_COLORS, BODY_EDGE
-from warp_lcp.render.recording import Color, Frame, Recording, RenderError
+from warp_lcp.render.recording import Color, RecordedFrame, Recording, RenderError
 from warp_lcp.render.solid_meshes import EDGE, nearest_distance, prescribed_solids
 from warp_lcp.simulation import Surface
 
@@ -53,7 +53,7 @@ class Section:
             motion = solid.motion.to_motion(self.scene.dimension) if solid.motion else None
             self._solids.append((solid.to_geometry(Path(), self.scene.dimension), motion))
 
-    def draw(self, frame: Frame) -> np.ndarray:
+    def draw(self, frame: RecordedFrame) -> np.ndarray:
         """Return a picture of a frame."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -91,7 +91,7 @@ class Section:
     def close(self) -> None:
         """Do nothing: pictures do not share a figure."""
 
-    def _draw_cells(self, axes: Any, frame: Frame) -> None:
+    def _draw_cells(self, axes: Any, frame: RecordedFrame) -> None:
         """Fill the cut cells, with the colors of their pressure if requested."""
         from matplotlib.colors import ListedColormap
 
@@ -178,7 +178,7 @@ class Section:
         ends = surface.points[surface.corners]
         return ends[..., :2] if self.at is None else cut(ends, self.at)
 
-    def _draw_particles(self, axes: Any, frame: Frame) -> None:
+    def _draw_particles(self, axes: Any, frame: RecordedFrame) -> None:
         """Draw the particles within half a cell of the plane.
 
         In their color, or as dots over the cells' pressure.

@@ -80,7 +80,7 @@ def export_run(
     try:
         make_folder(file.parent)
         with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
-            stage = Stage(Path(scratch) / "frames.usdc", recording, numbers)
+            stage = UsdStage(Path(scratch) / "frames.usdc", recording, numbers)
             told(0, len(numbers))
             for done, number in enumerate(numbers, 1):
                 stage.add(number)
@@ -109,7 +109,7 @@ def usd_suffix(file: Path) -> str:
     return suffix
 
 
-class Stage:
+class UsdStage:
     """USD stage that grows by frames, with one frame at a time in memory.
 
     Frames that have been added are on the disk.

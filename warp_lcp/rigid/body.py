@@ -11,9 +11,9 @@ from typing import cast, overload
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.host_kernel import HostKernel
 from warp_lcp.rigid.mass_properties import MassProperties
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.settings import NonNegative, Part, checked
 
 # Limit of the fixed-point iteration. A step rotates a body by far less than a radian, and each

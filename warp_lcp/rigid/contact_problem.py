@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.host_kernel import HostKernel
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.host_kernel import HostKernel
 
 if TYPE_CHECKING:
     from warp_lcp.rigid.joints import JointRows

@@ -15,9 +15,9 @@ from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, cross, in_space, lengt
 from warp_lcp.rigid.contact_detection import NONE, ContactDetection, FoundContacts, Place, between
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, JointPart
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
-from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
 from warp_lcp.rigid.planar_contacts import AHEAD, RATE, ROUGH, SLOP, PlanarContacts, PlanarImpulses
+from warp_lcp.rigid.supported_contacts import SINGULAR, SupportedContacts
 
 # Relative to the smallest body's size: gaps up to this are contacts, besides those that velocities
 # may close in a step.
@@ -506,7 +506,7 @@ class ContactSolve:
                 V = V[:, values > SINGULAR * values.max()]
                 self.bodies[number].hold = np.eye(3) - ((1.0 / root)[:, None] * V) @ V.T * root
         elif len(contacts):
-            firm = Firm.of(contacts, impulses, len(self.bodies))
+            firm = SupportedContacts.of(contacts, impulses, len(self.bodies))
             roots = self._roots()
             waiting = np.unique(contacts.first[firm.first.any(axis=1)]).tolist()
             while waiting:

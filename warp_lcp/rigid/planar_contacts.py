@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.host_kernel import HostKernel
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.box_contacts import FACE_FIRST, PARALLEL
 from warp_lcp.rigid.contact_detection import (
@@ -31,10 +33,8 @@ from warp_lcp.rigid.contact_detection import (
 from warp_lcp.rigid.contact_problem import YIELDS
 from warp_lcp.rigid.contact_shape import ON_SURFACE
 from warp_lcp.rigid.contacts import SAME_PLACE, Contacts
-from warp_lcp.rigid.firm import BEARS
 from warp_lcp.rigid.obstacles import Obstacle
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.host_kernel import HostKernel
+from warp_lcp.rigid.supported_contacts import BEARS
 
 # Factor on the displacement by velocities and gravity in a step, since the impulses of a material
 # are not known before its solve.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.files.claims import one_line
+from warp_lcp.files.size_limits import one_line
 from warp_lcp.frames.meshio_format import Dress, holds
 from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene

@@ -8,8 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 
 import warp as wp
 
-from warp_lcp.files.claims import free_host_memory
-from warp_lcp.rows.kernel_messages import start_warp
+from warp_lcp.files.size_limits import free_host_memory
+from warp_lcp.kernels.log_filter import start_warp
 from warp_lcp.run.kernel_cache import cache_error, watch_loads
 from warp_lcp.simulation import InputError
 

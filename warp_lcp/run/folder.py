@@ -28,7 +28,7 @@ from warp_lcp.files.atomic import (
     sync_folder,
     write_text,
 )
-from warp_lcp.files.claims import one_line
+from warp_lcp.files.size_limits import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import (
@@ -48,8 +48,8 @@ from warp_lcp.run.continuation import (
 )
 from warp_lcp.run.devices import versions
 from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
-from warp_lcp.run.gaps import gaps
 from warp_lcp.run.log import Log, OutputError
+from warp_lcp.run.missing_outputs import gaps
 from warp_lcp.run.rank_frames import RankFrames, RankFrameWriter
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, keys, load_scene, table_keys
@@ -96,7 +96,7 @@ class RunRecord:
             to another grid.
         mesh_files: digest of the content of each mesh file, by its key.
         overrides: `--set` options of this run, with the values of the scene's file, see
-            `warp_lcp.run.given_scene`.
+            `warp_lcp.run.resolve_scene`.
         seconds: wall time of this part of the run.
         warnings: warnings about the results.
         versions: versions of the software.

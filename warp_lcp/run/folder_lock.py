@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_lcp.files.atomic import open_in_place
-from warp_lcp.files.claims import one_line
+from warp_lcp.files.size_limits import one_line
 
 try:
     import fcntl

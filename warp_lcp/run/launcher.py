@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import OutputError, RunRecord
-from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
+from warp_lcp.run.resolve_scene import ResolvedScene, resolve_scene, scene_to_resume
 from warp_lcp.run.terminal import Terminal
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
@@ -47,7 +47,7 @@ class Launcher:
 
     def load(
         self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
-    ) -> GivenScene:
+    ) -> ResolvedScene:
         """Return the scene of a new or resumed run.
 
         Args:
@@ -66,7 +66,7 @@ class Launcher:
                     "SCENE is missing: give a scene file or the name of a built-in scene; only "
                     "--resume --out DIR needs none"
                 )
-            return given_scene(scene, overrides)
+            return resolve_scene(scene, overrides)
         if out is None and scene is None:
             raise OutputError("--resume: needs SCENE or --out DIR, the folder of the run")
         return scene_to_resume(

@@ -61,7 +61,7 @@ class RunRequest:
         out: the run's folder, visible to all ranks; no files are written if None.
         device: Warp device of this rank, such as `cuda:0`.
         overrides: differences of the scene from its file, for run.json, see
-            `warp_lcp.run.given_scene`.
+            `warp_lcp.run.resolve_scene`.
         last_frame: frame after which the run ends; default: the scene's last one.
         resume: continue the run in the folder, from any number of ranks.
         force: delete the run in the folder.

@@ -13,7 +13,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.files.atomic import write_text
-from warp_lcp.rows.team import get_threads, shared_seconds
+from warp_lcp.kernels.thread_pool import get_threads, shared_seconds
 from warp_lcp.run.terminal import table_lines
 
 PROFILE = "profile.json"
@@ -22,7 +22,7 @@ LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # message of Warp for each 
 
 
 @dataclass
-class Stage:
+class ProfileStage:
     """Time and memory traffic of a stage.
 
     Args:
@@ -58,7 +58,7 @@ class LoadedKernels:
     """
 
     def __init__(self) -> None:
-        self.loads = Stage()
+        self.loads = ProfileStage()
         self._logger, self._level = wp.get_logger(), wp.config.log_level
 
     def debug(self, message: str) -> None:
@@ -96,9 +96,9 @@ class Profile:
     """
 
     def __init__(self, device: str) -> None:
-        self.stages: dict[str, Stage] = {}
+        self.stages: dict[str, ProfileStage] = {}
         self._device = wp.get_device(device)
-        self._loads = Stage()
+        self._loads = ProfileStage()
 
     @contextmanager
     def kernels_apart(self) -> Iterator[None]:
@@ -117,7 +117,7 @@ class Profile:
             yield
         finally:
             self._wait()
-            stage = self.stages.setdefault(name, Stage())
+            stage = self.stages.setdefault(name, ProfileStage())
             stage.add(time.perf_counter() - begun - (self._loads.seconds - loading))
             stage.shared += shared_seconds() - shared
             stage.bytes += sum(
@@ -133,7 +133,7 @@ class Profile:
         try:
             yield
         finally:
-            self.stages.setdefault(name, Stage(beside=True)).add(time.perf_counter() - begun)
+            self.stages.setdefault(name, ProfileStage(beside=True)).add(time.perf_counter() - begun)
 
     def wrote(self, name: str, *files: Path) -> None:
         """Add the sizes of files to a stage; a missing file counts as 0."""

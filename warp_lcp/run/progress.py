@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn
 from rich.table import Column
 
-from warp_lcp.files.claims import one_line
+from warp_lcp.files.size_limits import one_line
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.run.log import Value
 from warp_lcp.run.terminal import say

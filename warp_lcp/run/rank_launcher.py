@@ -22,11 +22,11 @@ from warp_lcp.distributed.watchdog import Watchdog
 from warp_lcp.run.continuation import mesh_digests
 from warp_lcp.run.devices import DeviceError, EngineError, devices
 from warp_lcp.run.folder import OutputError, RunRecord, mark_ended
-from warp_lcp.run.given_scene import GivenScene
 from warp_lcp.run.launcher import Launcher
 from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
+from warp_lcp.run.resolve_scene import ResolvedScene
 from warp_lcp.run.terminal import Terminal, say, tell
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.table import written
@@ -61,7 +61,7 @@ class RankLauncher(Launcher):
 
     def load(
         self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
-    ) -> GivenScene:
+    ) -> ResolvedScene:
         """Return a scene that is the same on all ranks.
 
         Raises:

@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from warp_lcp.files.claims import one_line, visible
+from warp_lcp.files.size_limits import one_line, visible
 from warp_lcp.run.kernel_cache import KernelCacheError
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines

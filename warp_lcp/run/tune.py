@@ -12,7 +12,7 @@ from typing import Any
 
 from warp_lcp.files.atomic import write_text
 from warp_lcp.run.trial import Differences, Trial, spread_of, trial
-from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
+from warp_lcp.scene.presets import Preset, PresetName, PresetPrices, changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene
 from warp_lcp.scene.table import KeyFault, SceneError
@@ -252,7 +252,7 @@ class _Search:
     """Search for the fastest settings."""
 
     scene: Scene
-    prices: Prices
+    prices: PresetPrices
     preset: Preset
     device: str
     frames: int

@@ -36,7 +36,7 @@ class Preset:
 
 
 @dataclass(frozen=True)
-class Prices:
+class PresetPrices:
     """Presets and trial settings of one simulator.
 
     Attributes:
@@ -53,7 +53,7 @@ class Prices:
 
 
 @cache
-def price_table() -> Mapping[str, Prices]:
+def price_table() -> Mapping[str, PresetPrices]:
     """Return the entries of `presets.toml` by simulator."""
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     entries = {}
@@ -63,7 +63,7 @@ def price_table() -> Mapping[str, Prices]:
             for name in PRESETS
         }
         steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
-        entries[simulator] = Prices(
+        entries[simulator] = PresetPrices(
             presets, _flat(part["reference"]), steps, tuple(part["tolerances"])
         )
     return entries

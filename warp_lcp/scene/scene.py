@@ -29,8 +29,8 @@ from warp_lcp.scene.shapes import (
     Solid,
     Wall,
 )
+from warp_lcp.scene.suspicious_settings import scene_notes
 from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector, refuse, validate
-from warp_lcp.scene.unusual import scene_notes
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solvers.registry import grid_methods
 
@@ -237,7 +237,7 @@ class Physics(Table):
     )
 
 
-class Solver(Table):
+class SolverTable(Table):
     """[solver]: solution of the complementarity problem of each step."""
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
@@ -297,7 +297,7 @@ class Scene(Table):
     time: Time
     domain: Domain
     physics: Physics
-    solver: Solver = Field(default_factory=Solver)
+    solver: SolverTable = Field(default_factory=SolverTable)
     solid: list[Solid] = Field(default_factory=list)
     output: Output = Field(default_factory=Output)
     camera: Camera = Field(default_factory=Camera)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from warp_lcp.files.claims import one_line
+from warp_lcp.files.size_limits import one_line
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError
 

@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
-from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import Sums, rows_of
+from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.sweeps.spectrum import positive_diagonal, scaled_spectrum
 
@@ -93,7 +93,7 @@ class MomentumFields:
     unknown: wp.array[Any]
 
 
-class AcceleratedWorkspace(IterateMemory):
+class AcceleratedWorkspace(WorkspaceBase):
     """Workspace of the accelerated projected gradient method.
 
     Attributes:

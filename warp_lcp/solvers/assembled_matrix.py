@@ -13,7 +13,7 @@ from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, check_taken, has
-from warp_lcp.problem.solve import IterateMemory, Solver, Step, method_name
+from warp_lcp.problem.solve import Solver, Step, WorkspaceBase, method_name
 from warp_lcp.settings import Settings
 
 
@@ -57,7 +57,7 @@ class AssembledMatrix(Settings):
         return work.step(x)
 
 
-class AssembledWorkspace(IterateMemory):
+class AssembledWorkspace(WorkspaceBase):
     """Workspace for one problem; each solve assembles the matrix at its start."""
 
     def __init__(self, problem: LCP, method: Solver) -> None:

@@ -12,13 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.layout import put
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, check_taken, has
 from warp_lcp.problem.solve import PrecisionName, Solver, Step
-from warp_lcp.rows import Rows
-from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace

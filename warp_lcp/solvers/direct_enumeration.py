@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.fields import Array, checked_device, real_array
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.pickling import FieldsOnHost
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
 from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent
 from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
-from warp_lcp.rows.fields import Array, checked_device, real_array
 
 MOST = 4  # largest number of unknowns: 3^4 = 81 sets
 # Largest measure of a solution: natural residual over the terms of y, for cond(A) < 1e5.

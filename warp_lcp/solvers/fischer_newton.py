@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
-from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITY, without_far
@@ -21,7 +21,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
-from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.problem.solve import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.reduced.dense_problem import DenseWorkspace
 from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 from warp_lcp.reduced.grid_system import GridSystem
@@ -172,7 +172,7 @@ class FischerNewton(NewtonSettings):
         return work.newton_step(x)
 
 
-class FischerWorkspace(IterateMemory):
+class FischerWorkspace(WorkspaceBase):
     """Workspace of the method for one problem, on the device."""
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:

@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
 from warp_lcp.reduced.descent import NonmonotoneSearch
 from warp_lcp.reduced.nonsmooth_map import MapForm, MapName, NonsmoothMap
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
@@ -75,7 +75,7 @@ class GradientDescent(Settings):
         return work.descend(x)
 
 
-class DescentWorkspace(IterateMemory):
+class DescentWorkspace(WorkspaceBase):
     """Workspace of the method for one problem.
 
     It belongs to another method if it shares that method's residual.

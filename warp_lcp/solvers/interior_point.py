@@ -19,19 +19,19 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.kernels import FusedKernel, KernelFile, PrecomputedProduct
+from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
 from warp_lcp.reduced.grid_system import GridSystem
 from warp_lcp.reduced.multigrid_workspace import ColdStart
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.settings import NewtonSettings
-from warp_lcp.rows import KernelFile, Known, Wave
-from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Share
 
 LARGEST_START = 1e6  # times the residual's norm: largest ||b|| that sets the size of the start
@@ -44,7 +44,7 @@ MOVE = KERNELS["interior_point.move"]
 RATIOS = KERNELS["interior_point.ratios"]
 CENTER = KERNELS["interior_point.center"]
 # A plane is condensed when the one above it has moved.
-ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))
+ADVANCE = FusedKernel("interior_point.advance", (MOVE, 0), (CONDENSE, 1))
 
 
 # A near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50
@@ -193,7 +193,7 @@ class PathSystem:
     tau: float
 
 
-class InteriorPointWorkspace(IterateMemory):
+class InteriorPointWorkspace(WorkspaceBase):
     """Workspace of the method for one problem.
 
     Attributes:
@@ -409,7 +409,7 @@ class InteriorPointWorkspace(IterateMemory):
         return (
             self.problem.A.stencil  # type: ignore[attr-defined]
             if self._fused
-            else Known(r.diagonal, r.unit, r.y)
+            else PrecomputedProduct(r.diagonal, r.unit, r.y)
         )
 
     def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> PathSystem:

@@ -11,8 +11,11 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.vectors import Sums
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
@@ -21,7 +24,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.problem.solve import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.reduced.active_set_kernels import projected_move
 from warp_lcp.reduced.descent import Descent
@@ -29,9 +32,6 @@ from warp_lcp.reduced.diagonal_system import DiagonalSystem
 from warp_lcp.reduced.grid_system import projected_cycle
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.sparse_system import SparseSystem
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
 from warp_lcp.sweeps.sweep import Diagonal
 
@@ -254,7 +254,7 @@ class SplitResidual(NaturalResidual):
         return float(self.sums.scalars.numpy()[0])
 
 
-class MPRGPWorkspace(IterateMemory):
+class MPRGPWorkspace(WorkspaceBase):
     """Workspace of the method for one problem.
 
     Args:

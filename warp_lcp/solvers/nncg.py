@@ -12,12 +12,12 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.residual import WITHIN
 from warp_lcp.problem.solve import PrecisionName, Step
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.sweeps.sweep import sweep_for

@@ -12,17 +12,17 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.active_set_kernels import ON_FREE
 from warp_lcp.reduced.multigrid_workspace import ColdStart
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.settings import NewtonSettings
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Positive, Share
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
@@ -98,7 +98,7 @@ class Penalty(NewtonSettings):
         return work.policy_step(x)
 
 
-class PenaltyWorkspace(IterateMemory):
+class PenaltyWorkspace(WorkspaceBase):
     """Workspace of the method for one problem.
 
     Attributes:

@@ -14,11 +14,11 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
+from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.solve import Precision, Step
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.program import Launch, Program, launch_now
-from warp_lcp.rows.vectors import Reduction, rows_of
 from warp_lcp.settings import Count, Settings, Share
 
 f64, i32 = wp.float64, wp.int32
@@ -166,7 +166,7 @@ class ContactWorkspace:
         self._squares = Reduction(k, device, self._state, threads=max(every.places, 1))
         self._gather = self._gathering()
         self._left = self._passes.residual.bind(every, self._fields, out=self._squares.partials)
-        self._program = Program(device)
+        self._program = CommandBuffer(device)
         for count in range(method.check_every):
             self._record(count % 2)
         self._look(self._program.launch)

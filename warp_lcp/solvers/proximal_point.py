@@ -14,7 +14,7 @@ from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix
-from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, IterateMemory, Solver, Step
+from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Solver, Step, WorkspaceBase
 from warp_lcp.reduced.dense_problem import proved_infeasible
 from warp_lcp.settings import Settings
 from warp_lcp.solvers.fallback import Fallback, fails
@@ -88,7 +88,7 @@ class ProximalPoint(Settings):
         return work.step(x)
 
 
-class ProximalWorkspace(IterateMemory):
+class ProximalWorkspace(WorkspaceBase):
     """Workspace of the method for one problem; A is read when a solve begins."""
 
     def __init__(self, problem: LCP, inner: Solver | None) -> None:

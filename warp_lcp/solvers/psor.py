@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, Relaxes, check_taken, has, version_of
-from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.sweeps.spectrum import scaled_spectrum
 from warp_lcp.sweeps.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
@@ -105,7 +105,7 @@ class ProjectedSOR(Settings):
         return Step("sweep", len(directions), failure=work.contraction.test(x))
 
 
-class SweepWorkspace(IterateMemory):
+class SweepWorkspace(WorkspaceBase):
     """Workspace of a method that sweeps.
 
     Attributes:

@@ -16,15 +16,15 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.deadline import check_time
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.operators.grid_poisson import AIR, FLUID
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasBlocks, HasRows, check_taken, described, has, version_of
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.problem.solve import IterateMemory, Solver, Step, solve
+from warp_lcp.problem.solve import Solver, Step, WorkspaceBase, solve
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import rows_of
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.sweeps.sweep import Contraction
@@ -93,7 +93,7 @@ class Staggering(Settings):
         return Step("round", linear, failure=work.contraction.test(x))
 
 
-class StaggeringWorkspace(IterateMemory):
+class StaggeringWorkspace(WorkspaceBase):
     """Workspace of a problem in blocks that are solved in turn.
 
     Attributes:

@@ -13,6 +13,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
@@ -20,8 +22,6 @@ from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.reduced.active_set_kernels import ON_FREE, projected_move
 from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.sweeps.sweep import sweep_for

@@ -9,9 +9,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
-from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.sweeps.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.affine_bounds import affine_side
@@ -18,7 +19,6 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.rows.vectors import ADD, rows_of
 from warp_lcp.sweeps.sweep_kernels import CHANGE, row_kernels
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))

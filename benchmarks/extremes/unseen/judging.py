@@ -21,16 +21,16 @@ from warp_lcp.benchmarks.extremes.case import (
     HONEST,
     REFUSED,
     SOLVED,
-    Attempt,
-    Case,
     Expected,
+    ExtremeAttempt,
+    ExtremeCase,
+    ExtremeVerdict,
     Promise,
     SolveCase,
-    Verdict,
     checked,
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, equality
-from warp_lcp.benchmarks.harness.record import Table
+from warp_lcp.benchmarks.harness.record import RecordTable
 from warp_lcp.problem.protocol import families
 
 FAMILY, METHODS_FAMILY = FAMILIES = ("unseen", "unseen, every method")
@@ -54,7 +54,7 @@ Solve = Callable[..., wl.SolveResult]
 
 def solved(
     problem: Problem, solve: Solve, device: str, **more: Any
-) -> tuple[wl.SolveResult, Attempt]:
+) -> tuple[wl.SolveResult, ExtremeAttempt]:
     """Solve by the default method; return the result and its independent check."""
     begun = time.perf_counter()
     result = solve(
@@ -65,7 +65,7 @@ def solved(
 
 
 @dataclass(frozen=True)
-class Drawn(Case):
+class Drawn(ExtremeCase):
     """Random problem, reproducible from its kind and seed."""
 
     kind: str  # kind of the problem
@@ -84,7 +84,7 @@ class UnseenCase(Drawn):
             FAMILY, f"{kind} {seed}", kind, seed, solve=solve, expected=expected, budget=30.0
         )
 
-    def tried(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Solve cold and warm, and solve the equations without bounds."""
         drawn = unseen.problem(self.kind, self.seed)
         result, attempt = solved(drawn.problem, self.solve, device)
@@ -105,7 +105,7 @@ class UnseenCase(Drawn):
         problem: GridProblem,
         allowance: float,
         result: wl.SolveResult,
-        attempt: Attempt,
+        attempt: ExtremeAttempt,
         device: str,
     ) -> None:
         free, count = equality(problem), None
@@ -122,7 +122,7 @@ class UnseenCase(Drawn):
             )
 
     def _warm(
-        self, then: GridProblem, before: wl.SolveResult, attempt: Attempt, device: str
+        self, then: GridProblem, before: wl.SolveResult, attempt: ExtremeAttempt, device: str
     ) -> None:
         iterations = {}
         for how, guess in (("cold", {}), ("warm", {"x0": before.x})):
@@ -165,7 +165,7 @@ class EveryMethodCase(Drawn):
             budget=180.0,
         )
 
-    def tried(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Try all methods."""
         problem, start_time = (
             unseen.problem(self.kind, self.seed, small=True).problem,
@@ -182,7 +182,9 @@ class EveryMethodCase(Drawn):
             "ends": ends,
             "converged": sum(end == "CONVERGED" for end in ends.values()),
         }
-        return Attempt("done", None, time.perf_counter() - start_time, faults=faults, facts=facts)
+        return ExtremeAttempt(
+            "done", None, time.perf_counter() - start_time, faults=faults, facts=facts
+        )
 
 
 def by_method(
@@ -226,7 +228,7 @@ def cases(
         yield EveryMethodCase(kind, first)
 
 
-def summary(verdicts: Sequence[Verdict], first: int) -> tuple[Table, list[str]]:
+def summary(verdicts: Sequence[ExtremeVerdict], first: int) -> tuple[RecordTable, list[str]]:
     """Return a row for each kind, and the faults of all cases together."""
     own = [v for v in verdicts if v.case.family == FAMILY]
     rows = [
@@ -268,12 +270,12 @@ def summary(verdicts: Sequence[Verdict], first: int) -> tuple[Table, list[str]]:
     ]
     wrong = [f"{FAMILY}: only {within}"] if counted and share < OFTEN_SHARE else []
     wrong += [f"{FAMILY}: only {warm}"] if beyond and warm_share < OFTEN_SHARE else []
-    return Table(
+    return RecordTable(
         "Unseen problems", [*columns, "slowest [s]"], [row for row in rows if row], remark
     ), wrong
 
 
-def _row(kind: str, own: Sequence[Verdict]) -> list[str]:
+def _row(kind: str, own: Sequence[ExtremeVerdict]) -> list[str]:
     if not own:
         return []
     facts = [v.attempt.facts for v in own]

@@ -24,7 +24,7 @@ auto unite = [&](int i, int j) {
     }
 };
 
-// kernel warp_lcp.material.flight.unite: Cells with a face between them that particles gave weight
+// kernel warp_lcp.material.ballistic_fragments.unite: Cells with a face between them that particles gave weight
 // belong together
 //   compute    float32
 //   whole      int32 parent
@@ -49,7 +49,7 @@ for (int i = first; i < last; ++i) {
     if (w && weighs(w[i]) && !(x && weighs(w[i - 1]) && weighs(u[i - s1]))) unite(c, c - s1);
 }
 
-// kernel warp_lcp.material.flight.alone: Every cell is a tree of its own
+// kernel warp_lcp.material.ballistic_fragments.alone: Every cell is a tree of its own
 //   compute    float32
 //   whole      int32 parent; uint8 held, several
 //   box        int8 kind
@@ -60,7 +60,7 @@ for (int i = first; i < last; ++i) {
     several[c] = 0;
 }
 
-// kernel warp_lcp.material.flight.number: Number the trees of several cells that nothing holds;
+// kernel warp_lcp.material.ballistic_fragments.number: Number the trees of several cells that nothing holds;
 // other cells get -1
 //   compute    float32
 //   whole      int32 parent; uint8 held, several; int32 number, count
@@ -71,7 +71,7 @@ for (int i = first; i < last; ++i) {
     number[c] = parent[c] == c && !held[c] && several[c] ? wp::atomic_add(count, 1) : -1;
 }
 
-// kernel warp_lcp.material.flight.hold: Tell which trees reach a wall, and which have several
+// kernel warp_lcp.material.ballistic_fragments.hold: Tell which trees reach a wall, and which have several
 // cells: those without weight stay alone
 //   compute    float32
 //   whole      int32 parent; uint8 held, several

@@ -1,5 +1,5 @@
 // Impulses of contacts in a plane, see `rigid/planar_contacts.py`: the loops of
-// `ContactSolve.push_apart`, `ContactMemory` and `Firm`, with their bits.
+// `ContactSolve.push_apart`, `ContactMemory` and `SupportedContacts`, with their bits.
 
 // kernel warp_lcp.rigid.planar_impulses.push: Impulses of contacts, as `ContactSolve.push_apart`
 // has them. `reals` holds values, masses, inverse inertias and their roots of `count` bodies;
@@ -212,7 +212,7 @@ if (deep[0] > 0.0) {
             pushes[3 * second_of[k] + a] += far[k] * others[6 * k + a] + 0.0;
     for (int i = 0; i < 3 * n; ++i) ways[i] = roots[i] * (roots[i] * pushes[i] + 0.0) + 0.0;
 }
-// what walls and other solids hold, see `Firm`: G' J' J G of its rows
+// what walls and other solids hold, see `SupportedContacts`: G' J' J G of its rows
 for (int i = 0; i <= n; ++i) largest[i] = 0.0;
 for (int i = 0; i < n; ++i) {
     holding[i] = 0.0;

@@ -1,0 +1,72 @@
+"""What this process waits in for other ranks, and how it waits."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from typing import Any, Self
+
+# seconds that a wait spends asking: between two operations ranks rarely differ by more
+AWAKE = 1e-3
+SHARE = 1 / 16  # of a wait's length so far, which a rank that has nothing to do sleeps at a time
+LONGEST = 5e-3  # seconds of such a sleep
+
+
+class InterruptibleWait:
+    """Tells others, such as a `Watchdog`, whether this process is inside an operation that other ranks take part in.
+
+    Attributes:
+        native: entries and exits of operations in native code, and the error of the first one that
+            has failed, 0 while none has.
+
+    >>> waiting = Waiting()
+    >>> with waiting("a sum"):
+    ...     waiting.name, waiting.count
+    ('a sum', 1)
+    >>> waiting.name, waiting.count
+    ('', 2)
+    """
+
+    def __init__(self) -> None:
+        self._name, self._count, self._next = "", 0, ""
+        self.native = (ctypes.c_uint64 * 2)()
+
+    @property
+    def name(self) -> str:
+        """Of the operation, "" outside."""
+        return "an exchange among launches" if self.native[0] % 2 else self._name
+
+    @property
+    def count(self) -> int:
+        """Of entries and exits so far."""
+        return self._count + int(self.native[0])
+
+    def __call__(self, name: str) -> Self:
+        """Return the context of an operation of this name."""
+        self._next = name
+        return self
+
+    def __enter__(self) -> Self:
+        self._name = self._next
+        self._count += 1
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._name = ""
+        self._count += 1
+
+
+waiting = InterruptibleWait()  # MPI's world is one a process, and its main thread alone is in it
+
+
+def finish(request: Any, seconds: float = math.inf) -> bool:
+    """Wait for a request of MPI without using up a core, and return whether it has ended within some seconds."""
+    begun = time.monotonic()
+    while not request.Test():
+        waited = time.monotonic() - begun
+        if waited > seconds:
+            return False
+        if waited > AWAKE:
+            time.sleep(min(SHARE * waited, LONGEST))
+    return True

@@ -1,0 +1,130 @@
+"""What particles reach of a grid: pieces of its rows, where a box around all of them would be mostly empty."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import SEGMENT, StaggeredGrid, Window
+from warp_lcp.kernels import KernelFile
+
+# of a box that may be visited in part: finding the part costs as much as a pass over particles and
+# one over segments
+LEAST_CELLS = 1 << 17
+MOST = 0.4  # of a box's segments that a part may have
+REST = 6  # steps after which one looks again whether a part has become smaller
+
+KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
+MARK = KERNELS["warp_lcp.grid.active_rows.mark_segments"]
+
+
+class ActiveRows:
+    """Find what the particles of a simulation reach.
+
+    A step leaves something in fields where it reaches, nothing elsewhere: one that visits what is
+    reached in it and what was in the step before leaves fields as if it had visited all cells.
+
+    Args:
+        grid: of the particles.
+        before: what has looked at another part of the same domain, whose cells begin a multiple of
+            `SEGMENT` apart.
+    """
+
+    def __init__(self, grid: StaggeredGrid, before: "ActiveRows | None" = None) -> None:
+        self.grid = grid
+        nz, ny, nx = grid.shape
+        self._marks: wp.array[wp.uint8] | None = None
+        self._shape = nz, ny, -(-nx // SEGMENT)
+        self._step = -1  # that has been looked at
+        self._now: np.ndarray | None = None  # what it reaches
+        self._before: np.ndarray | None = None  # and what the one before it did; None: not known
+        self._rest = -1  # the step until which all is visited
+        self.active = not grid.device.is_cuda and grid.size >= LEAST_CELLS
+        if before is not None and self.active:
+            self._take(before)
+
+    def _take(self, other: "ActiveRows") -> None:
+        """Go on from what another one has found."""
+        if other._now is None:
+            return
+        shift = np.array(other.grid.origin) - self.grid.origin
+        made = np.zeros(self._shape, dtype=np.uint8)
+        into, of = [], []
+        for steps, mine, theirs in zip(
+            (shift[2], shift[1], shift[0] // SEGMENT), made.shape, other._now.shape, strict=True
+        ):
+            first, last = max(steps, 0), min(mine, theirs + steps)
+            into.append(slice(first, max(last, first)))
+            of.append(slice(first - steps, max(last, first) - steps))
+        made[tuple(into)] = other._now[tuple(of)]
+        self._step, self._now = other._step, made
+
+    def window(self, box: Window, particles: Particles, grow: int, step: int) -> Window:
+        """Return what must be visited of a box.
+
+        Args:
+            box: of all that particles reach.
+            particles: where they are.
+            grow: cells that they reach beyond their own.
+            step: number of the step; what it has reached before counts as well.
+        """
+        whole = math.prod(end - start for start, end in zip(box.low, box.high, strict=True))
+        if not self.active or whole < LEAST_CELLS or step < self._rest:
+            self._step, self._now, self._before = step, None, None
+            return box
+        near = self._near(box, particles, grow)
+        if step != self._step:
+            self._step, self._before, self._now = step, self._now, None
+        self._now = near if self._now is None else self._now | near
+        if self._before is None:
+            return box
+        both = self._now | self._before
+        if SEGMENT * np.count_nonzero(both) > MOST * whole:
+            self._rest = step + REST
+            return box
+        return replace(box, near=both)
+
+    def _near(self, box: Window, particles: Particles, grow: int) -> np.ndarray:
+        """Return which segments of rows are reached."""
+        if self._marks is None:
+            self._marks = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=self.grid.device)
+        self._marks.zero_()
+        in_z, in_y, in_x = self._shape
+        launch(
+            MARK,
+            len(particles.position),
+            self.grid,
+            position=particles.position,
+            marks=self._marks,
+            segment=SEGMENT,
+            in_z=in_z,
+            in_y=in_y,
+            in_x=in_x,
+        )
+        near = np.zeros(self._shape, dtype=np.uint8)
+        part = tuple(slice(low, high) for low, high in zip(box.low, box.high, strict=True))
+        part = (*part[:2], slice(part[2].start // SEGMENT, -(-part[2].stop // SEGMENT)))
+        found = self._marks.numpy().reshape(self._shape)[part]
+        for axis, cells in enumerate(
+            (grow * (self.grid.dimension == 3), grow, -(-grow // SEGMENT))
+        ):
+            found = spread(found, cells, axis)
+        near[part] = found
+        return near
+
+
+def spread(marks: np.ndarray, cells: int, axis: int) -> np.ndarray:
+    """Return bytes that are 1 where one is within some cells along an axis."""
+    if cells == 0:
+        return marks
+    width, all = 1, 2 * cells + 1
+    made = np.pad(np.moveaxis(marks, axis, 0), ((0, cells), (0, 0), (0, 0)))
+    while width < all:
+        step = min(width, all - width)
+        made[step:] |= made[:-step]
+        width += step
+    return np.moveaxis(made[cells:], 0, axis)

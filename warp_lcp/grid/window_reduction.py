@@ -1,0 +1,115 @@
+"""What passes find in the cells of a window: sums, and the largest of something."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_lcp.grid.staggered import KERNELS, ActiveWindow, StaggeredGrid, Window
+from warp_lcp.kernels import Rows, StencilKernel
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.vectors import Tally
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+# columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
+CUDA_SUMS = 1 << 20
+CUDA_PLANES = 16  # of one of them, at least
+
+ADD_ROWS = KERNELS["warp_lcp.grid.window_reduction.add_rows"]
+
+
+class WindowTally:
+    """A tally over windows of a grid; on the CPU rows are added up as they lie in the grid.
+
+    Args:
+        declared: a pass over a box, with what it finds.
+        grid: the grid.
+        counted: cells whose rows the CPU adds up; None: those of the window.
+    """
+
+    def __init__(
+        self, declared: StencilKernel, grid: StaggeredGrid, counted: Window | None = None
+    ) -> None:
+        self._shape, domain, self._declared = grid.shape[:2], grid.domain, declared
+        self._planes = max(CUDA_PLANES, grid.size // CUDA_SUMS)
+        self.name, self._counted = declared.name, counted
+        columns, device = len(declared.found), grid.device
+        self._tally = (
+            Tally(declared, device, domain.rows_of_sums(self._planes).places)
+            if device.is_cuda
+            else None
+        )
+        if self._tally is None:
+            rows = self._shape[0] * self._shape[1]
+            self._partials, self._host = (
+                wp.zeros(columns * rows, dtype=wp.float64, device=device) for _ in range(2)
+            )
+            self._reading, self._columns = (
+                DeviceScalar(device, columns),
+                Rows.flat(columns, device, serial=True),
+            )
+
+    def take(self, window: Window, *structs: DataclassInstance, **given: Any) -> None:
+        """Launch the pass, bound as by `StencilKernel.bind`, over a window."""
+        rows_of_sums = window.rows_of_sums(self._planes)
+        if self._tally is not None:
+            self._tally.launch(rows_of_sums, structs, given)
+            return
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows_of_sums, structs, given).launch()
+        first_k, first_j, planes, rows = _numbers(window)
+        box_k, box_j, box_planes, box_rows = _numbers(self._counted or window)
+        hulls, pieces = _hulls(window)
+        ADD_ROWS.bind(
+            self._columns,
+            partials=self._partials,
+            host=self._host,
+            results=self._reading.array,
+            hulls=hulls,
+            pieces=pieces,
+            first_k=first_k,
+            first_j=first_j,
+            planes=planes,
+            rows_=rows,
+            box_k=box_k,
+            box_j=box_j,
+            box_planes=box_planes,
+            box_rows=box_rows,
+            sums_=len(self._declared.sums),
+            all_planes=self._shape[0],
+            all_rows=self._shape[1],
+        ).launch()
+        self._reading.changed()
+
+    def changed(self) -> None:
+        """Say that a recorded `take` has run."""
+        if self._tally is None:
+            self._reading.changed()
+        else:
+            self._tally.changed()
+
+    def on_device(self) -> Any:
+        """Return what is found, a number a column, where kernels find it."""
+        return self._reading.array if self._tally is None else self._tally.found
+
+    def read(self) -> list[float]:
+        """Return what the last launch found."""
+        found = self._reading.numpy() if self._tally is None else self._tally.read()
+        return [float(v) for v in found]
+
+
+def _numbers(window: Window) -> tuple[Any, ...]:
+    """Return the first plane and row of a window, and how many it has."""
+    if isinstance(window, ActiveWindow):
+        return *window.first, *window.sizes
+    return *window.low[:2], *window.rows
+
+
+def _hulls(window: Window) -> tuple[Any, Any]:
+    """Return how many pieces of rows a window in part has, and those; 0 and None: all of its box."""
+    if isinstance(window, ActiveWindow):
+        return window.pieces, window.hull_pieces
+    return (0, None) if window.near is None else (len(window._hulls), window._hulls)

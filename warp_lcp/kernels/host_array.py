@@ -1,0 +1,43 @@
+"""Arrays that the host fills and kernels read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.kernels.launch_graph import LaunchGraph
+
+
+class HostArray:
+    """An array filled by the host and read by kernels: one memory on the CPU, two on a GPU.
+
+    Args:
+        count: elements, or the shape.
+        dtype: of them, a Warp type or struct.
+        device: where kernels read them.
+
+    Attributes:
+        host: NumPy array to write to.
+        array: what kernels take, up to date after `send`.
+    """
+
+    def __init__(self, count: int | tuple[int, ...], dtype: Any, device: wp.Device) -> None:
+        self.array: wp.array[Any] = wp.zeros(count, dtype=dtype, device=device)
+        self._shared = wp.get_device(device).is_cpu
+        self.host: Any = self.array.numpy() if self._shared else np.zeros_like(self.array.numpy())
+        self._upload: Any = None  # the copy as a node of CUDA graphs
+
+    def send(self) -> None:
+        """Bring `array` up to date; with graphs of steps, the copy waits among recorded stretches, see `joined.py`."""
+        if self._shared:
+            return
+        if not LaunchGraph.on_device:
+            self.array.assign(self.host)
+            return
+        if self._upload is None:
+            from warp_lcp.kernels.device_graph import Upload
+
+            self._upload = Upload(self.host, self.array)
+        self._upload.run()

@@ -1,0 +1,165 @@
+"""CUDA graphs of neighboring stretches of a step, joined into one graph.
+
+Within `joined` a recorded stretch is not launched at once. It waits, with the numbers that it reads
+in this run, until the host or Warp needs the device: for a readback, a launch or copy that is not
+recorded, the end of the step. All that wait are then launched as one graph, which is captured when
+their sequence comes for the second time. A stretch that finds the device idle, after a readback, is
+launched at once, so that the host prepares the next ones while the device works.
+
+Nothing is reordered: the functions of Warp by which anything else reaches the device (`SETTLING`)
+launch first what waits. So a profile, which synchronizes at the end of each stage, still has the
+time of each stage alone.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_lcp.kernels.launch_graph import LaunchGraph
+
+if TYPE_CHECKING:
+    from warp_lcp.kernels.device_graph import DeviceGraph
+
+MOST_SEQUENCES = 64  # that are remembered
+# after these the device is idle
+WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
+# Functions of Warp that give work to a device or wait for it, and where callers look them up.
+SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
+    (
+        wp,
+        (
+            "launch",
+            "launch_tiled",
+            "copy",
+            "clone",
+            "capture_launch",
+            "capture_while",
+            "capture_if",
+            "record_event",
+        ),
+    ),
+    (wp, ("synchronize", "synchronize_device", "synchronize_stream")),
+    (wp.Launch, ("launch",)),
+    (wp.array, ("assign", "zero_", "fill_", "to", "list", "numpy")),
+    (
+        wp.utils,
+        (
+            "radix_sort_pairs",
+            "segmented_sort_pairs",
+            "array_scan",
+            "array_sum",
+            "array_inner",
+            "runlength_encode",
+        ),
+    ),
+)
+
+
+class _Waiting(threading.local):
+    """Stretches of this thread that wait to be launched, in order."""
+
+    depth = 0  # of `joined`
+    idle = True  # whether the device has done all that this thread has launched
+
+    def __init__(self) -> None:
+        self.programs: list[DeviceGraph] = []
+
+
+WAITING = _Waiting()
+# weak references to the stretches, and their graph once there is one
+_sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}
+
+
+@contextmanager
+def joined(device: wp.Device) -> Iterator[None]:
+    """Join the graphs of recorded stretches that follow each other; on the CPU, and without graphs of steps, do nothing."""
+    if not (device.is_cuda and LaunchGraph.on_device):
+        yield
+        return
+    _settle_before_warp()
+    WAITING.depth += 1
+    try:
+        yield
+    finally:
+        WAITING.depth -= 1
+        settle()
+
+
+def waits(program: DeviceGraph) -> bool:
+    """Have a stretch wait, whose changed numbers are in its buffer; return False where it is to be launched now."""
+    if not (WAITING.depth and program.has_run) or WAITING.idle:
+        WAITING.idle = False
+        return False
+    WAITING.programs.append(program)
+    return True
+
+
+def settle(program: DeviceGraph | None = None) -> None:
+    """Launch what waits; with a `program`, only if that waits."""
+    programs = WAITING.programs
+    if not programs or (program is not None and all(other is not program for other in programs)):
+        return
+    WAITING.programs = []
+    graph = None if len(programs) == 1 else _graph_of(programs)
+    if graph is None:
+        for stretch in programs:
+            stretch.launch_now()
+        return
+    wp.capture_launch(graph)
+    for stretch in programs:
+        stretch.note_launch()
+
+
+def _graph_of(programs: list[DeviceGraph]) -> Any:
+    """Return the graph of a sequence of stretches; None where the sequence has come for the first time."""
+    key = tuple(map(id, programs))
+    references, graph = _sequences.get(key, ((), None))
+    if len(references) != len(programs) or any(
+        of() is not program for of, program in zip(references, programs, strict=True)
+    ):
+        if len(_sequences) >= MOST_SEQUENCES:
+            _sequences.clear()
+        forget = functools.partial(_forget, key)
+        _sequences[key] = tuple(weakref.ref(program, forget) for program in programs), None
+        return None
+    if graph is None:
+        graph = programs[0].captured(
+            [command for program in programs for command in program.commands]
+        )
+        _sequences[key] = references, graph
+    return graph
+
+
+def _forget(key: tuple[int, ...], reference: Any) -> None:
+    """Forget a sequence, one of whose stretches is gone."""
+    _sequences.pop(key, None)
+
+
+@functools.cache
+def _settle_before_warp() -> None:
+    """Have functions of Warp launch first what waits."""
+    for owner, names in SETTLING:
+        for name in names:
+            if hasattr(owner, name):
+                setattr(owner, name, _settling(getattr(owner, name), idle=name in WAITING_FOR))
+
+
+def _settling(plain: Callable[..., Any], *, idle: bool) -> Callable[..., Any]:
+    """Return a function of Warp that launches first what waits; `idle`: the device has nothing left to do after it."""
+
+    @functools.wraps(plain)
+    def called(*args: Any, **options: Any) -> Any:
+        if WAITING.programs and not options.get("record_cmd"):
+            settle()
+        found = plain(*args, **options)
+        WAITING.idle = idle or WAITING.idle
+        return found
+
+    return called

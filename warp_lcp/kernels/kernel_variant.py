@@ -1,0 +1,547 @@
+# mypy: ignore-errors
+"""Forms of row passes: a pass whose types and constants are known, its C++ source and its kernel."""
+
+import ctypes
+import functools
+import math
+import struct
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.layout import (
+    ANYWHERE,
+    Alignment,
+    BoundFields,
+    Pattern,
+    RowLayout,
+    make_struct,
+    packed,
+    stencil_struct,
+    threads,
+)
+from warp_lcp.kernels.memory import value_of
+from warp_lcp.kernels.native import HEADERS, shared, text
+from warp_lcp.kernels.thread_pool import TableEntry
+
+if TYPE_CHECKING:
+    from warp_lcp.kernels.stencil_kernel import BoundKernel, StencilKernel
+
+C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
+C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
+# types of fields that quads keep in registers
+LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)
+POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
+Quads = tuple[Alignment, Alignment]  # of fields of passes by quads, and of those of the other level
+QUADS = ANYWHERE, ANYWHERE
+# threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most
+BLOCKS_OF_QUADS = 256, 2
+PLACE = ("k0", "j0", "i0")  # first stored cell of a box
+INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
+PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
+SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
+NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
+# stencils: with a weight an axis, with arrays of them, with a product in place
+UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"
+
+
+def words_of(quads: Quads | None) -> list[str]:
+    """Return what tells forms by quads from those by cells, and from each other."""
+    if quads is None:
+        return []
+    return [
+        "quads",
+        *(f"{name}{a.word}" for name, a in zip(("at", "of"), quads, strict=True) if a.word),
+    ]
+
+
+@functools.cache
+def form_of(
+    declared: "StencilKernel",
+    letters: Any,
+    constants: Any,
+    shape: str | Pattern,
+    bounds: str,
+    *,
+    quads: Quads | None = None,
+) -> "KernelVariant":
+    """Return the form of a pass with these types, constants, stencil and bounds, by `quads` of cells if told."""
+    return KernelVariant(declared, dict(letters), dict(constants), shape, bounds, quads=quads)
+
+
+TOGETHER: dict[
+    str, list["StencilKernel"]
+] = {}  # passes by the Warp module in which they are compiled
+
+
+def make_kernels_of_module(
+    form: "KernelVariant", letters: Any, shape: str | Pattern, bounds: str
+) -> None:
+    """Make the kernels that belong to a form's module before Warp loads it: for one more it would compile all of them again."""
+    if not form.declared.module or form.pattern is not None:
+        return
+    for other in TOGETHER[form.declared.module]:
+        words = other.words(dict(letters), other.constants, shape, bounds) + words_of(form.quads)
+        if (
+            other.letters == form.declared.letters
+            and words == form.words
+            and (other.quads or not form.quads)
+        ):
+            assert form_of(
+                other, letters, tuple(other.constants.items()), shape, bounds, quads=form.quads
+            ).kernel
+
+
+class KernelVariant:
+    """A pass whose types and constants are known.
+
+    Attributes:
+        words: what tells it from other forms.
+        joins: whether it is compiled with other passes.
+        quads: alignments, where a thread takes four cells of a row at a time, on CUDA only; see
+            `headers/quad.h`. None: it does not.
+        name: of its kernel.
+        fields: struct of its arguments.
+        native: that struct in C.
+        run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
+    """
+
+    def __init__(
+        self,
+        declared: "StencilKernel",
+        letters: dict[str, Any],
+        constants: dict[str, int],
+        shape: str | Pattern,
+        bounds: str,
+        *,
+        quads: Quads | None = None,
+    ) -> None:
+        self.declared, self.letters, self.bounds, self.quads, d = (
+            declared,
+            letters,
+            bounds,
+            quads,
+            declared,
+        )
+        self._chosen = tuple(sorted(letters.items())), tuple(constants.items()), shape, bounds
+        self.pattern = pattern = shape if isinstance(shape, Pattern) else None
+        self.joins = bool(d.module) and pattern is None  # the module of other passes
+        shape = pattern.word if pattern else shape
+        of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
+        self.words = d.words(letters, constants, shape, bounds) + words_of(quads)
+        weights = (
+            of(d.stencil[1])
+            if d.stencil and (shape == VARIABLE or (pattern and pattern.names))
+            else wp.float32
+        )
+        parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
+        parts |= {"bounds": BoundFields} if d.bounds else {}
+        self.types = {name: of(kind) for name, kind in d.arrays.items()}
+        members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {
+            n: of(t) for n, t in d.numbers.items()
+        }
+        self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
+        self.fields = Fields = make_struct(
+            f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members
+        )
+
+        def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
+
+        blank = Fields()
+        self._struct, self.native, self._entry = type(blank), type(blank.__ctype__()), None
+        self._size = ctypes.sizeof(self.native)
+        area, _, last = d.name.rpartition(".")
+        variant = ".".join(
+            ["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)]
+        )
+        # apart from other forms, which Warp would take for overloads
+        run.__module__ = area if d.box else variant
+        self.name = d.name.replace(".", "_") if self.joins else last
+        run.__qualname__ = f"{self.name}_rows"
+        self._code = self._source(letters, constants, ord(shape[0]), of)
+        self.run = wp.func_native(self._code)(run)
+
+    def _source(
+        self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any
+    ) -> str:
+        """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
+        d, pattern = self.declared, self.pattern
+        assert not (self.quads and (pattern or not d.quads)), d.label
+        into = not {*d.ring}.isdisjoint(d.writes)
+        levels = d.finer or bool(d.other)
+        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
+        switches |= {
+            "BOUNDS": ord(self.bounds[0]),
+            "STENCIL": stencil,
+            "FOUND": len(d.found),
+            "SUMS": len(d.sums),
+        }
+        macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
+        head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [
+            f"typedef {C[of(d.compute)]} T;"
+        ] * ("T" not in letters)
+        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [
+            f"#define {n} {int(v)}" for n, v in macros.items()
+        ]
+        head += [
+            f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros
+        ]
+        if self.quads:
+            return self._source_of_quads(head, macros, of)
+        at = {
+            n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)
+        } | dict.fromkeys(d.other, " + P.q")
+        each = [
+            "const Piece P = piece(k_i, j_i, c_, ring_); const int n = P.n; const long long p = "
+            "P.p;"
+        ]
+        each += [
+            f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = "
+            f"{'L.o1' if d.finer else 'P.zp'};"
+        ]
+        each += [
+            f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = "
+            f"{'-zp' if d.finer else 'P.zm'};"
+        ]
+        each += [
+            "const long long down = P.down, up = P.up;"
+            if d.ring and not into
+            else "const long long down = zm, up = zp;"
+        ]
+        if levels:
+            each += [
+                "const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 "
+                "> L.n1 ? 1 : 2;"
+            ]
+            each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
+        for n in (n for n in d.arrays if n not in d.box and not (d.found and n == "out")):
+            pointer = f"given.{n}.data{at.get(n, '')}"
+            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
+            each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
+        each += [f"const auto {n} = given.{n};" for n in d.numbers]
+        if d.box:
+            each += [f"double {n} = 0;" for n in d.found]
+            each += [
+                f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = "
+                f"s2*given.{next(iter(d.box))}.shape[1];"
+            ]
+            listed = [
+                f"for (int m_ = P.first; m_ < P.first + n; ++m_) {{ const int at_ = "
+                f"{d.listed}[m_], k = at_ / (int)s1;"
+            ]
+            listed += [
+                "const int j = (at_ - k*(int)s1) / (int)s2, first = at_ % (int)s2, last = first + "
+                "1;"
+            ]
+            each += (
+                listed
+                if d.listed
+                else [
+                    "const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"
+                ]
+            )
+            each += [
+                f"auto* {n} = given.{n}.data ? given.{n}.data + k*s1 + j*s2 : nullptr;"
+                for n in d.box
+            ]
+        if d.stencil:
+            fields, numbers = (
+                (pattern.names, pattern.numbers)
+                if pattern
+                else (("wx", "wy", "wz"), ("cx", "cy", "cz"))
+            )
+            first = "P.q" if d.finer else "p"
+            each += [
+                f"const auto* {n} = given.stencil.{n}.data + {first};"
+                for n in ("d", *fields, "known")
+            ]
+            each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", *numbers)]
+            if pattern:
+                at = (
+                    f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = "
+                    "yp, b = zp;"
+                )
+                each += [
+                    f"const auto place = [&](long long k) {{ {at}",
+                    "return wp::vec3i((int)(e / b), (int)(e % b / a), (int)(e % a)); };",
+                ]
+                each += pattern.source()
+        sums = [
+            "#define EACH_FOUND(DO) "
+            f"{' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}",
+            text(HEADERS / "sums.h"),
+        ]
+        sums += ["#undef EACH_FOUND"]
+        common = [
+            shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used
+        ]
+        before = [
+            shared("native.h"),
+            '#line 1 "types"',
+            *head,
+            shared("piece.h"),
+            shared("tasks.h"),
+            '#line 1 "fields"',
+            POINTERS,
+            *each,
+        ]
+        # there names may be those of the pass
+        body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]
+        closed = ["}"] * bool(d.listed)
+        macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
+        tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
+        return "\n".join(
+            [
+                "",
+                *before,
+                *common,
+                *body,
+                *closed,
+                '#line 1 "sums"',
+                *(sums if d.found else []),
+                *tail,
+            ]
+        )
+
+    def _source_of_quads(self, head: list[str], macros: dict[str, Any], of: Any) -> str:
+        """Return the body for quads: a loop over planes, in it the row function twice, for four cells and for fewer."""
+        d = self.declared
+        found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
+        sums = (
+            [f"#define EACH_FOUND(DO) {found}", text(HEADERS / "sums.h"), "#undef EACH_FOUND"]
+            if d.found
+            else []
+        )
+        common = [
+            shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used
+        ]
+        function = [*common, text(d.header, d.declared), '#line 1 "sums"', *sums]
+        head = [*head, f"constexpr bool FINER = {str(d.finer).lower()};"]
+        for level, at in zip(("Ours_", "Others_"), self.quads, strict=True):
+            head.append(
+                f"struct {level} {{ enum {{ FIRST = {at.first}, EITHER = {int(at.either)} }}; }};"
+            )
+        before = [
+            "#define QUADS",
+            shared("native.h"),
+            '#line 1 "types"',
+            *head,
+            shared("quad.h"),
+            '#line 1 "fields"',
+        ]
+        whole = [
+            line
+            for half in self._halves()
+            for line in (*half, *self._fields_of_quad(of, kept=True), *function, "}", "else")
+        ][:-1]
+        rest = [
+            "else if (FOUND || P.n > 0) {",
+            "const int n = P.n;",
+            POINTERS,
+            *self._fields_of_quad(of, kept=False),
+            *function,
+            "}",
+        ]
+        # cells fewer than four: their loops are not unrolled
+        once = ["#undef VECTORS", '#define VECTORS(WIDTH) _Pragma("unroll 1")']
+        after = [
+            '#line 1 "end"',
+            "}",
+            "#undef QUADS",
+            "#undef METHOD",
+            *(f"#undef {n}" for n in macros),
+            "",
+        ]
+        return "\n".join(["", *before, *whole, *once, *rest, *after])
+
+    def _halves(self) -> list[list[str]]:
+        """Return C++ that begins the row function for whole quads: once for each place of rows."""
+        finer = self.declared.finer
+        either = self.quads[finer].either
+        made = []
+        for half in ("false", "true")[: 1 + either]:
+            ours, others = ("half_", half) if finer else (half, "other_half_")
+            here = f" && {'other_' * finer}half_ == {half}" * either
+            lines = [f"if (P.n == 4{here}) {{", "constexpr int n = 4;"]
+            lines += [
+                f"const auto in_ = reading_(Ours_(), {ours});",
+                f"const auto in_other_ = reading_(Others_(), {others});",
+            ]
+            made.append([*lines, f"const auto out_ = writing_({ours});"])
+        return made
+
+    def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
+        """Return C++ that declares the fields at a quad's first cell, by name; `kept`: in registers, as `quad.h` does."""
+        d = self.declared
+        made = []
+        of_other = "in_other_" if kept else "in_"
+        reading = lambda other, data: f"{of_other}({data}, q)" if other else f"in_({data}, p)"  # noqa: E731
+        for n in (n for n in d.arrays if not (d.found and n == "out")):
+            if (
+                kept
+                and self.types[n] in LOADED
+                and (n in d.reads or n in d.writes or (d.finer and n in d.other))
+            ):
+                data = f"given.{n}.data"
+                out = f"auto {n} = out_({data}, p);"
+                made.append(
+                    out if n in d.writes else f"const auto {n} = {reading(n in d.other, data)};"
+                )
+                continue
+            pointer = f"given.{n}.data" + (
+                " + p" if n in d.reads or n in d.writes else " + q" * (n in d.other)
+            )
+            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
+            made.append(f"{'const ' * (n in d.reads)}auto* {n} = {pointer};")
+        made += ["const bool pairs = L.fx > 1 || L.fx < -1;"] if d.other or d.finer else []
+        made += (
+            [
+                "const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2, wide = L.fy == 1 || 2*P.j "
+                "+ 2 > L.n2 ? 1 : 2;"
+            ]
+            if d.finer
+            else []
+        )
+        made += [f"const auto {n} = given.{n};" for n in d.numbers]
+        if d.stencil:
+            fields, numbers = ("d", "wx", "wy", "wz", "known"), ("unit", "cx", "cy", "cz")
+            made += [
+                f"const auto {n} = {reading(d.finer, f'given.stencil.{n}.data')};" for n in fields
+            ]
+            made += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
+        return made
+
+    def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
+        """Return the struct of arguments as C has it: structs and arrays, which fill whole eight bytes, side by side, then numbers."""
+        parts = [] if stencil is None else [stencil.struct.__ctype__()]
+        if bounds is not None:
+            lower, least, upper, most, code = bounds
+            parts += [*packed((lower, upper, code)), SIDES.pack(least.value, most.value)]
+        parts += packed([given[name] for name in self.types])
+        values = [value_of(given[name]) for name in self.declared.numbers]
+        try:
+            parts.append(self._numbers.pack(*values))
+        except struct.error as error:
+            named = zip(self.declared.numbers, values, strict=True)
+            raise TypeError(
+                f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in named)}: {error}"
+            ) from None
+        return b"".join(parts).ljust(self._size, b"\0")
+
+    def struct_of(self, bound: "BoundKernel") -> Any:
+        """Return the struct of arguments for Warp, which keeps them alive; a capture on the CPU looks for the arrays by name."""
+        stencil, bounds = bound.kept
+        members = {name: bound.given[name] for name in self.types}
+        if stencil is not None:
+            members["stencil"] = stencil.struct
+        if bounds is not None:
+            members["bounds"] = SimpleNamespace(lower=bounds[0], upper=bounds[2], code=bounds[4])
+        made = object.__new__(self._struct)
+        made.__dict__.update(
+            members, _kept=bound, _ctype=self.native.from_buffer_copy(bound.arguments)
+        )
+        return made
+
+    @functools.cached_property
+    def run_in_turn(self) -> Any:
+        """`run` for launches of several passes: a pass reads what one before it has written.
+
+        Loads by `__ldg` may have values from before the launch.
+        """
+        if not self.quads:
+            return self.run
+
+        def run(
+            L: RowLayout, given: self.fields, slab_: int, row_: int, chunk_: int, count_: int
+        ): ...
+
+        run.__module__ = self.run.module.name
+        run.__qualname__ = f"{self.name}_rows_in_turn"
+        code = f"#define __ldg(q) (*(q))\n{self._code}\n#undef __ldg\n"
+        return wp.func_native(code)(run)
+
+    @functools.cached_property
+    def kernel(self) -> Any:
+        """The kernel of the pass alone."""
+        run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
+        if self.quads:
+
+            def alone(L: RowLayout, F: Fields):
+                q = task_of(L, wp.tid())
+                run(L, F, q[0], q[1], q[2], 1)
+        elif touch is not None:
+
+            def alone(L: RowLayout, F: Fields):
+                i, j, c = wp.tid()
+                if L.planes < 0:
+                    touch(0)
+                first = first_task(L)
+                run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
+        else:
+
+            def alone(L: RowLayout, F: Fields):
+                i, j, c = wp.tid()
+                first = first_task(L)
+                run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
+
+        alone.__name__ = alone.__qualname__ = self.name
+        if self.quads:
+            return forward_kernel(module=run.module.name, launch_bounds=BLOCKS_OF_QUADS)(alone)
+        if touch is not None:  # the caller's function may need what the project's flags leave out
+            return wp.kernel(enable_backward=False, module=run.module.name)(alone)
+        return forward_kernel(module=run.module.name)(alone)
+
+    @property
+    def by_cells(self) -> "KernelVariant":
+        """The same of single cells."""
+        return form_of(self.declared, *self._chosen)
+
+    @property
+    def by_quads(self) -> "KernelVariant | None":
+        """The same of quads, as CUDA launches it on grids; None where there is none."""
+        return self.with_quads(QUADS)
+
+    def with_quads(self, quads: Quads) -> "KernelVariant | None":
+        """Return the same of quads at these alignments; None where there is none."""
+        if not self.declared.quads or self.pattern is not None:
+            return None
+        return form_of(self.declared, *self._chosen, quads=quads)
+
+    def dim(self, layout: Any) -> tuple[int, ...]:
+        """Return the dimensions of a launch of the kernel: by quads one, for three would be divided in 64 bits."""
+        return (math.prod(threads(layout)),) if self.quads else threads(layout)
+
+    def entry(self, bound: "BoundKernel") -> TableEntry:
+        """Return the kernel as the team calls it."""
+        if self._entry is None:
+            self._entry = TableEntry(
+                wp.launch(
+                    self.kernel,
+                    (1, 1, 1),
+                    [bound.layout, bound.fields],
+                    device="cpu",
+                    record_cmd=True,
+                )
+            )
+        return self._entry
+
+
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+return wp::vec3i(0, 0, 0);
+#else
+return wp::vec3i(L.begin / (L.rows*L.chunks), L.begin / L.chunks % L.rows, L.begin % L.chunks);
+#endif
+""")
+def first_task(L: RowLayout) -> wp.vec3i:
+    """Slab, row and chunk of a range's first task; 0 on CUDA, where a thread has one of its own."""
+
+
+@wp.func_native("""
+const unsigned t = (unsigned)thread, row = t / (unsigned)L.chunks, slab = row / (unsigned)L.rows;
+return wp::vec3i((int)slab, (int)(row - slab*L.rows), (int)(t - row*L.chunks));
+""")
+def task_of(L: RowLayout, thread: int) -> wp.vec3i:
+    """Slab, row and chunk of a thread of a launch with one dimension."""

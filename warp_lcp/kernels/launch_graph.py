@@ -1,0 +1,618 @@
+"""Launches that are recorded once and run again: on the CPU by a team of threads in native code, on CUDA as a graph."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from typing import Any, ClassVar, Protocol
+
+import warp as wp
+
+from warp_lcp.deadline import check_time, is_collective
+from warp_lcp.kernels.memory import ARRAY_BYTES, Scalar, value_of
+from warp_lcp.kernels.thread_pool import (
+    ALONE,
+    CELLS,
+    Operation,
+    OperationKind,
+    OperationTable,
+    Patch,
+    copied,
+    get_threads,
+    prepared,
+    ranges,
+    team,
+)
+
+
+class _Recording(threading.local):
+    """The program that takes what a thread launches; None: it is launched."""
+
+    program: CommandBuffer | None = None
+
+
+RECORDING = _Recording()
+
+
+def is_recording() -> bool:
+    """Return whether what this thread launches is recorded."""
+    return RECORDING.program is not None
+
+
+@contextmanager
+def recording(program: CommandBuffer) -> Iterator[None]:
+    """Record what this thread launches by `warp_lcp.kernels`, in place of launching it."""
+    before, RECORDING.program = RECORDING.program, program
+    try:
+        yield
+    finally:
+        RECORDING.program = before
+
+
+def loops_on_device(device: wp.Device) -> bool:
+    """Return whether loops run on the device, without the host: on the CPU by the team, on CUDA from driver 12.4."""
+    return bool(wp.is_conditional_graph_supported()) if device.is_cuda else team() is not None
+
+
+def device_program(launch: Any = None) -> Any:
+    """Return the `DeviceGraph` that records what this thread launches; None: there is none, or `launch` records."""
+    program = RECORDING.program
+    if (
+        program is None
+        or not program.device.is_cuda
+        or isinstance(getattr(launch, "__self__", None), CommandBuffer)
+    ):
+        return None
+    return program
+
+
+class Launch(Protocol):
+    """Launches a kernel now, as `wp.launch` does, or records it, as `CommandBuffer.launch` does."""
+
+    def __call__(
+        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...
+    ) -> Any:
+        """Launch the kernel now, or record its launch."""
+
+
+def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: Any) -> Any:
+    """Launch a kernel by Warp; a default argument that holds `wp.launch` itself would pass by what waits, see `joined.py`."""
+    return wp.launch(kernel, dim, inputs, device=device, **options)
+
+
+def launch_graph(graph: Any) -> None:
+    """Launch a captured graph by Warp; likewise."""
+    wp.capture_launch(graph)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the host does between launches: exchange with other processes, say.
+
+    Args:
+        function: does it.
+        operation: makes what the team can do in its place, on the CPU; None: nothing can.
+    """
+
+    function: Callable[[], object]
+    operation: Callable[[], Operation] | None = None
+
+    def launch(self, launch: Launch = launch_now) -> None:
+        """Do it now, or record it between the launches."""
+        recorded = (
+            is_recording() or isinstance(getattr(launch, "__self__", None), CommandBuffer)
+        ) and team() is not None
+        perform(self.operation() if recorded and self.operation else self.function, launch)
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """A program that is launched if a number on the device is not 0: in a graph, or by the team, without the host."""
+
+    condition: wp.array[Any]
+    program: CommandBuffer
+
+    def launch(self) -> None:
+        """Launch it, or record that in the graph that is being captured."""
+        wp.capture_if(self.condition, self.program._launch)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A program that is repeated on CUDA while a number on the device is not 0, within a graph."""
+
+    condition: wp.array[Any]
+    program: CommandBuffer
+
+    def launch(self) -> None:
+        """Repeat it now, or record that in the graph that is being captured."""
+        wp.capture_while(self.condition, self.program._launch)
+
+
+def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
+    """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
+    program = getattr(launch, "__self__", None)
+    if not isinstance(program, CommandBuffer):
+        program = RECORDING.program
+    if program is not None:
+        program.record(what)
+    elif isinstance(what, Operation):
+        run_table(OperationTable([what]))
+    else:
+        what()
+
+
+@contextmanager
+def together(device: wp.Device) -> Iterator[Launch]:
+    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches now or records."""
+    if device.is_cuda or team() is None:
+        yield launch
+        return
+    program = CommandBuffer(device)
+    yield program.launch
+    program.run()
+
+
+@contextmanager
+def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
+    """Record what is launched within by `warp_lcp.kernels`; the team works through it as one table afterwards. Nothing is read within.
+
+    On CUDA, and where fields are shared `across` ranks, launches are done at once.
+    """
+    if device.is_cuda or across is not None or is_recording() or team() is None:
+        yield
+        return
+    program = CommandBuffer(device)
+    with recording(program):
+        yield
+    program.run()
+
+
+def run_table(table: OperationTable) -> None:
+    """Have the team work through a table."""
+    at_work = team()
+    assert at_work is not None, "a table is made for a team"
+    at_work.run(table)
+
+
+def _run_while(condition: Any, table: OperationTable) -> None:
+    """Have the team repeat a table, unless its condition is 0 before."""
+    if condition[0]:
+        run_table(table)
+
+
+def launch_ranges(
+    kernel: Any,
+    dim: tuple[int, ...],
+    cells: int,
+    inputs: list[Any],
+    *,
+    device: Any,
+    launch: Launch | None,
+    ordered: bool,
+    first: Patch | None = None,
+    sized: int = 0,
+    extent: Any = None,
+) -> None:
+    """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
+
+    Args:
+        kernel: with as many coordinates of a thread as `dim` has.
+        dim: of the launch where there is no such range.
+        cells: what a task costs, in cells of a usual pass.
+        inputs: arguments; numbers may be `Scalar`.
+        device: where.
+        launch: of a program; None: now.
+        ordered: whether tasks write what others read or write.
+        first: what of the first argument recorded launches read from memory.
+        sized: address of the number of tasks then; 0: that of `dim`.
+        extent: memory whose `room` bounds the launch dimensions on CUDA; None: they are always
+            `dim`.
+    """
+    if device.is_cuda and (program := device_program(launch)) is not None:
+        program.record_tasks(kernel, dim, inputs, first, sized, extent)
+        return
+    tasks, recorded = math.prod(dim), launch is None and is_recording()
+    if (
+        device.is_cuda
+        or team() is None
+        or (launch is None and not recorded and tasks * cells < 4 * CELLS)
+    ):
+        (launch or wp.launch)(kernel, dim, [value_of(v) for v in inputs], device=device)
+    elif tasks or (recorded and sized):
+        entry, arguments, native = prepared(kernel, (1,) * len(dim), [value_of(v) for v in inputs])
+        patches = (
+            [*([first] if first else ()), *_patches(inputs, kernel, native)] if recorded else ()
+        )
+        stage = OperationKind(
+            entry,
+            arguments,
+            (inputs, extent),
+            tasks // dim[0] if dim[0] else 0,
+            dim[0],
+            patches=patches,
+        )
+        perform(
+            ranges(stage, cells, ordered=ordered, sized=sized if recorded else 0),
+            launch or wp.launch,
+        )
+
+
+def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]:
+    """Return what of a kernel's arguments, a struct in C, is read from memory: numbers and arrays that others replace."""
+    for i, value in enumerate(inputs):
+        if type(value) is Scalar:
+            yield (getattr(native, f"p{i}").offset, *value.address(kernel.adj.args[i].type))
+        elif (slot := getattr(value, "slot", None)) is not None:
+            yield getattr(native, f"p{i}").offset, slot.address, ARRAY_BYTES
+
+
+def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
+    """Return the launch of a kernel on the CPU as an operation that is not cut."""
+    entry, arguments, native = prepared(kernel, dim, [value_of(v) for v in inputs])
+    return Operation(
+        ALONE,
+        [OperationKind(entry, arguments, inputs, patches=list(_patches(inputs, kernel, native)))],
+    )
+
+
+def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
+    """Launch a Warp kernel, now or among recorded launches; numbers may be `Scalar`."""
+    program = RECORDING.program
+    if program is None and device.is_cpu and team() is not None:
+        run_table(OperationTable([_alone(kernel, dim, inputs)]))
+    elif program is None:
+        wp.launch(kernel, dim, [value_of(v) for v in inputs], device=device, block_dim=block_dim)
+    else:
+        program.launch(kernel, dim, inputs, device=device, block_dim=block_dim)
+
+
+def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
+    """Copy an array to another of the same type and size whose elements lie side by side, now or among recorded launches."""
+    program = RECORDING.program
+    if program is None:
+        wp.copy(to, source)
+    elif program.device.is_cuda:
+        program.record(DeviceCopy(to, source))
+    else:
+        program.record(copied(to.ptr, source.ptr, _bytes_of(to), (to, source)))
+
+
+def clear(*arrays: wp.array[Any]) -> None:
+    """Set arrays whose elements lie side by side to 0, now or among recorded launches."""
+    program = RECORDING.program
+    for array in arrays:
+        if program is None:
+            array.zero_()
+        elif array.size and program.device.is_cuda:
+            program.record(DeviceCopy(array, None))
+        elif array.size:
+            program.record(copied(array.ptr, 0, _bytes_of(array), array))
+
+
+@dataclass(frozen=True)
+class DeviceCopy:
+    """Copy of an array on CUDA, or zeros: a node of a graph."""
+
+    to: wp.array[Any]
+    source: wp.array[Any] | None
+
+    def launch(self) -> None:
+        """Copy now, or while a graph is captured."""
+        if self.source is None:
+            self.to.zero_()
+        else:
+            wp.copy(self.to, self.source)
+
+
+@dataclass(frozen=True)
+class DeviceCall:
+    """What Warp launches by a function of its own on CUDA, a sort or a scan: nodes of a graph."""
+
+    function: Callable[[], object]
+
+    def launch(self) -> None:
+        """Do it now, or while a graph is captured."""
+        self.function()
+
+
+def call(function: Callable[[], object]) -> None:
+    """Do on CUDA what Warp launches by a function of its own, now or among recorded launches."""
+    program = RECORDING.program
+    function() if program is None else program.record(DeviceCall(function))
+
+
+def _bytes_of(array: wp.array[Any]) -> int:
+    return int(array.size * wp.types.type_size_in_bytes(array.dtype))
+
+
+class CommandBuffer:
+    """A sequence of kernel launches with fixed arguments.
+
+    Functions that launch take `launch: Launch = launch_now`; given `program.launch`, they record
+    instead. On the CPU the team works through a table of them, on CUDA a graph is captured once the
+    first run has loaded every kernel. Where the host has tasks between launches, see `perform`,
+    there is a table or a graph for each stretch without one.
+
+    Args:
+        device: where the kernels run.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device = device
+        self._commands: list[Any] = []
+        self._arguments: list[Any] = []  # a recorded launch holds addresses only
+        self._runs = 0
+        self._stretches: list[Callable[[], object]] | None = None
+        # what launches their graph, by the address of their condition
+        self._loops: dict[int, Callable[[], object]] = {}
+        self._native: bool | None = None  # None: not known
+
+    def __len__(self) -> int:
+        """Return the number of launches."""
+        return len(self._commands)
+
+    def launch(
+        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
+    ) -> None:
+        """Record a launch, and keep its arguments alive; numbers may be `Scalar` on the CPU."""
+        self._arguments.append(inputs)
+        if self.device.is_cuda or team() is None:
+            listed = [value_of(v) for v in inputs]
+            self.record(
+                wp.launch(kernel, dim, listed, device=device, block_dim=block_dim, record_cmd=True)
+            )
+        else:
+            self.record(_alone(kernel, dim, inputs))
+
+    def record(self, what: Any) -> None:
+        """Record a recorded launch, an operation of the team, a task of the host or, where loops run on the device, a conditional."""
+        if isinstance(what, Conditional) and not self.device.is_cuda:
+            self._arguments.append(what)
+            self._commands += [
+                operation.only_if(what.condition) for operation in what.program._commands
+            ]
+        else:
+            self._commands.append(Task(what) if callable(what) else what)
+        self._forget_prepared()
+
+    def _forget_prepared(self) -> None:
+        """Prepare again what is run, since there are other commands."""
+        self._stretches = self._native = None
+        self._loops.clear()
+
+    @property
+    def is_native(self) -> bool:
+        """Whether the team works through all of it."""
+        if self._native is None:
+            self._native = all(isinstance(command, Operation) for command in self._commands)
+        return self._native
+
+    def fits(self) -> bool:
+        """Return whether its launches have room for the rows as they are now."""
+        return True
+
+    @property
+    def has_run(self) -> bool:
+        """Whether all of its kernels are loaded: it has run, or they were loaded as they were recorded, on the CPU."""
+        return self._runs > 0 or not self.device.is_cuda
+
+    def extend(self, other: CommandBuffer) -> None:
+        """Append the launches of another program."""
+        self._commands += other._commands
+        self._arguments += other._arguments
+        self._forget_prepared()
+
+    def run(self) -> None:
+        """Launch everything once, or record that among the launches of another program."""
+        if RECORDING.program is not None:
+            RECORDING.program.extend(self)
+            return
+        if self._stretches is None and self.device.is_cuda and self._runs == 0:
+            self._launch()
+        else:
+            if self._stretches is None:
+                self._stretches = self._prepared()
+            for stretch in self._stretches:
+                stretch()
+        self._runs += 1
+
+    def run_while(self, condition: wp.array[Any]) -> None:
+        """Launch everything again and again while the condition is not 0; the launches update it.
+
+        Where loops run on the device, they do not come back to the host: on CUDA, all but the first
+        call are one graph, and return before it has ended; on the CPU, the team looks after signals
+        and the deadline. Ranks must find the same condition; they repeat the launches without the
+        host unless they have a deadline, which they look at together.
+
+        Args:
+            condition: shape (1,), wp.int32.
+        """
+        if RECORDING.program is not None and self.device.is_cuda:
+            RECORDING.program.record(Loop(condition, self))
+        elif self._loops_here():
+            self._loop(condition)
+        elif self.device.is_cuda and loops_on_device(self.device) and not self._has_tasks:
+            wp.capture_if(condition, self._run_in_time)  # launch by launch, which loads the kernels
+            if self._runs:
+                self._loop(condition)
+        else:
+            wp.capture_while(condition, self._run_in_time)
+
+    def _loop(self, condition: wp.array[Any]) -> None:
+        """Launch everything while the condition is not 0, without the host."""
+        if condition.ptr not in self._loops:
+            self._loops[condition.ptr] = self._captured_loop(condition)
+        self._loops[condition.ptr]()
+
+    def _loops_here(self) -> bool:
+        """Return whether `run_while` can do without the host now."""
+        if not self.device.is_cuda and team() is not None:
+            return self.is_native and not is_collective()
+        if self._has_tasks or not loops_on_device(self.device):
+            return False
+        return self._runs > 0  # the first run loads the kernels
+
+    def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
+        """Return what launches a graph, or has the team work through a table, that repeats the launches."""
+        if not self.device.is_cuda and team() is not None:
+            return partial(_run_while, condition.numpy(), OperationTable(self._commands, condition))
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            wp.capture_while(condition, self._launch)
+        return partial(launch_graph, capture.graph)
+
+    def _run_in_time(self) -> None:
+        check_time()
+        self.run()
+
+    @property
+    def _has_tasks(self) -> bool:
+        return any(isinstance(command, Task) for command in self._commands)
+
+    def _prepared(self) -> list[Callable[[], object]]:
+        """Return a graph, a table or the launches of every stretch between tasks, and the tasks."""
+        made: list[Callable[[], object]] = []
+        for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
+            stretch = list(group)
+            if is_task:
+                made += [task.function for task in stretch]
+            elif self.device.is_cuda:
+                made.append(partial(launch_graph, self._captured(stretch)))
+            elif all(isinstance(command, Operation) for command in stretch):
+                made.append(partial(run_table, OperationTable(stretch)))
+            else:
+                made += [command.launch for command in stretch]
+        return made
+
+    def _captured(self, commands: Sequence[Any]) -> Any:
+        """Return the graph of some launches."""
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            for command in commands:
+                command.launch()
+        return capture.graph
+
+    def _launch(self) -> None:
+        for command in self._commands:
+            command.launch()
+
+    def differs(self, other: CommandBuffer) -> str:
+        """Say where operations differ from another program's in more than what they read from memory; "" if nowhere."""
+        if len(self._commands) != len(other._commands):
+            return f"{len(self._commands)} operations, {len(other._commands)} before"
+        for at, (mine, its) in enumerate(zip(self._commands, other._commands, strict=True)):
+            if (
+                isinstance(mine, Operation)
+                and isinstance(its, Operation)
+                and mine.content() != its.content()
+            ):
+                return f"operation {at}: {mine.name()}, {its.name()} before"
+        return ""
+
+
+def _identity(argument: Any) -> Hashable:
+    """Return by what a recording knows an argument: an array by its address, unless it is replaced by others; a list by its elements."""
+    if isinstance(argument, wp.array):
+        slot = getattr(argument, "slot", None)
+        return (argument.ptr, argument.shape) if slot is None else slot.address
+    if isinstance(argument, (list, tuple)):
+        return tuple(map(_identity, argument))
+    if isinstance(argument, dict):
+        return tuple((name, _identity(value)) for name, value in argument.items())
+    return getattr(argument, "identity", argument)
+
+
+MOST_RECORDED = 32  # sequences of a graph
+
+
+class NotRecordable(Exception):
+    """What a graph of CUDA cannot hold: a task of the host, a copy of a replaced array."""
+
+
+class LaunchGraph:
+    """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
+
+    On CUDA it is one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where
+    launches must go through Warp, `record` is called in each run.
+
+    Args:
+        device: where the kernels run.
+        record: launches by `warp_lcp.kernels` what is to be recorded: kernels, `copy`, `clear`. It
+            must not read from the device, nor decide anything by what changes from run to run:
+            `Scalar`, `ActiveWindow` and lists stand for that.
+        at_once: whether to launch in each run instead.
+    """
+
+    # whether CUDA graphs are captured: not yet run on a GPU
+    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
+    # makes the recording of a device: `device_graph.DeviceGraph`, set by `warp_lcp.kernels`
+    device_program: ClassVar[Any]
+    # whether each run records again and compares with the first recording, for tests
+    verify: ClassVar[bool] = False
+
+    def __init__(
+        self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False
+    ) -> None:
+        self.device, self._record, self.at_once = device, record, at_once
+        self._programs: dict[Hashable, CommandBuffer] = {}
+        self._threads = 0
+
+    def run(self, *arguments: Any, variant: Hashable = None) -> None:
+        """Launch everything, or record that among the launches of a program that is being recorded.
+
+        Args:
+            arguments: of `record`. Other arrays or objects are recorded for themselves.
+            variant: by what else `record` decides which of several sequences it launches; each is
+                recorded once.
+        """
+        if (
+            self.at_once
+            or RECORDING.program is not None
+            or not (self.on_device if self.device.is_cuda else team())
+        ):
+            self._record(*arguments)
+            return
+        if not self.device.is_cuda and self._threads != get_threads():
+            self._programs, self._threads = {}, get_threads()
+        key = (variant, *map(_identity, arguments))
+        program = self._programs.get(key)
+        if program is None or not program.fits():
+            if len(self._programs) >= MOST_RECORDED:
+                self._programs.clear()
+            program = self._recorded(arguments)
+            if program is None:  # on CUDA
+                self.at_once = True
+                self._record(*arguments)
+                return
+            self._programs[key] = program
+        elif LaunchGraph.verify and not self.device.is_cuda:
+            other = self._recorded(arguments)
+            assert other is not None
+            if difference := other.differs(program):
+                raise AssertionError(f"a recorded launch differs: {difference}")
+        program.run()
+
+    def forget(self) -> None:
+        """Record again in the next run, since arrays have been replaced."""
+        self._programs = {}
+
+    def _recorded(self, arguments: tuple[Any, ...]) -> CommandBuffer | None:
+        """Return the program of some arguments; None where a graph of CUDA cannot hold it, so that it is launched in each run."""
+        if not self.device.is_cuda:
+            program = CommandBuffer(self.device)
+            with recording(program):
+                self._record(*arguments)
+            return program
+        on_device = LaunchGraph.device_program(self.device)
+        try:
+            with recording(on_device):
+                self._record(*arguments)
+        except NotRecordable:
+            return None
+        on_device.finish()
+        return on_device

@@ -1,0 +1,99 @@
+"""What a user hears of Warp: one line when kernels are compiled, instead of a banner and a line for every module."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+import warp as wp
+
+# whose modules of kernels are not worth a line each
+OURS = ("warp_lcp", "fluids", "granular", "benchmarks", "warp")
+BANNER = re.compile(r"Warp \S+ initialized:")
+LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+ ms +\((\w+)\)")
+
+
+class KernelMessages:
+    """A logger for Warp that says once for each device that kernels are being compiled, when the first of them has been.
+
+    It drops Warp's banner and what Warp says of each module of this library; all else goes where it
+    went. `wp.config.log_level` has its usual meaning: above `wp.LOG_INFO` there is no line either,
+    at `wp.LOG_DEBUG` Warp says all that it says without this library, and so it does after
+    `wp.set_logger(None)`.
+
+    Args:
+        logger: takes the rest.
+        stream: takes the line; the error stream as it is then unless given.
+    """
+
+    def __init__(self, logger: wp.Logger, stream: TextIO | None = None) -> None:
+        self._logger, self._stream = logger, stream
+        self._told: set[str] = set()
+        self.debug, self.error = logger.debug, logger.error
+
+    def info(self, message: str) -> None:
+        """Pass a message on, unless it is of the banner or a module of ours."""
+        found = LOADED.match(message)
+        hidden = (found is not None and found[1] in OURS) or BANNER.match(message)
+        if not hidden or wp.config.log_level <= wp.LOG_DEBUG:
+            self._logger.info(message)
+        elif found and found[3] == "compiled" and found[2] not in self._told:
+            self._told.add(found[2])
+            print(
+                f"compiling kernels for {found[2]}, which takes seconds and is done once; cache: "
+                f"{wp.config.kernel_cache_dir}",
+                file=self._stream or sys.stderr,
+                flush=True,
+            )
+
+    def warning(
+        self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
+    ) -> None:
+        """Pass a warning on, at its caller's place."""
+        self._logger.warning(message, category, stacklevel=stacklevel + 1)
+
+
+@functools.cache
+def start_warp() -> None:
+    """Start Warp if nothing has, without what its native code writes of a CUDA driver that is not there: no setting of Warp's drops that.
+
+    At `wp.LOG_DEBUG` it is written. What Warp says in Python, its logger drops.
+
+    Raises:
+        OSError: there is no place for compiled kernels.
+    """
+    if wp.config.log_level <= wp.LOG_DEBUG:
+        wp.init()
+        return
+    with _native_messages_dropped():
+        wp.init()
+
+
+@contextmanager
+def _native_messages_dropped() -> Iterator[None]:
+    """Keep what native code writes to the error stream off it, where there is one."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # the stream is closed
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(nowhere)
+        os.close(kept)
+
+
+def install_log_filter() -> None:
+    """Put `KernelMessages` in the place of Warp's own logger; one that a program has set stays."""
+    logger = wp.get_logger()
+    if type(logger).__module__.startswith("warp."):
+        wp.set_logger(KernelMessages(logger))

@@ -1,0 +1,205 @@
+"""Memory that recorded launches read when they run: numbers, windows, lists, and where arrays lie.
+
+A launch that is recorded once holds its arguments as bytes. What changes from run to run stands in
+memory of its owner, and a patch of the launch, (offset in the arguments, address, bytes), has it
+copied into them each time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.kernels.layout import RowLayout
+
+_BLANK: Any = RowLayout()
+LAYOUT = type(_BLANK.__ctype__())
+LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
+_ARRAY: Any = type(wp.array(dtype=wp.uint8).__ctype__())
+ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), _ARRAY.shape.offset
+# members of a RowLayout from `nx` to `slab`; first (k, j, i)
+BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")
+FORMATS: dict[Any, Any] = {
+    wp.float32: ctypes.c_float,
+    wp.float64: ctypes.c_double,
+    wp.int32: ctypes.c_int32,
+    wp.int64: ctypes.c_int64,
+    wp.bool: ctypes.c_bool,
+    float: ctypes.c_float,
+    int: ctypes.c_int32,
+    bool: ctypes.c_bool,
+}
+
+
+class Scalar:
+    """A number that changes between the runs of recorded launches.
+
+    Pass it where a kernel takes a number: a launch that is recorded reads `value` each time it
+    runs, another takes it as it is.
+    """
+
+    __slots__ = ("_cells", "_scaled", "_value")
+
+    def __init__(self, value: float = 0) -> None:
+        self._cells: dict[Any, Any] = {}  # the number in each type that kernels take it in
+        self._scaled: dict[float, Scalar] = {}
+        self._value = value
+
+    @property
+    def value(self) -> float:
+        """The number."""
+        return self._value
+
+    @value.setter
+    def value(self, value: float) -> None:
+        self._value = value
+        for cell in self._cells.values():
+            cell.value = value
+        for factor, product in self._scaled.items():
+            product.value = value * factor
+
+    def scaled(self, factor: float) -> Scalar:
+        """Return the number times a factor, which goes along with it."""
+        if factor not in self._scaled:
+            self._scaled[factor] = Scalar(self._value * factor)
+        return self._scaled[factor]
+
+    def address(self, kind: Any) -> tuple[int, int]:
+        """Return the address of the number in one of Warp's types, and its bytes."""
+        kind = FORMATS[kind]
+        if kind not in self._cells:
+            self._cells[kind] = kind(self._value)
+        return ctypes.addressof(self._cells[kind]), ctypes.sizeof(kind)
+
+
+def scaled(number: float | Scalar, factor: float) -> Any:
+    """Return a number times a factor."""
+    return number.scaled(factor) if isinstance(number, Scalar) else number * factor
+
+
+def value_of(number: Any) -> Any:
+    """Return a number, or what a `Scalar` holds now."""
+    return number.value if type(number) is Scalar else number
+
+
+class Slot:
+    """Address of an array that other arrays replace between runs; the current array has it as attribute `slot`."""
+
+    __slots__ = ("_held", "_length", "_memory", "address")
+
+    def __init__(self) -> None:
+        self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
+        self.address = ctypes.addressof(self._memory)
+        self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
+        self._held: Any = None  # the store that `point_to_first` has been given last
+
+    def point_to(self, array: wp.array[Any]) -> None:
+        """Have recorded launches use this array from now on."""
+        self._held = None
+        ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
+        array.slot = self
+
+    def point_to_first(self, count: int, store: wp.array[Any]) -> None:
+        """Have recorded launches use the first elements of an array of one axis from now on."""
+        if self._held is not store:
+            ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
+            self._held = store
+        self._length.value = count
+
+
+class RowsMemory:
+    """Rows that change between runs: their layout, the first cell of a box, and the number of tasks.
+
+    Attributes:
+        layout: native struct of the layout.
+        place: first (k, j, i) of a box.
+        tasks: of a pass over the rows.
+    """
+
+    __slots__ = ("layout", "place", "tasks")
+
+    def __init__(self) -> None:
+        self.layout = LAYOUT()
+        self.place, self.tasks = (ctypes.c_int32 * 3)(), ctypes.c_int64()
+
+    def patches(self, place: int | None) -> list[tuple[int, int, int]]:
+        """Return what a launch reads; `place`: offset of `k0` in its arguments, None: it has none."""
+        found = [(0, ctypes.addressof(self.layout), LAYOUT_BYTES)]
+        return (
+            found
+            if place is None
+            else [*found, (place, ctypes.addressof(self.place), ctypes.sizeof(self.place))]
+        )
+
+    @property
+    def sized(self) -> int:
+        """Address of the number of tasks."""
+        return ctypes.addressof(self.tasks)
+
+    def take_box(
+        self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]
+    ) -> None:
+        """Take whole rows of a box over, see `RowLayout`."""
+        ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
+        BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
+        PLACE.pack_into(self.place, 0, *place)
+        self.tasks.value = planes * rows * chunks
+
+    def take_entries(self, count: int, cells: int) -> int:
+        """Take the entries of a list over on the CPU, as `Rows.entries` with so many `cells` a task; return the number of tasks."""
+        chunks = -(-count // cells)
+        self.take_box(count, 1, 1, cells, chunks, (0, 0, 0))
+        return chunks
+
+    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+        """Take rows over.
+
+        Args:
+            layout: a RowLayout.
+            place: first (k, j, i).
+        """
+        ctypes.memmove(
+            ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES
+        )
+        self.place[:] = list(place)
+        self.tasks.value = -(-layout.planes // max(layout.slab, 1)) * layout.rows * layout.chunks
+
+
+class DeviceRows(RowsMemory):
+    """Rows that change between runs, on CUDA: with the launch dimensions that they take, and those that a graph is captured with.
+
+    Attributes:
+        extent: threads of a launch (slabs, rows, chunks) now.
+        room: those of a captured launch: the largest that have been asked for, those beyond the
+            rows return at once.
+        places: number of threads, of which each has a place for its sums.
+    """
+
+    __slots__ = ("extent", "places", "room", "spare")
+
+    def __init__(self, spare: float = 1.0) -> None:
+        """Begin with one thread; where `room` must grow, it does so by the factor `spare` more."""
+        super().__init__()
+        self.extent: tuple[int, ...] = (1, 1, 1)
+        self.room: tuple[int, ...] = (1, 1, 1)
+        self.places, self.spare = Scalar(), spare
+
+    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+        """Take rows over."""
+        super().take(layout, place)
+        self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
+        self.room = larger(self.room, self.extent, self.spare)
+        self.places.value = self.tasks.value
+
+
+def rows_memory(device: wp.Device, spare: float = 1.0) -> RowsMemory:
+    """Return memory of rows for recorded launches of a device; `spare` as of `DeviceRows`."""
+    return DeviceRows(spare) if device.is_cuda else RowsMemory()
+
+
+def larger(room: tuple[int, ...], extent: tuple[int, ...], spare: float = 1.0) -> tuple[int, ...]:
+    """Return launch dimensions that hold others, too: where they must grow, by a factor more."""
+    return tuple(r if r >= e else int(spare * e) for r, e in zip(room, extent, strict=True))

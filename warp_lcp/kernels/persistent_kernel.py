@@ -1,0 +1,209 @@
+# mypy: ignore-errors
+"""Passes one after another in one launch on CUDA; on the CPU, launches.
+
+A block of threads takes them, or a cluster of blocks. All threads meet at a barrier after each
+pass. A cluster (compute capability 9.0 on) is a few blocks on neighboring multiprocessors that have
+a barrier in hardware. It is taken where a pass has more tasks than a block has threads.
+"""
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.kernel_variant import KernelVariant
+from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
+from warp_lcp.kernels.layout import RowLayout, make_struct, threads
+from warp_lcp.kernels.stencil_kernel import BoundKernel
+
+CUDA_THREADS = 512  # of a block that inverts a matrix
+THREADS = 256  # of a block that works through passes: with 512 they spill registers
+BLOCKS = 8  # of a cluster: as many as every GPU with clusters has
+CLUSTERED = 90  # the least architecture that has them
+MOST = 5  # forms
+
+
+@wp.struct
+class EmptyArguments:
+    """Fields of a form that a sequence does not have; of eight bytes, as all structs of arguments are."""
+
+    unused: wp.int64
+
+
+@wp.func
+def nothing(L: RowLayout, F: EmptyArguments, slab: int, row: int, chunk: int, count: int):
+    """Stand for a form that a sequence does not have."""
+
+
+class PersistentKernel:
+    """A table of passes on the device, which one launch works through: grids of 16^3 cells take less time than launches.
+
+    Args:
+        name: of the kernel, as a pass has one.
+        stages: the passes in order, of five forms at most, without sums. Those that are the same
+            object are kept once.
+
+    Attributes:
+        tasks: the most of a pass.
+        threads: of the launch.
+
+    Raises:
+        ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
+    """
+
+    def __init__(self, name: str, stages: list[BoundKernel]) -> None:
+        forms = tuple(dict.fromkeys(stage.form for stage in stages))
+        names = [form.declared.name for form in forms]
+        if not stages or any(stage.rows.device is not stages[0].rows.device for stage in stages):
+            raise ValueError(f"{name}: takes passes, all on one device")
+        if len(forms) > MOST:
+            raise ValueError(
+                f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}"
+            )
+        if summing := [form.declared.name for form in forms if form.declared.sums]:
+            raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
+        self.device, self._stages, self._forms = stages[0].rows.device, tuple(stages), forms
+        self.tasks = max(math.prod(threads(stage.layout)) for stage in stages)
+        clustered = has_clusters(self.device) and self.tasks > THREADS
+        self.threads = THREADS * (BLOCKS if clustered else 1)
+        self._name = name
+        self.kernel, self._Tables, self._structs = _sequence_kernel(name, forms, clustered)
+
+    def kernel_by_quads(self, *, clustered: bool) -> Any:
+        """Return the kernel as a GPU launches it, by one block or a cluster of them."""
+        forms = tuple(dict.fromkeys(form.by_quads or form for form in self._forms))
+        return _sequence_kernel(self._name, forms, clustered)[0]
+
+    @functools.cached_property
+    def tables(self) -> Any:
+        """The passes, those of each form in a table, and the order in which they follow."""
+        places = dict[int, tuple[int, int]]()
+        kept: list[list[bytes]] = [[] for _ in self._forms]
+        for bound in {id(stage): stage for stage in self._stages}.values():
+            which = self._forms.index(bound.form)
+            places[id(bound)] = which, len(kept[which])
+            kept[which].append(bytes(bound.layout.__ctype__()) + bound.arguments)
+        made = self._Tables()
+        made.order = wp.array(
+            [places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device
+        )
+        for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):
+            stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
+            typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
+            # a recorded launch keeps the tables alone, and they what they have the addresses of
+            typed.kept = stored, self._stages
+            setattr(made, table, typed)
+        return made
+
+    def launch(self, launch: Launch = launch_now) -> None:
+        """Launch all passes, or record their launch."""
+        if self.device.is_cuda:
+            inputs = [self.tables, 0, len(self._stages), self.threads]
+            launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
+            return
+        made: dict[int, Any] = {}  # what the team does of a pass that comes again
+        for stage in self._stages:
+            key = id(stage)
+            if key not in made:
+                made[key] = stage.operation()
+            if made[key] is None:
+                stage.launch(launch)
+            else:
+                perform(made[key], launch)
+
+
+TABLES = tuple(f"pieces{i}" for i in range(MOST))
+
+
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+"""
+)
+def meet():
+    """Wait for all threads of the block."""
+
+
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && defined(__CUDACC__)
+asm volatile("barrier.cluster.arrive.release;" ::: "memory");
+asm volatile("barrier.cluster.wait.acquire;" ::: "memory");
+#elif defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+"""
+)
+def meet_in_cluster():
+    """Wait for all threads of the cluster, and see what they have written."""
+
+
+def has_clusters(device: wp.Device) -> bool:
+    """Return whether a device launches clusters of blocks."""
+    return bool(device.is_cuda and device.arch >= CLUSTERED)
+
+
+@functools.cache
+def _shared(form: KernelVariant | None) -> Any:
+    """Return the struct of a pass with its arguments, and the function by which threads share its rows."""
+    run, Fields = (form.run_in_turn, form.fields) if form else (nothing, EmptyArguments)
+    Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
+    pieces = wp.array(dtype=Piece)
+
+    def share(given: pieces, place: int, t: int, threads: int):
+        P = given[place]
+        a_plane = P.L.rows * P.L.chunks
+        for q in range(t, (P.L.planes + P.L.slab - 1) // P.L.slab * a_plane, threads):
+            run(P.L, P.F, q // a_plane, q % a_plane // P.L.chunks, q % P.L.chunks, 1)
+
+    share.__module__ = run.module.name if form else __name__
+    share.__qualname__ = f"{run.key}_shared"
+    return Piece, wp.func(share)
+
+
+@functools.cache
+def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: bool) -> Any:
+    (One, first), (Two, second), (Three, third), (Four, fourth), (Five, fifth) = (
+        _shared(form) for form in (*forms, *(None,) * (MOST - len(forms)))
+    )
+    kinds = [form.declared.name.rpartition(".")[2] for form in forms]
+    words = [
+        *dict.fromkeys(word for form in forms for word in form.words),
+        *["cluster"] * clustered,
+    ]
+    variant = f"{'_'.join(kinds)}.{'_'.join(words)}"
+    wait = meet_in_cluster if clustered else meet
+    structs = (One, Two, Three, Four, Five)
+    members = {"order": wp.array(dtype=wp.vec2i)} | {
+        n: wp.array(dtype=s) for n, s in zip(TABLES, structs, strict=True)
+    }
+    Tables = make_struct(f"{name.replace('.', '_')}_{variant.replace('.', '_')}", members)
+
+    def sequence(T: Tables, begin: int, end: int, threads: int):
+        """Every thread passes every barrier: the bounds of the loop are the same for all."""
+        t = wp.tid()
+        for s in range(begin, end):
+            at = T.order[s]
+            if at[0] == 0:
+                first(T.pieces0, at[1], t, threads)
+            elif at[0] == 1:
+                second(T.pieces1, at[1], t, threads)
+            elif at[0] == 2:
+                third(T.pieces2, at[1], t, threads)
+            elif at[0] == 3:
+                fourth(T.pieces3, at[1], t, threads)
+            else:
+                fifth(T.pieces4, at[1], t, threads)
+            wait()
+
+    sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
+    options = {"cluster_dim": BLOCKS} if clustered else {}
+    module = f"warp_lcp.{name}.{variant}"
+    # without the least number of blocks, 1, ptxas keeps to 128 registers and spills
+    kernel = forward_kernel(module=module, launch_bounds=(THREADS, 1), **options)(sequence)
+    return kernel, Tables, structs

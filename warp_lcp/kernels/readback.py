@@ -1,0 +1,115 @@
+"""Numbers that kernels leave on a device for the host, which waits for the device whenever it reads: those of a device come together."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.kernels.fields import zeros
+
+BYTES = 1 << 15  # of a board: as long under way as eight
+LINE = 64  # bytes that no two readings share
+
+
+class DeviceScalar:
+    """An array of a few numbers, written by kernels and read by the host.
+
+    Whoever has launched what writes to `array` says so by `changed`; `numpy` then waits for the
+    device, once for all readings of it.
+
+    Args:
+        device: where it is.
+        count: numbers.
+        dtype: of them.
+    """
+
+    _board: ReadbackBuffer | None
+    _view: np.ndarray  # of an array that the host reads as it is
+
+    def __init__(self, device: wp.Device, count: int = 1, dtype: Any = wp.float64) -> None:
+        self.array: wp.array[Any]
+        self._board, self._change = None, 0
+        if not device.is_cuda:
+            self.array = zeros(count, dtype, device)
+            self._view = self.array.numpy()
+            return
+        size = count * wp.types.type_size_in_bytes(dtype)
+        self._board, place = place_of(device, size)
+        self.array = wp.array(
+            ptr=self._board.memory.ptr + place, dtype=dtype, shape=count, device=device
+        )
+        self.array.zero_()
+        self._slice, self._kind = slice(place, place + size), wp.dtype_to_numpy(dtype)
+        weakref.finalize(self, self._board.give_back, place, size)
+
+    def changed(self) -> None:
+        """Say that launches have written to it."""
+        if self._board is not None:
+            self._change = self._board.note()
+
+    def numpy(self) -> np.ndarray:
+        """Return the numbers as they are after all that has been launched, not to be written to."""
+        if self._board is None:
+            return self._view
+        return self._board.fetched(self._change)[self._slice].view(self._kind)
+
+
+class ReadbackBuffer:
+    """Memory of a device for its readings.
+
+    Args:
+        device: where it is.
+        size: of it, in bytes.
+    """
+
+    def __init__(self, device: wp.Device, size: int = BYTES) -> None:
+        self.memory = wp.zeros(-(-size // LINE) * LINE, dtype=wp.uint8, device=device)
+        self._host, self._end, self._changes, self._known = np.zeros(0, dtype=np.uint8), 0, 0, 0
+        self._free: dict[int, list[int]] = {}  # places by their size
+
+    def take(self, size: int) -> int | None:
+        """Return a place of so many bytes, None if there is none."""
+        size = -(-size // LINE) * LINE
+        if free := self._free.get(size):
+            return free.pop()
+        if self._end + size > self.memory.size:
+            return None
+        self._end += size
+        self._known = -1  # what has been fetched is too short
+        return self._end - size
+
+    def give_back(self, place: int, size: int) -> None:
+        """Take a place back."""
+        self._free.setdefault(-(-size // LINE) * LINE, []).append(place)
+
+    def note(self) -> int:
+        """Count a change; return its number."""
+        self._changes += 1
+        return self._changes
+
+    def fetched(self, change: int) -> np.ndarray:
+        """Return all bytes as they are after a change, or later."""
+        if self._known < change:
+            self._known, self._host = self._changes, self.memory[: self._end].numpy()
+        return self._host
+
+
+_boards: dict[str, ReadbackBuffer] = {}  # the newest of each device
+
+
+def place_of(device: wp.Device, size: int) -> tuple[ReadbackBuffer, int]:
+    """Return a board of a device that has so many bytes free, and their place on it."""
+    board = _boards.get(device.alias) or _boards.setdefault(device.alias, ReadbackBuffer(device))
+    place = board.take(size)
+    if place is None:
+        gc.collect()  # readings that only a circle of references still holds
+        place = board.take(size)
+    if place is None:  # the old one stays as long as its readings do
+        board = _boards[device.alias] = ReadbackBuffer(device, max(size, BYTES))
+        place = board.take(size)
+        assert place is not None
+    return board, place

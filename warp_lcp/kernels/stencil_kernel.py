@@ -1,0 +1,605 @@
+# mypy: ignore-errors
+"""Row passes: declared by fields with roles and a C++ row function, launched by name, composed to waves.
+
+A row function sees a piece: pointers to its first cell, the number n of its cells, the offsets ym,
+yp, zm, zp of the rows beside it.
+"""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from operator import attrgetter, index
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from warp_lcp.kernels.kernel_variant import (
+    KNOWN,
+    NUMBERS,
+    PACKED,
+    PLACE,
+    QUADS,
+    TOGETHER,
+    UNIFORM,
+    VARIABLE,
+    C,
+    KernelVariant,
+    form_of,
+    make_kernels_of_module,
+)
+from warp_lcp.kernels.launch_graph import Launch, device_program, is_recording, perform
+from warp_lcp.kernels.layout import PrecomputedProduct, Rows, copy_of, put, threads
+from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar
+from warp_lcp.kernels.native import sections
+from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
+
+BLOCK_BYTES = 16  # that a thread loads at a time
+# fields of one element a row that row functions only set, or find it set
+FLAGGED = ("changed", "away")
+# names of the layer's own
+OWN = frozenset(
+    (
+        "self",
+        "rows",
+        "stencil",
+        "bounds",
+        "given",
+        "P",
+        "n",
+        "p",
+        "ym",
+        "yp",
+        "zm",
+        "zp",
+        "down",
+        "up",
+        "c_",
+        "_ctype",
+    )
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StencilKernel:
+    """What is done to the cells of a row.
+
+    Types of fields are Warp's, or letters: a letter stands for one type, that of the arrays given,
+    and is the name of it in the row function. `T` there is the type of computations.
+
+    Args:
+        name: of the kernel, with the area before it: `projected_multigrid.assess`.
+        header: C++ row function, or the header of an area in which it is `declared`.
+        compute: what T stands for.
+        stencil: types of the diagonal and the weights of `stencil.h`, if it has one. `affine` there
+            is A x + b: of the stencil, or known.
+        bounds: whether it has those of `bounds.h`.
+        reads: fields, pointers to the piece's first cell.
+        writes: likewise, written.
+        ring: which of those keep three planes only; the pointer is to its place there, `down` and
+            `up` lead to the planes around it.
+        other: fields of the other level of a transfer, pointers to the element that belongs to the
+            first cell. Cells belong together in `pairs` along x or not; `deep` planes and `wide`
+            rows of a finer level belong to one of ours.
+        finer: whether the stencil and the offsets are those of the other level, which is finer.
+        by_row: one element a row of the grid: pointers to the first row's; `P.row` counts.
+        whole: small arrays: pointers to the first element.
+        box: fields of all cells of a grid, of `Rows.box`: pointers to the first stored cell of row
+            j of plane k, null where there is none; of one that has layers, in its first. The piece
+            is first <= i < last; the planes of the first field are s1 elements apart, its rows s2.
+            Such a pass has no letters and one form, in the Warp module that its name begins with.
+            Lists, too, are fields.
+        listed: int32 array of `whole` with the flat indices of the cells that are visited; the box
+            is then that of the list's entries.
+        optional: which arrays may be None, or empty: their pointers are null then.
+        numbers: given by the host.
+        sums: variables of the row function that are summed over the cells. Those of a pass over a
+            box are doubles, and 0 before a piece.
+        largest: likewise, of which the largest counts; after the sums.
+        ordered: whether tasks write what others read or write: on the CPU one thread takes them, in
+            order.
+        by_cell: whether a thread takes one cell on CUDA, not four of a row: what it does of one is
+            long, or reaches what others write.
+        constants: numbers that are known when the kernel is made, with their usual values; those
+            that are given are integers, and macros.
+        declared: the kernel's name in the header, see `kernel_file.py`; empty: the header is the
+            row function alone.
+        module: Warp module of passes that are used together. They are compiled at once for each set
+            of types: a module of its own costs 0.04 s before its first kernel. Not for a pass over
+            a box, whose module its name begins with.
+
+    Raises:
+        ValueError: a name cannot be one in C++, is the layer's own, or stands for two things; a
+            role or a letter is of no array.
+        TypeError: a number is of a type that cannot be given.
+    """
+
+    name: str
+    header: Path
+    compute: Any
+    stencil: tuple[Any, Any] | None = None
+    bounds: bool = False
+    reads: Mapping[str, Any] = field(default_factory=dict)
+    writes: Mapping[str, Any] = field(default_factory=dict)
+    ring: tuple[str, ...] = ()
+    other: Mapping[str, Any] = field(default_factory=dict)
+    finer: bool = False
+    by_row: Mapping[str, Any] = field(default_factory=dict)
+    whole: Mapping[str, Any] = field(default_factory=dict)
+    optional: tuple[str, ...] = ()
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    sums: tuple[str, ...] = ()
+    largest: tuple[str, ...] = ()
+    constants: Mapping[str, float] = field(default_factory=dict)
+    box: Mapping[str, Any] = field(default_factory=dict)
+    listed: str = ""
+    ordered: bool = False
+    by_cell: bool = False
+    declared: str = ""
+    module: str = ""
+
+    def __post_init__(self) -> None:
+        """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
+        self._check_names()
+        if self.module:
+            TOGETHER.setdefault(self.module, []).append(self)
+        if self.box:
+            object.__setattr__(self, "numbers", {**self.numbers, **dict.fromkeys(PLACE, int)})
+            assert form_of(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
+
+    def _check_names(self) -> None:
+        """Check the declaration, in whose place a compiler would complain, or nobody."""
+        numbers = {n: kind for n, kind in self.numbers.items() if not (self.box and n in PLACE)}
+        fields = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box})
+        groups = (
+            *fields,
+            numbers,
+            self.constants,
+            self.found and ("out", *(self.found if self.box else ())),
+        )
+        names = [name for group in groups for name in group]
+        wrong = {
+            name
+            for name in names
+            if names.count(name) > 1 or not name.isidentifier() or name in OWN
+        }
+        wrong |= {*self.ring} - {*self.reads, *self.writes} | {*self.optional} & {*[*self.box][:1]}
+        wrong |= {part for part in self.name.split(".") if not part.isidentifier()}
+        known = {*self.arrays.values(), *(self.stencil or ())}
+        wrong |= {
+            kind
+            for kind in (self.compute, *numbers.values())
+            if isinstance(kind, str) and kind not in known
+        }
+        if wrong:
+            expected = (
+                "names that are free, rings of fields, letters of arrays, a first field of "
+                "a box that is not optional"
+            )
+            raise ValueError(f"{self.label}: {sorted(wrong)}: expected {expected}")
+        if others := {
+            name
+            for name, kind in numbers.items()
+            if not isinstance(kind, str) and kind not in PACKED
+        }:
+            raise TypeError(
+                f"{self.label}: {sorted(others)}: expected numbers of the types "
+                f"{', '.join(t.__name__ for t in PACKED)}"
+            )
+
+    @functools.cached_property
+    def source(self) -> str:
+        """File and line of the declaration."""
+        return f"{self.header}:{sections(self.header)[self.declared].line if self.declared else 1}"
+
+    @functools.cached_property
+    def label(self) -> str:
+        """The name and where it is declared, for messages."""
+        return f"{self.name} ({self.source})" if self.declared else self.name
+
+    @functools.cached_property
+    def letters(self) -> frozenset[str]:
+        """Letters that stand for types."""
+        return frozenset(
+            kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str)
+        )
+
+    @functools.cached_property
+    def found(self) -> tuple[str, ...]:
+        """What is summed, and what the largest is taken of."""
+        return (*self.sums, *self.largest)
+
+    @functools.cached_property
+    def quads(self) -> bool:
+        """Whether a thread can take four cells of a row at a time on CUDA: of passes over the rows of grids."""
+        elsewhere = self.box or self.ring or {*self.by_row} - {*FLAGGED}
+        return not (elsewhere or self.ordered or self.by_cell)
+
+    @functools.cached_property
+    def arrays(self) -> dict[str, Any]:
+        """Types of all arrays by name; `out` receives what is found, a column each."""
+        out = {"out": wp.float64} if self.found else {}
+        return {
+            **self.reads,
+            **self.writes,
+            **self.other,
+            **self.by_row,
+            **self.whole,
+            **self.box,
+            **out,
+        }
+
+    def bind(
+        self,
+        rows: Rows,
+        *structs: Any,
+        stencil: Any = None,
+        bounds: list[Any] | None = None,
+        **given: Any,
+    ) -> "BoundKernel":
+        """Check and take what a launch needs.
+
+        Args:
+            rows: which rows.
+            structs: dataclasses whose members have the names of arguments; the kernel takes those
+                that it declares.
+            stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `PrecomputedProduct` product in
+                place of one.
+            bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
+            given: arrays, numbers, and constants that are not as usual, by name; they override
+                members of structs.
+
+        Raises:
+            TypeError: an argument is missing, unknown, or of the wrong type; two structs have it; a
+                struct is no dataclass.
+            ValueError: an array has the wrong length, lies on another device, or its elements do
+                not lie side by side.
+        """
+        return self.bind_arguments(rows, structs, given, stencil, bounds)
+
+    def bind_arguments(
+        self,
+        rows: Rows,
+        structs: tuple[Any, ...],
+        given: dict[str, Any],
+        stencil: Any = None,
+        bounds: list[Any] | None = None,
+    ) -> "BoundKernel":
+        """Bind as `bind` does, for functions that hand on the structs and keywords of their callers; `given` changes."""
+        if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
+            verb = {True: "needs", False: "takes no"}
+            raise TypeError(
+                f"{self.label}: {verb[self.stencil is not None]} stencil, {verb[self.bounds]} "
+                "bounds"
+            )
+        if structs:
+            given = self._with_members(structs, given)
+        if self.box:
+            given |= rows.place
+            constants = tuple(self.constants.values())
+        else:
+            try:
+                constants = (
+                    tuple(
+                        [
+                            index(given.pop(n)) if n in given else v
+                            for n, v in self.constants.items()
+                        ]
+                    )
+                    if self.constants
+                    else ()
+                )
+            except TypeError as error:
+                raise TypeError(
+                    f"{self.label}: {', '.join(self.constants)} are integers where given: {error}"
+                ) from None
+        if given.keys() != self._wanted:
+            missing, unknown = (
+                sorted(self._wanted - given.keys()),
+                sorted(given.keys() - self._wanted),
+            )
+            searched = (
+                f" in {', '.join(type(s).__name__ for s in structs)}" if structs and missing else ""
+            )
+            raise TypeError(f"{self.label}: missing {missing}{searched}, unknown {unknown}")
+        types = [getattr(given[n], "dtype", None) for n in self.arrays]
+        kind, weights, stored = NUMBERS, None, ()
+        if bounds:
+            lower, _, upper, _, code = bounds
+            if length := code.size or lower.size or upper.size:
+                kind = "coded" if code.size else "fields"
+                if length != rows.size:
+                    raise ValueError(
+                        f"{self.label}: bounds have {length} elements, not {rows.size}"
+                    )
+        if stencil is not None:
+            d, weights, pattern = stencil.d, stencil.weights, getattr(stencil, "pattern", None)
+            stored = (type(stencil), pattern, d.dtype, weights[0].dtype if weights else None)
+            if d.size != (rows.other_size if self.finer else rows.size):
+                raise ValueError(
+                    f"{self.label}: the stencil has {d.size} elements, not "
+                    f"{rows.other_size if self.finer else rows.size}"
+                )
+        quads = None
+        if (
+            rows.quads is not None
+            and self.quads
+            and rows.memory is None
+            and not (stored and stored[1])
+        ):
+            fields = rows.alignments != QUADS and self._fields_of_rows(given, stencil, bounds)
+            quads = rows.alignments if fields and in_blocks(fields) else QUADS
+        key = (constants, kind, quads, *stored, *types)
+        made = self._forms.get(key)
+        if made is None:
+            letters = tuple(sorted(self._letters(stencil, given).items()))
+            numbers = tuple(zip(self.constants, constants, strict=True))
+            shape = (
+                KNOWN
+                if isinstance(stencil, PrecomputedProduct)
+                else stored[1]
+                if stencil and stored[1]
+                else VARIABLE
+                if weights
+                else UNIFORM
+            )
+            made = self._forms[key] = form_of(self, letters, numbers, shape, kind, quads=quads)
+            make_kernels_of_module(made, letters, shape, kind)
+        self._check_memory(rows, given)
+        return BoundKernel(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
+
+    def _with_members(self, structs: tuple[Any, ...], given: dict[str, Any]) -> dict[str, Any]:
+        """Return the members of structs that are arguments, and what is given."""
+        kinds = tuple([type(s) for s in structs])
+        plan = self._members.get(kinds)
+        if plan is None:
+            plan = self._members[kinds] = self._plan(kinds)
+        names, getters = plan
+        values = [
+            value
+            for s, get in zip(structs, getters, strict=True)
+            if get is not None
+            for value in get(s)
+        ]
+        return {**dict(zip(names, values, strict=True)), **given}
+
+    def _plan(self, kinds: tuple[type, ...]) -> tuple[tuple[str, ...], tuple[Any, ...]]:
+        """Return the arguments that structs of these classes have, and for each class what gets them, or None."""
+        if others := [kind.__name__ for kind in kinds if not is_dataclass(kind)]:
+            raise TypeError(f"{self.label}: {others[0]} is not a dataclass")
+        shares = [[f.name for f in fields(kind) if f.name in self._wanted] for kind in kinds]
+        names = tuple(name for share in shares for name in share)
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise TypeError(
+                f"{self.label}: {', '.join(kind.__name__ for kind in kinds)}: two of them have "
+                f"{twice}"
+            )
+        return names, tuple(_getter(share) for share in shares)
+
+    def words(
+        self, letters: dict[str, Any], constants: Mapping[str, float], shape: str, bounds: str
+    ) -> list[str]:
+        """Return what tells a form from others: kinds of stencil and bounds, types, constants that differ from the usual ones."""
+        differing = [
+            f"{name.lower()}{value}"
+            for name, value in constants.items()
+            if value != self.constants[name]
+        ]
+        kinds = [shape] * bool(self.stencil) + [bounds] * (self.bounds and bounds != NUMBERS)
+        return [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
+
+    def _fields_of_rows(self, given: dict[str, Any], stencil: Any, bounds: Any) -> list[Any]:
+        """Return the fields that quads may read in blocks."""
+        fields = [given[name] for name in (*self.reads, *self.writes, *self.other)]
+        if stencil is not None:
+            fields += [stencil.d, *(stencil.weights or ()), getattr(stencil, "y", None)]
+        return [*fields, *(bounds or ())[::2]]
+
+    @functools.cached_property
+    def _members(self) -> dict[tuple[type, ...], Any]:
+        """Plans of `_with_members` by the classes of structs."""
+        return {}
+
+    @functools.cached_property
+    def _wanted(self) -> frozenset[str]:
+        return frozenset({*self.arrays, *self.numbers})
+
+    @functools.cached_property
+    def _forms(self) -> dict[Any, KernelVariant]:
+        """Forms by what is given, so that types are checked once."""
+        return {}
+
+    def _letters(self, stencil: Any, given: dict[str, Any]) -> dict[str, Any]:
+        """Find what the letters stand for, and check the types of all arrays."""
+        letters: dict[str, Any] = {}
+        seen: dict[str, str] = {}
+        pairs = [(name, kind, given[name]) for name, kind in self.arrays.items()]
+        if self.stencil is not None:
+            pairs += [("the stencil's d", self.stencil[0], stencil.d)]
+            pairs += (
+                [("the stencil's weights", self.stencil[1], stencil.weights[0])]
+                if stencil.weights
+                else []
+            )
+        for name, kind, value in pairs:
+            if value is None and name in self.optional:
+                continue
+            found = value.dtype if isinstance(value, wp.array) else type(value)
+            expected = letters.setdefault(kind, found) if isinstance(kind, str) else kind
+            if not isinstance(value, wp.array) or found is not expected:
+                why = f", as {seen[kind]}" if isinstance(kind, str) and kind in seen else ""
+                raise TypeError(
+                    f"{self.label}: {name} is {found.__name__}, not an array of "
+                    f"{expected.__name__}{why}"
+                )
+            seen.setdefault(kind, name)
+        if others := [
+            f"{seen[kind]} is {found.__name__}" for kind, found in letters.items() if found not in C
+        ]:
+            raise TypeError(
+                f"{self.label}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}"
+            )
+        # of what is absent
+        return letters | dict.fromkeys(self.letters - letters.keys(), wp.float32)
+
+    @functools.cached_property
+    def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
+        """Names of the arrays of each length, with the attribute of rows that it is; None: of any."""
+        sized = (
+            ("size", {**self.reads, **self.writes}),
+            ("other_size", self.other),
+            ("count", self.by_row),
+        )
+        groups = (
+            *sized,
+            (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.found))}),
+        )
+        return [(length, tuple(names)) for length, names in groups if names]
+
+    def _check_memory(self, rows: Rows, given: dict[str, Any]) -> None:
+        device = rows.device
+        for length, names in self._lengths:
+            expected = length and getattr(rows, length)
+            for name in names:
+                value = given[name]
+                found = 0 if value is None else value.size
+                if not found and name in self.optional and getattr(value, "slot", None) is None:
+                    # a slice of nothing has an address; of a list that grows it is read when it
+                    # runs
+                    given[name] = None
+                if found != expected is not None and (found or name not in self.optional):
+                    raise ValueError(f"{self.label}: {name} has {found} elements, not {expected}")
+                if found and not (value.is_contiguous and value.device is device):
+                    why = f"on {value.device}, not {device}" if value.is_contiguous else "strided"
+                    raise ValueError(f"{self.label}: {name} is {why}")
+        if self.box:
+            self._check_box(
+                rows, {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None}
+            )
+        if self.found and given["out"].size < len(self.found) * rows.places:
+            least = (
+                f"fewer than {len(self.found) * rows.places}: {rows.places} threads for each sum"
+            )
+            raise ValueError(f"{self.label}: out has {given['out'].size} elements, {least}")
+
+    def _check_box(self, rows: Rows, shapes: set[tuple[int, ...]]) -> None:
+        if len(shapes) > 1:
+            raise ValueError(
+                f"{self.label}: fields have the shapes {', '.join(map(str, sorted(shapes)))}"
+            )
+        for shape in shapes:
+            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
+            if not self.listed and (rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i):
+                raise ValueError(
+                    f"{self.label}: fields have the shape {shape}, the box ends at {rows.ends}"
+                )
+
+
+def _getter(names: list[str]) -> Any:
+    """Return a function from a struct to its members of these names; None if there are none."""
+    if len(names) == 1:
+        return lambda s, name=names[0]: (getattr(s, name),)
+    return attrgetter(*names) if names else None
+
+
+def in_blocks(fields: list[Any]) -> bool:
+    """Return whether the memory of all fields begins with a block of 16 bytes, and stays where it is."""
+    arrays = [value for value in fields if isinstance(value, wp.array) and value.size]
+    return all(
+        value.ptr % BLOCK_BYTES == 0 and getattr(value, "slot", None) is None for value in arrays
+    )
+
+
+class BoundKernel(NamedTuple):
+    """A pass with its arguments.
+
+    Attributes:
+        form: the pass.
+        rows: which it visits.
+        arguments: struct of its arguments, as bytes.
+        given: arrays and numbers by name.
+        kept: what else has memory in it: the stencil, the operands of bounds.
+    """
+
+    form: KernelVariant
+    rows: Rows
+    arguments: bytes
+    given: dict[str, Any]
+    kept: Any
+
+    @property
+    def fields(self) -> Any:
+        """The struct of arguments for Warp, which keeps their memory."""
+        return self.form.struct_of(self)
+
+    @property
+    def layout(self) -> Any:
+        """Where the rows are, for a pass that sums or one that does not."""
+        return (
+            self.rows.summed
+            if self.form.declared.found
+            else self.rows.quads
+            if self.form.quads
+            else self.rows.single
+        )
+
+    def launch(self, launch: Launch | None = None) -> None:
+        """Launch the pass, or record it."""
+        if self.rows.device.is_cuda and (program := device_program(launch)) is not None:
+            program.record_pass(self)
+        elif self.rows.device.is_cuda or team() is None:
+            (launch or wp.launch)(
+                self.form.kernel,
+                self.form.dim(self.layout),
+                [self.layout, self.fields],
+                device=self.rows.device,
+            )
+        elif (made := self.operation()) is not None:
+            perform(made, launch)
+
+    def operation(self) -> Operation | None:
+        """Return the pass for the team, cut into ranges of tasks; None where it has no task, or is not for the team."""
+        recorded = self.rows.memory is not None and is_recording()
+        if (
+            self.rows.device.is_cuda
+            or team() is None
+            or (0 in threads(self.layout) and not recorded)
+        ):
+            return None
+        cost, sized = (
+            max(self.layout.grain * self.rows.weight, 1),
+            self.rows.memory.sized if recorded else 0,
+        )
+        return ranges(self.stage(), cost, ordered=self.form.declared.ordered, sized=sized)
+
+    def patches(self) -> list[Patch]:
+        """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
+        d, native, patches = self.form.declared, self.form.native, []
+        if self.rows.memory is not None:
+            patches += self.rows.memory.patches(LAYOUT_BYTES + native.k0.offset if d.box else None)
+        for name in self.form.types:
+            if (slot := getattr(self.given[name], "slot", None)) is not None:
+                patches.append(
+                    (LAYOUT_BYTES + getattr(native, name).offset, slot.address, ARRAY_BYTES)
+                )
+        for name, kind in d.numbers.items():
+            if type(number := self.given[name]) is Scalar:
+                kind = self.form.letters[kind] if isinstance(kind, str) else kind
+                patches.append((LAYOUT_BYTES + getattr(native, name).offset, *number.address(kind)))
+        return patches
+
+    def stage(self, lag: int = 0, **members: int) -> OperationKind:
+        """Return the pass for the team, as a stage of a wave whose layout has these members."""
+        L = put(copy_of(self.layout), members) if members else self.layout
+        patches = self.patches() if is_recording() else ()
+        return OperationKind(
+            self.form.entry(self),
+            bytes(L.__ctype__()) + self.arguments,
+            self,
+            L.rows * L.chunks,
+            threads(L)[0],
+            lag,
+            max(L.fz, 1),
+            L.n1,
+            patches,
+        )

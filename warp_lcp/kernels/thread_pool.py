@@ -1,0 +1,709 @@
+# mypy: ignore-errors
+"""A team of threads that runs tables of CPU launches in native code: all cores of a machine in one process, with the bits of one.
+
+A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes
+the next: `headers/team.h` says how. What is computed depends neither on who does it nor on how it
+is cut.
+"""
+
+from __future__ import annotations
+
+import atexit
+import copy
+import ctypes
+import functools
+import os
+import struct
+import threading
+import time
+import warnings
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.deadline import check_time, seconds_left
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.native import shared
+
+VARIABLE = "WARP_LCP_THREADS"
+# where launchers of ranks tell how many are on this machine
+RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")
+MOST_THREADS = 1024
+# nanoseconds in native code after which the interpreter is asked whether there is a signal
+PATIENCE = 50_000_000
+# of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+CELLS = 4096
+PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
+# of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
+SPINS = 10000, 2000
+COPIED = 1 << 18  # bytes that a thread copies at least
+ROOM = 4096  # bytes of the arguments of what can be cut
+RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
+ALONE, TASKS, SLABS, COPY = range(4)
+DONE_ALONE, SHARED, RESUMED = 0, 1, 2
+TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
+    1,
+    2,
+    56,
+    64,
+    24,
+    13,
+    8,
+)
+COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
+WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
+MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are kept
+# of `struct`
+FORMATS = {
+    wp.float32: "f",
+    wp.float64: "d",
+    float: "f",
+    wp.int32: "i",
+    int: "i",
+    wp.int64: "q",
+    wp.bool: "?",
+    bool: "?",
+}
+MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
+LOCKS = (
+    "pthread_mutex_lock",
+    "pthread_mutex_unlock",
+    "pthread_cond_wait",
+    "pthread_cond_broadcast",
+)
+SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
+
+
+@wp.func_native("\n".join(["", shared("team.h"), ""]))
+def work_through(
+    team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share: int, limit_: wp.int64
+):
+    """Do what `mode` asks of thread `me`."""
+
+
+@forward_kernel(module="warp_lcp.team")
+def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: int, limit: wp.int64):
+    """Do what `mode` asks of thread `me`; one thread."""
+    work_through(team, table, mode, me, share, limit)
+
+
+# a part of a kernel's arguments that is read from memory: offset in them, address, bytes
+Patch = tuple[int, int, int]
+
+
+class Arguments(ctypes.Structure):
+    """Arguments of `team_kernel`."""
+
+    _fields_ = (
+        ("team", ctypes.c_uint64),
+        ("table", ctypes.c_uint64),
+        ("mode", ctypes.c_int32),
+        ("me", ctypes.c_int32),
+        ("share", ctypes.c_int32),
+        ("limit", ctypes.c_int64),
+    )
+
+
+class TableEntry:
+    """A kernel on the CPU: what C calls, and the bounds of a launch.
+
+    Args:
+        launch: a recorded launch of it.
+    """
+
+    def __init__(self, launch: Any) -> None:
+        self.kernel, self.function = launch.kernel, launch.hooks.forward
+        # the module stays loaded; the launch would keep arrays
+        self._kept = launch.module_exec, launch.bounds
+        self.call = ctypes.cast(self.function, ctypes.c_void_p).value
+        self.bounds = ctypes.addressof(launch.bounds)
+
+
+class OperationKind:
+    """A kernel with arguments, as words for C.
+
+    Args:
+        entry: the kernel.
+        arguments: their bytes, which begin with the range of tasks if it can be cut.
+        kept: what must live as long.
+        plane_tasks: tasks of a plane.
+        planes: how many there are.
+        lag: planes that it is behind the first stage of a wave.
+        finer: planes of the finer level that one of its planes stands for.
+        finer_planes: their number.
+        patches: parts of the arguments that are read from memory in each run: offset, address,
+            bytes.
+    """
+
+    def __init__(
+        self,
+        entry: TableEntry,
+        arguments: bytes,
+        kept: Any,
+        plane_tasks: int = 1,
+        planes: int = 1,
+        lag: int = 0,
+        finer: int = 1,
+        finer_planes: int = 0,
+        patches: Sequence[Patch] = (),
+    ) -> None:
+        memory, size = array("B", arguments), len(arguments)
+        listed = (
+            array("Q", [len(patches), *(word for patch in patches for word in patch)])
+            if patches
+            else None
+        )
+        self.kept, self.tasks, self.planes = (
+            (entry, memory, kept, listed),
+            plane_tasks * planes,
+            planes,
+        )
+        self.patches = tuple(patches)
+        if size > ROOM:
+            raise ValueError(f"a kernel's arguments take {size} bytes: expected at most {ROOM}")
+        where = 0 if listed is None else listed.buffer_info()[0]
+        self.words = (
+            entry.call,
+            entry.bounds,
+            memory.buffer_info()[0],
+            size,
+            plane_tasks,
+            planes,
+            lag,
+            finer,
+            finer_planes,
+            where,
+        )
+
+    def content(self) -> tuple[Any, ...]:
+        """Return what it does: the kernel, its arguments but for what is patched, and the patches; of a copy, its words."""
+        if not isinstance(self.kept, tuple) or not isinstance(self.kept[0], TableEntry):
+            return self.words
+        memory = bytearray(self.kept[1])
+        for offset, _, size in self.patches:
+            memory[offset : offset + size] = bytes(size)
+        return self.words[0], bytes(memory), self.patches
+
+
+class Operation:
+    """Stages that are done together: a launch, or a wave of them.
+
+    Attributes:
+        check: raises what has failed in it, once the table is done; None: nothing can.
+        condition: address of an int32 number; the operation is skipped where it is 0. 0: it is
+            never skipped.
+
+    Args:
+        kind: ALONE for a launch as it is; TASKS, SLABS for what is cut; COPY for memory.
+        stages: what is launched.
+        chunks: into how many pieces it is cut.
+        each: tasks, or planes, of a piece.
+        everything: tasks, or planes, in all.
+        margin: planes that the last stage of a wave is behind the first.
+        sized: address of the number of tasks, which may differ from run to run; 0: it is
+            `everything`.
+    """
+
+    __slots__ = ("_kept", "_stages", "check", "chunks", "condition", "sized", "words")
+
+    def __init__(
+        self,
+        kind: int,
+        stages: list[OperationKind],
+        chunks: int = 1,
+        each: int = 0,
+        everything: int = 0,
+        margin: int = 0,
+        sized: int = 0,
+    ) -> None:
+        self._stages, self._kept, self.chunks = (
+            array("Q", [word for stage in stages for word in stage.words]),
+            stages,
+            chunks,
+        )
+        self.check: Callable[[], object] | None = None
+        self.condition, self.sized = 0, sized
+        self.words = (
+            kind,
+            self._stages.buffer_info()[0],
+            len(stages),
+            each,
+            everything,
+            margin,
+            chunks,
+        )
+
+    def content(self) -> tuple[Any, ...]:
+        """Return what it does, but for what it reads from memory in each run."""
+        return (
+            self.words[0],
+            self.sized,
+            self.condition,
+            *(stage.content() for stage in self._kept if isinstance(stage, OperationKind)),
+        )
+
+    def name(self) -> str:
+        """Return the names of its kernels."""
+        return (
+            "copy"
+            if self.words[0] == COPY
+            else ", ".join(s.kept[0].kernel.key for s in self._kept if isinstance(s, OperationKind))
+        )
+
+    def only_if(self, condition: wp.array[Any]) -> Operation:
+        """Return the same operation, skipped where a number, shape (1,), wp.int32, is 0."""
+        made = copy.copy(self)
+        made._kept, made.condition = [*self._kept, condition], condition.ptr
+        return made
+
+
+def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: int = 0) -> Operation:
+    """Return a stage cut into ranges of its tasks.
+
+    Args:
+        stage: what is launched.
+        cells: what a task costs, in cells of a usual pass.
+        ordered: whether tasks write what others read or write: then it is not cut.
+        sized: address of the number of tasks in each run; 0: it is the stage's.
+    """
+    each, threads = stage.tasks, 1 if ordered else get_threads()
+    if sized:
+        return Operation(
+            TASKS,
+            [stage],
+            PIECES * threads if threads > 1 else 1,
+            -(-CELLS // max(cells, 1)),
+            stage.tasks,
+            sized=sized,
+        )
+    if threads > 1:
+        count = max(min(PIECES * threads, stage.tasks * cells // CELLS), 1)
+        # as many for each thread: 5 equal pieces take two threads as long as 6
+        count -= count % threads if count > threads else 0
+        each = -(-stage.tasks // count)
+    return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
+
+
+def copied(to: int, source: int, size: int, kept: Any) -> Operation:
+    """Return the copy of some bytes as an operation.
+
+    Args:
+        to: address.
+        source: address; 0: zeros.
+        size: bytes.
+        kept: what must live as long.
+    """
+    stage = object.__new__(OperationKind)
+    stage.kept, stage.tasks, stage.planes, stage.patches = kept, 1, 1, ()
+    stage.words = source, 0, to, size, 1, 1, 0, 1, 0, 0
+    each = max(size if get_threads() == 1 else -(-size // get_threads() // 64) * 64, COPIED)
+    return Operation(COPY, [stage], max(-(-size // each), 1), each, size)
+
+
+class OperationTable:
+    """Operations one after another, as C works through them.
+
+    Attributes:
+        checks: raise what has failed, after all of it.
+
+    Args:
+        operations: in order.
+        again: number on the host, shape (1,), wp.int32, that operations write: the table is run
+            until it is 0. None: once.
+    """
+
+    def __init__(self, operations: Iterable[Operation], again: wp.array[Any] | None = None) -> None:
+        self._kept = tuple(operations)
+        self.checks = {operation.check for operation in self._kept} - {None}
+        lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
+        # what is left, and the cuts
+        sizes = [
+            LANE_WORDS * n + operation.chunks
+            for n, operation in zip(lanes, self._kept, strict=True)
+        ]
+        at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
+        self.words = array("Q", bytes(8 * (at + sum(sizes))))
+        self.address = self.words.buffer_info()[0]
+        total, made = 0, []
+        for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
+            total += operation.chunks
+            places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
+            made += [total, *operation.words, count, *places, operation.sized, operation.condition]
+            at += size
+        # of the same length, so it stays where it is
+        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)
+        self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = (
+            len(self._kept),
+            total,
+            self.address + 8 * TABLE_WORDS,
+        )
+        self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
+        self.cut = total > len(self._kept)
+        self.asked: Arguments | None = None  # of the last team of one thread
+
+
+class ThreadPool:
+    """Threads that help the caller; the bits are those of one.
+
+    Args:
+        size: threads, the caller among them.
+        entry: of `team_kernel`.
+    """
+
+    def __init__(self, size: int, entry: TableEntry) -> None:
+        self.size, self._entry = size, entry
+        self._function, self._bounds = entry.function, ctypes.c_void_p(entry.bounds)
+        self.words = (ctypes.c_uint64 * (THREADS + 8 * size))()
+        self.address = ctypes.addressof(self.words)
+        for i, function in enumerate(_system()):
+            self.words[CALLS + i] = function
+        for name, word in MADE.items() if _system() else ():
+            getattr(ctypes.CDLL(None), name)(ctypes.c_void_p(self.address + 8 * word), None)
+        self.words[IDLE_SPINS] = SPINS[size > available_threads()]
+        self._lock, self._inside = threading.Lock(), 0
+        self._posted, self._retired = None, []
+        self.shared_time = 0.0  # seconds that callers have spent in what the team shared
+        self._workers = [
+            threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)
+        ]
+        for worker in self._workers:
+            worker.start()
+
+    def run(self, table: OperationTable) -> None:
+        """Work through a table: with the others if nobody else uses them."""
+        if self.size == 1 and table.again is None:
+            self._run_alone(table)
+            return
+        with self._lock:
+            self._inside += 1
+            share = SHARED if table.cut and self.size > 1 and self._inside == 1 else DONE_ALONE
+            if share and self._posted is not table.words:
+                self._retire(table.words)
+        table.words[SHARED_TIME] = 0
+        asked = Arguments(self.address, table.address, RUN, 0, share, patience(table))
+        try:
+            self._do(asked)
+            while unfinished := table.words[UNFINISHED]:  # the interpreter has looked after signals
+                if table.again is not None:
+                    check_time()
+                    for check in table.checks:  # what has failed may keep the loop from ending
+                        check()
+                asked.share = share + (RESUMED if unfinished == WITHIN else 0)
+                asked.limit = patience(table)
+                self._do(asked)
+        except BaseException:
+            self._do(Arguments(self.address, table.address, CANCEL))
+            raise
+        finally:
+            with self._lock:
+                self._inside -= 1
+        if share:
+            self.shared_time += table.words[SHARED_TIME] * 1e-9
+        for check in table.checks:
+            check()
+
+    def _run_alone(self, table: OperationTable) -> None:
+        """Work through a table with the caller's thread."""
+        asked = table.asked
+        if asked is None or asked.team != self.address:  # of another team, which is gone
+            asked = table.asked = Arguments(
+                self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE
+            )
+        try:
+            self._do(asked)
+            while table.words[UNFINISHED]:  # the interpreter has looked after signals
+                self._do(Arguments(self.address, table.address, RUN, 0, RESUMED, PATIENCE))
+        except BaseException:
+            self._do(Arguments(self.address, table.address, CANCEL))
+            raise
+        for check in table.checks:
+            check()
+
+    def stop(self) -> None:
+        """Send the others home; what is called later is done by the caller."""
+        self._do(Arguments(self.address, 0, QUIT))
+        for worker in self._workers:
+            worker.join()
+        self.size = 1
+
+    def _retire(self, words: Any) -> None:
+        """Keep the words before as long as a thread that came late may read them: what they tell of is done, and may go."""
+        seen = {self.words[THREADS + 8 * me] for me in range(1, self.size)}
+        self._retired = [old for old in self._retired if old.buffer_info()[0] in seen]
+        if self._posted is not None:
+            self._retired.append(self._posted)
+        self._posted = words
+
+    def _serve(self, me: int) -> None:
+        self._do(Arguments(self.address, 0, SERVE, me))
+
+    def _do(self, asked: Arguments) -> None:
+        self._function(self._bounds, ctypes.byref(asked))
+
+
+def patience(table: OperationTable) -> int:
+    """Return after how many nanoseconds the interpreter looks after signals, and after the deadline of a loop."""
+    return PATIENCE if table.again is None else int(min(PATIENCE, 1e9 * seconds_left()))
+
+
+def arguments_of(launch: Any) -> Any:
+    """Return the memory of a recorded launch's arguments, as C has them."""
+    params = launch.params[1:]
+    return _arguments(*map(type, params))(*params)
+
+
+@functools.cache
+def _arguments(*types: Any) -> Any:
+    return type(
+        "LaunchArguments",
+        (ctypes.Structure,),
+        {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]},
+    )
+
+
+ALIGNED = {1: "B", 2: "H", 4: "I", 8: "Q"}  # formats of `struct` by their alignment
+
+
+class Signature:
+    """Types of a Warp kernel's arguments: packs them as C has them, in a tenth of the time that Warp takes to record a launch.
+
+    Attributes:
+        entries: by launch dimensions: the kernel as C calls it, and the struct of its arguments.
+
+    Args:
+        kernel: with arrays, vectors, structs, and numbers of `FORMATS`; others are left to Warp.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self.entries: dict[Any, tuple[TableEntry, Any]] = {}
+        self._kinds = [argument.type for argument in kernel.adj.args]
+        formats = [] if kernel.is_generic else [_format(kind) for kind in self._kinds]
+        self._packing = struct.Struct("".join(formats) + "0Q") if formats and all(formats) else None
+        structs = [kind for kind in self._kinds if isinstance(getattr(kind, "ctype", None), type)]
+        self._structs = {kind: type(kind()) for kind in structs} if self._packing else {}
+
+    def check(self, inputs: Sequence[Any], memory: Any) -> None:
+        """Leave all to Warp from now on if it has packed arguments in another way."""
+        mine = self.pack(inputs)
+        if mine is not None and mine[: ctypes.sizeof(memory)] != bytes(memory):
+            self._packing = None
+
+    def pack(self, inputs: Sequence[Any]) -> bytes | None:
+        """Return arguments as C has them; None where Warp should convert or refuse one."""
+        if self._packing is None:
+            return None
+        values = []
+        for kind, value in zip(self._kinds, inputs, strict=False):
+            if kind in FORMATS:
+                plain = type(value) in (int, float, bool)
+            elif type(value) is wp.array:
+                plain = (
+                    isinstance(kind, wp.array)
+                    and value.dtype is kind.dtype
+                    and value.ndim == kind.ndim
+                    and value.device.is_cpu
+                )
+                value = bytes(value.__ctype__())
+            elif kind in self._structs:
+                plain = type(value) is self._structs[kind]
+                value = bytes(value.__ctype__()) if plain else b""
+            else:
+                plain = type(value) is kind
+                value = bytes(value) if plain else b""
+            if not plain:
+                return None
+            values.append(value)
+        try:
+            return self._packing.pack(*values)
+        except (struct.error, OverflowError):
+            return None
+
+
+def _format(kind: Any) -> str:
+    """Return how `struct` packs an argument of a type, aligned as in C; "" for one that it does not."""
+    if kind in FORMATS:
+        return FORMATS[kind]
+    if isinstance(kind, wp.array):
+        return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
+    if isinstance(getattr(kind, "ctype", None), type):  # a struct
+        return f"0{ALIGNED[ctypes.alignment(kind.ctype)]}{ctypes.sizeof(kind.ctype)}s"
+    # a vector's or a matrix's numbers
+    of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None
+    of = getattr(of, "_type_", "")
+    return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
+
+
+@functools.lru_cache(maxsize=256)
+def signature_of(kernel: Any) -> Signature:
+    """Return the types of a kernel's arguments, and its entries."""
+    return Signature(kernel)
+
+
+def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, bytes, Any]:
+    """Return a Warp kernel on the CPU as C calls it, its arguments, and the struct of them."""
+    signature = signature_of(kernel)
+    if (known := signature.entries.get(dim)) is not None and (
+        arguments := signature.pack(inputs)
+    ) is not None:
+        return known[0], arguments, known[1]
+    launch = wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
+    memory = arguments_of(launch)
+    signature.check(inputs, memory)
+    if len(signature.entries) >= MOST_ENTRIES:
+        signature.entries.clear()
+    signature.entries[dim] = made = TableEntry(launch), type(memory)
+    return made[0], bytes(memory), made[1]
+
+
+def launched_alone(launch: Any, kept: Any = None) -> Operation:
+    """Return a recorded launch as an operation that is not cut; `kept` must live as long."""
+    return Operation(
+        ALONE, [OperationKind(TableEntry(launch), bytes(arguments_of(launch)), (launch, kept))]
+    )
+
+
+@functools.cache
+def _system() -> list[int]:
+    """Return the addresses of what the team needs of the system, and the number of its clock; [] where there is no such thing."""
+    try:
+        library = ctypes.CDLL(None)
+        addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM]
+        return [*addresses, getattr(time, "CLOCK_MONOTONIC", 1)]
+    except (OSError, TypeError, AttributeError):
+        return []
+
+
+@forward_kernel(module="warp_lcp.team")
+def trial_kernel(a: wp.array(dtype=wp.float32), first: int, value: float):
+    """a[first + i] = value + i."""
+    i = wp.tid()
+    a[first + i] = value + float(i)
+
+
+@functools.cache
+def _entry() -> TableEntry | None:
+    """Return the executor, tried on a launch whose result is known; None, with a notice, where this Warp's launches are not as expected."""
+    try:
+        made = TableEntry(
+            wp.launch(team_kernel, 1, [0, 0, 0, 0, 0, 0], device="cpu", record_cmd=True)
+        )
+        a = wp.zeros(8, dtype=wp.float32, device="cpu")
+        launch = wp.launch(trial_kernel, 5, [a, 2, 3.0], device="cpu", record_cmd=True)
+        ThreadPool(1, made).run(OperationTable([launched_alone(launch)]))
+        if a.numpy().tolist() != [0, 0, 3, 4, 5, 6, 7, 0]:
+            raise RuntimeError("a test launch gave a wrong result")
+    except Exception as error:
+        warnings.warn(
+            f"one CPU thread: Warp {wp.__version__} records launches in an unknown format "
+            f"({error})",
+            stacklevel=2,
+        )
+        return None
+    return made
+
+
+def available_threads() -> int:
+    """Return the cores that this process may use, shared among the ranks on this machine."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    ranks = next((int(os.environ[name]) for name in RANKS if os.environ.get(name, "").isdigit()), 1)
+    return min(max(cores // max(ranks, 1), 1), MOST_THREADS)
+
+
+def _asked_threads() -> int:
+    value = os.environ.get(VARIABLE, "")
+    if not value:
+        return available_threads()
+    return _checked(value, VARIABLE)
+
+
+def _checked(value: Any, name: str) -> int:
+    try:
+        count = int(value)
+    except (TypeError, ValueError):
+        count = 0
+    if not 1 <= count <= MOST_THREADS or isinstance(value, float):
+        raise ValueError(
+            f"{name}: {value!r}: expected a number of threads from 1 to {MOST_THREADS}"
+        )
+    return count
+
+
+class State:
+    """How many threads there are to be, and the team once it is needed."""
+
+    def __init__(self) -> None:
+        self.threads: int | None = None
+        self.team: ThreadPool | None = None
+        self.lock = threading.Lock()
+
+
+STATE = State()
+
+
+def get_threads() -> int:
+    """Return the number of threads on the CPU.
+
+    The number of `set_threads`, else WARP_LCP_THREADS, else the number of cores.
+
+    Raises:
+        ValueError: WARP_LCP_THREADS is no such number.
+    """
+    if STATE.threads is None:
+        STATE.threads = _asked_threads()
+    return STATE.threads if _system() else 1
+
+
+def set_threads(count: int | None) -> None:
+    """Set the number of threads on the CPU.
+
+    Results have the same bits for any number.
+
+    Args:
+        count: from 1 to 1024; None: as many as at the start.
+
+    Raises:
+        ValueError: it is no such number.
+    """
+    asked = _asked_threads() if count is None else _checked(count, "count")
+    with STATE.lock:
+        if asked != STATE.threads:
+            STATE.threads, old, STATE.team = asked, STATE.team, None
+            if old is not None:
+                old.stop()
+
+
+def team() -> ThreadPool | None:
+    """Return the team, made at its first use; None where launches must go through Warp."""
+    if STATE.team is None:
+        entry = _entry()
+        if entry is None:
+            return None
+        with STATE.lock:
+            if STATE.team is None:
+                STATE.team = ThreadPool(get_threads(), entry)
+    return STATE.team
+
+
+def shared_seconds() -> float:
+    """Return how long callers have worked together with the rest of the team, since it was made."""
+    return 0.0 if STATE.team is None else STATE.team.shared_time
+
+
+def _forget() -> None:
+    """Have no team in a forked child: its threads are the parent's."""
+    STATE.team, STATE.lock = None, threading.Lock()
+
+
+def _leave() -> None:
+    """Send the threads home before the interpreter goes."""
+    if STATE.team is not None:
+        STATE.team.stop()
+
+
+atexit.register(_leave)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)

@@ -1,0 +1,485 @@
+"""Flat fields: conversions, inner products, deterministic sums. The only vector primitives that the solvers use.
+
+Every operator stores its fields as flat arrays (see `warp_lcp.kernels.fields`), so that these serve
+all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, no_type_check
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.kernels import Rows, StencilKernel
+from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.kernel_file import KernelFile
+from warp_lcp.kernels.launch_graph import Launch, Task, as_one_table, copy, is_recording, launch_now
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.native import HEADERS, text
+from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.thread_pool import Operation
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+CUDA_BLOCK = 256  # threads that add up partial sums
+CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
+KERNELS = KernelFile(Path(__file__).parent / "headers/vectors.h")
+DOT = KERNELS["vectors.dot"]
+ADD = KERNELS["vectors.add"]
+ADD_UP = KERNELS["vectors.add_up"]
+CONVERT = KERNELS["vectors.convert"]
+
+
+@wp.func_native("\n".join(["", text(HEADERS / "native.h"), text(KERNELS.path, "add_up"), ""]))
+def add_up_span(
+    partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int
+) -> wp.float64:
+    """The sum of every stride-th of the partial sums from `offset` + `start` on."""
+
+
+@no_type_check
+@forward_kernel(module="warp_lcp.vectors")
+def add_up_kernel(
+    partials: wp.array(dtype=wp.float64),
+    before: int,
+    n: int,
+    threads: int,
+    segments: int,
+    out: wp.array(dtype=wp.float64),
+    slot: int,
+):
+    """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
+
+    Columns are counted from the one after `before` others.
+
+    The order of the additions does not change from run to run.
+    """
+    t = wp.tid()
+    block = t // threads
+    column = block // segments
+    segment = block - column * segments
+    s = add_up_span(
+        partials,
+        (before + column) * n,
+        segment * threads + t - block * threads,
+        n,
+        threads * segments,
+    )
+    total = wp.tile_sum(wp.tile(s))
+    if t == block * threads:
+        out[slot + block] = total[0]
+
+
+@no_type_check
+@forward_kernel(module="warp_lcp.vectors")
+def largest_kernel(
+    partials: wp.array(dtype=wp.float64),
+    before: int,
+    n: int,
+    threads: int,
+    segments: int,
+    out: wp.array(dtype=wp.float64),
+    slot: int,
+):
+    """The same for the largest of them."""
+    t = wp.tid()
+    block = t // threads
+    column = block // segments
+    segment = block - column * segments
+    most = -wp.float64(wp.inf)
+    for i in range(segment * threads + t - block * threads, n, threads * segments):
+        most = wp.max(most, partials[(before + column) * n + i])
+    total = wp.tile_max(wp.tile(most))
+    if t == block * threads:
+        out[slot + block] = total[0]
+
+
+class Communicator(Protocol):
+    """Who else has a part of the unknowns: the ranks of a distributed problem. All methods are collective, with one answer for all."""
+
+    def sum(self, values: Any) -> Any:
+        """Return sums over all parts, entry by entry."""
+
+    def adding(self, sums: np.ndarray) -> Operation:
+        """Return what replaces float64 sums by those over all parts, in place, as an operation of the team."""
+
+    def max(self, values: Any) -> Any:
+        """Return the largest over all parts, entry by entry."""
+
+    def any(self, condition: bool) -> bool:
+        """Return whether it holds in some part."""
+
+    def join(self, key: bytes) -> bytes:
+        """Return a key that stands for the keys of all parts."""
+
+
+def segments_of(n: int) -> int:
+    """Return how many blocks of a GPU add up a column first: one would take long over very many partial sums."""
+    return CUDA_SEGMENTS if n > CUDA_SEGMENTS * CUDA_BLOCK else 1
+
+
+def fold(
+    kernel: wp.Kernel,
+    partials: wp.array[wp.float64],
+    n: Any,
+    columns: int,
+    out: wp.array[wp.float64],
+    slot: int,
+    between: wp.array[wp.float64],
+    launch: Launch = launch_now,
+    most: int | None = None,
+    before: int = 0,
+) -> None:
+    """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
+
+    Args:
+        kernel: one of the two.
+        partials: of one column after another.
+        n: of each.
+        columns: how many.
+        out: receives a number a column.
+        slot: of the first.
+        between: memory of columns * segments_of(n) numbers, where these are more than the columns.
+        launch: of a program.
+        most: of n, where that is a `Scalar`.
+        before: columns before the first that is taken.
+    """
+    device, segments = partials.device, segments_of(n if most is None else most)
+    launch = launch_recorded if is_recording() and not hasattr(launch, "__self__") else launch
+    if segments > 1:
+        blocks = columns * segments * CUDA_BLOCK
+        launch(
+            kernel,
+            blocks,
+            [partials, before, n, CUDA_BLOCK, segments, between, 0],
+            device=device,
+            block_dim=CUDA_BLOCK,
+        )
+        partials, before, n = between, 0, segments
+    launch(
+        kernel,
+        columns * CUDA_BLOCK,
+        [partials, before, n, CUDA_BLOCK, 1, out, slot],
+        device=device,
+        block_dim=CUDA_BLOCK,
+    )
+
+
+class Reduction:
+    """Sums over flat fields of n elements; the same bits on every run.
+
+    Args:
+        n: elements of a field.
+        device: where they live.
+        scalars: device array that receives the sums, shape (slots,), float64.
+        columns: the most sums that one pass makes.
+        threads: threads of that pass; those of a flat kernel unless given.
+        across: who has the other parts of the fields; None: nobody.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        device: wp.Device,
+        scalars: wp.array[wp.float64],
+        *,
+        columns: int = 1,
+        threads: int | None = None,
+        across: Communicator | None = None,
+    ) -> None:
+        self.scalars, self.columns, self._across = scalars, columns, across
+        self.threads = threads or Rows.flat(n, device).places
+        self.partials = zeros(columns * self.threads, wp.float64, device)
+        self._folded = zeros(
+            columns * segments_of(self.threads) if device.is_cuda else 0, wp.float64, device
+        )
+
+    def add_up(self, slot: int, columns: int = 1, *, launch: Launch = launch_now) -> None:
+        """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
+        device = self.partials.device
+        if device.is_cpu:  # Warp's tiles are not for several threads at a time
+            rows = Rows.flat(columns, device)
+            ADD_UP.bind(
+                rows, partials=self.partials, count=self.threads, scalars=self.scalars, slot=slot
+            ).launch(launch)
+        else:
+            fold(
+                add_up_kernel,
+                self.partials,
+                self.threads,
+                columns,
+                self.scalars,
+                slot,
+                self._folded,
+                launch,
+            )
+        if self._across is not None:
+            add_across(self._across, self.scalars, slice(slot, slot + columns), launch)
+
+    def dot(
+        self,
+        a: wp.array[Any],
+        b: wp.array[Any],
+        slot: int,
+        *,
+        rows: Rows | None = None,
+        launch: Launch = launch_now,
+    ) -> None:
+        """Write the inner product a.b, over some rows if told, to scalars[slot]."""
+        DOT.bind(rows or rows_of(a), a=a, b=b, out=self.partials).launch(launch)
+        self.add_up(slot, launch=launch)
+
+
+class Sums(Reduction):
+    """Sums that passes over the same rows make, read back by the host.
+
+    Args:
+        rows: of the passes.
+        columns: the most sums that one of them makes.
+        slots: of `scalars`, if more than that.
+        across: who has the other parts of the fields; None: nobody.
+    """
+
+    def __init__(
+        self, rows: Rows, columns: int = 1, *, slots: int = 0, across: Communicator | None = None
+    ) -> None:
+        self.rows, self.reading = rows, DeviceScalar(rows.device, max(columns, slots))
+        super().__init__(
+            rows.size,
+            rows.device,
+            self.reading.array,
+            columns=columns,
+            threads=rows.places,
+            across=across,
+        )
+
+    def of(
+        self, declared: StencilKernel, *structs: DataclassInstance, slot: int = 0, **given: Any
+    ) -> np.ndarray:
+        """Launch a pass, bound as by `StencilKernel.bind`; return its sums, which are in `scalars` from a slot on."""
+        with as_one_table(self.rows.device, self._across):
+            self._launch(declared, structs, given, slot, wp.launch)
+        return self.reading.numpy()[slot : slot + len(declared.sums)]
+
+    def launch(
+        self,
+        declared: StencilKernel,
+        *structs: DataclassInstance,
+        slot: int = 0,
+        launch: Launch = launch_now,
+        **given: Any,
+    ) -> None:
+        """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
+        self._launch(declared, structs, given, slot, launch)
+
+    def _launch(
+        self,
+        declared: StencilKernel,
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, Any],
+        slot: int,
+        launch: Launch,
+    ) -> None:
+        stencil, bounds = given.pop("stencil", None), given.pop("bounds", None)
+        given["out"] = self.partials
+        declared.bind_arguments(self.rows, structs, given, stencil, bounds).launch(launch)
+        self.add_up(slot, columns=len(declared.sums), launch=launch)
+        self.reading.changed()
+
+
+class Tally:
+    """What a pass finds in the rows that it is given each time: sums, and the largest of something; the same bits on every run.
+
+    Args:
+        declared: the pass.
+        device: where.
+        places: of the most rows that it is given, else memory is made when they come.
+    """
+
+    def __init__(self, declared: StencilKernel, device: wp.Device, places: int = 0) -> None:
+        self._declared, self._columns = declared, len(declared.found)
+        self._reading = DeviceScalar(device, self._columns) if device.is_cuda else None
+        self._partials = wp.empty(self._columns * places, dtype=wp.float64, device=device)
+        self._between = wp.empty(
+            self._columns * CUDA_SEGMENTS if device.is_cuda else 0, dtype=wp.float64, device=device
+        )
+        self._places = 0
+
+    @property
+    def found(self) -> wp.array[Any] | None:
+        """What is found, a number a column, where it is on a GPU; None on the CPU."""
+        return None if self._reading is None else self._reading.array
+
+    def take(
+        self,
+        rows: Rows,
+        *structs: DataclassInstance,
+        stencil: Any = None,
+        bounds: list[Any] | None = None,
+        **given: Any,
+    ) -> None:
+        """Launch the pass, bound as by `StencilKernel.bind`, over rows; what it finds replaces what was found."""
+        self.launch(rows, structs, given, stencil, bounds)
+
+    def launch(
+        self,
+        rows: Rows,
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, Any],
+        stencil: Any = None,
+        bounds: list[Any] | None = None,
+    ) -> None:
+        """Do what `take` does, with arguments as of `StencilKernel.bind_arguments`."""
+        self._places, device = rows.places, rows.device
+        if is_recording() and device.is_cuda:
+            self._record(rows, structs, given, stencil, bounds)
+            return
+        if self._partials.size < self._columns * self._places:
+            self._partials = wp.empty(self._columns * self._places, dtype=wp.float64, device=device)
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
+        if self._reading is None:
+            return
+        sums, largest = len(self._declared.sums), len(self._declared.largest)
+        if not self._places:
+            self._reading.array.zero_()
+        elif sums:
+            fold(
+                add_up_kernel,
+                self._partials,
+                self._places,
+                sums,
+                self._reading.array,
+                0,
+                self._between,
+            )
+        if self._places and largest:
+            fold(
+                largest_kernel,
+                self._partials,
+                self._places,
+                largest,
+                self._reading.array,
+                sums,
+                self._between,
+                before=sums,
+            )
+        self._reading.changed()
+
+    def _record(
+        self,
+        rows: Rows,
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, Any],
+        stencil: Any,
+        bounds: Any,
+    ) -> None:
+        """Record the pass on CUDA, for as many places as the rows have in a run."""
+        assert self._reading is not None
+        memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
+        most = self._places if memory is None else math.prod(memory.room)
+        places = self._places if memory is None else memory.places
+        if self._partials.size < self._columns * most:
+            self._partials = wp.empty(self._columns * most, dtype=wp.float64, device=rows.device)
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
+        for kernel, count, before in ((add_up_kernel, sums, 0), (largest_kernel, largest, sums)):
+            if count:
+                fold(
+                    kernel,
+                    self._partials,
+                    places,
+                    count,
+                    self._reading.array,
+                    before,
+                    self._between,
+                    most=most,
+                    before=before,
+                )
+
+    def changed(self) -> None:
+        """Say that a recorded `take` has run."""
+        if self._reading is not None:
+            self._reading.changed()
+
+    def read(self, arrange: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
+        """Return what was found, a number a column.
+
+        Args:
+            arrange: gives what threads have found, shape (columns, threads), the shape in which the
+                host adds it up, columns first.
+        """
+        if self._reading is not None:
+            return self._reading.numpy()
+        parts = arrange(
+            self._partials.numpy()[: self._columns * self._places].reshape(
+                self._columns, self._places
+            )
+        )
+        sums = len(self._declared.sums)
+        return np.array(
+            [part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)]
+        )
+
+
+def add_across(
+    across: Communicator,
+    scalars: wp.array[wp.float64],
+    slots: slice,
+    launch: Launch = launch_now,
+    condition: wp.array[wp.int32] | None = None,
+) -> None:
+    """Add what the others have summed, now or among the launches of a program.
+
+    Args:
+        across: the others.
+        scalars: sums of this process, which are replaced.
+        slots: of them, those that are added up.
+        launch: of a program.
+        condition: number, shape (1,), the same in all processes; where it is 0 nothing is done.
+            None: always.
+    """
+
+    def operation() -> Operation:
+        adding = across.adding(scalars.numpy()[slots])
+        return adding if condition is None else adding.only_if(condition)
+
+    Task(
+        partial(_add_across, across, scalars, slots, condition),
+        operation if scalars.device.is_cpu else None,
+    ).launch(launch)
+
+
+def _add_across(
+    across: Communicator,
+    scalars: wp.array[wp.float64],
+    slots: slice,
+    condition: wp.array[wp.int32] | None,
+) -> None:
+    if condition is not None and not condition.numpy()[0]:
+        return
+    if scalars.device.is_cpu:
+        sums = scalars.numpy()[slots]
+        sums[...] = across.sum(sums)
+    else:
+        scalars[slots].assign(across.sum(scalars[slots].numpy()))
+
+
+def rows_of(field: wp.array[Any]) -> Rows:
+    """Return the rows of passes over flat fields like this one."""
+    return Rows.flat(field.size, field.device)
+
+
+def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    """b = a, between float types; types that differ may be recorded by `launch`."""
+    if a.dtype is b.dtype:
+        copy(b, a)
+    else:
+        CONVERT.bind(rows_of(a), a=a, b=b).launch(launch)

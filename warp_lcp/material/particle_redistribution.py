@@ -1,0 +1,200 @@
+"""What moves particles apart from the flow: they are evened out where a scene asks for it, and moved apart where they crowd."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.level_set import Fill
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.density_correction import DensityCorrection
+from warp_lcp.material.particle_assembly import (
+    make_density_correction,
+    make_density_monitor,
+    make_reseeding,
+)
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.simulation import Stopwatch
+
+CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
+STATE = "density_correction"
+PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes out what crowds
+
+
+class ParticleRedistribution:
+    """Particle redistribution: density correction and reseeding, when they are due.
+
+    Without the table [density_correction] a correction acts in steps that begin with more than the
+    fraction `ParticleScene.most_crowded` of the material in excess of what cells may hold. It
+    removes the excess over a time `PACE` sqrt(dx / g), so that a short step lifts little material.
+    The density is that at the start of the step, which the liquid's surface and the sand's packing
+    have computed already: whether a step acts depends on the particles' positions only, so that a
+    checkpoint needs no more state. The fields of the correction are allocated when it first acts.
+
+    Args:
+        scene: what asks for it.
+        grid: its grid.
+        boundary: its solids.
+
+    Attributes:
+        reseeding: the reseeding; None: the scene does not ask for it.
+        density_monitor: decides when to correct; None: the scene decides, or there is no
+            correction.
+        correction: the density correction; None: it has not acted yet, or never does.
+        moved: whether the last `apply` may have moved particles.
+    """
+
+    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> None:
+        """Make what the scene asks for."""
+        self._scene, self._grid, self._boundary = scene, grid, boundary
+        self.reseeding = make_reseeding(scene, grid, boundary)
+        self.density_monitor = make_density_monitor(scene, grid, boundary)
+        self.correction: DensityCorrection | None = None
+        settings = scene.correction
+        self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
+        if scene.density_correction is not None and settings is not None:
+            self.correction = self._made()
+        g = math.hypot(*scene.physics.gravity)
+        self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
+        self.moved = False
+        # whether a step has measured the density_monitor, and which one has been looked at
+        self._looked, self._step = False, -1
+
+    def look(
+        self, step: int, density: wp.array | None, particles: Particles, window: Window
+    ) -> None:
+        """Measure the density_monitor at the start of a step, before anything moves, if that is what decides.
+
+        Args:
+            step: its number.
+            density: of the particles, in units of that at rest, float32; None: nobody has found it
+                yet.
+            particles: the material.
+            window: cells that hold all of it, with two to spare on each side.
+        """
+        if self._step == step:
+            return
+        self._step = step
+        self._looked = self.density_monitor is not None and step % self._every == 0
+        if self.density_monitor is not None and self._looked:
+            self.density_monitor.measure(density, particles, window)
+
+    def has_looked(self, step: int) -> bool:
+        """Return whether `look` has been called in a step."""
+        return self._step == step
+
+    @property
+    def max_density(self) -> float | None:
+        """Return the largest density at the start of the step, if it was measured."""
+        return (
+            self.density_monitor.found()[1]
+            if self.density_monitor is not None and self._looked
+            else None
+        )
+
+    def due(self, step: int) -> bool:
+        """Return whether a step moves anything."""
+        return self._evens(step) or self._parts(step)
+
+    def corrects_alone(self, step: int) -> bool:
+        """Return whether a step's only rearrangement is a density correction."""
+        return not self._evens(step) and self._parts(step)
+
+    def apply(
+        self,
+        particles: Particles,
+        window: Window,
+        step: int,
+        dt: float,
+        watch: Stopwatch,
+        fill: Fill | None,
+        contact: wp.array | None,
+    ) -> dict[str, float | int | str]:
+        """Even out the particles and move them apart, if it is time.
+
+        Args:
+            particles: the material (moved).
+            window: cells that hold all particles, with two to spare on each side.
+            step: its number.
+            dt: its length [s].
+            watch: what the stages are measured with.
+            fill: adds to the density in a window what no particle stands for.
+            contact: uint8, RELEASED where walls have let go in the step; None: it is not known.
+
+        Returns:
+            What the log says of it.
+        """
+        row: dict[str, float | int | str] = {}
+        self.moved = self._evens(step)
+        if self.reseeding is not None and self.moved:
+            with watch.stage("reseeding", *particles.arrays().values()):
+                row["reseeded"] = self.reseeding.apply(particles, window, step)
+        if self._parts(step):
+            correction = self.correction = self.correction or self._made()
+            with watch.stage(
+                "density correction",
+                particles.position,
+                correction.density,
+                correction.x,
+                *correction.displacement,
+            ):
+                done = correction.apply(
+                    particles, window, fill=fill, contact=contact, share=self._share(dt)
+                )
+            self.moved = self.moved or done.result is not None
+            row["density_status"] = (
+                done.result.status.name if done.result is not None else "NOTHING_TO_DO"
+            )
+            row["density_iterations"] = done.result.iterations if done.result is not None else 0
+            row["max_density"] = done.max_density
+        return row
+
+    def _evens(self, step: int) -> bool:
+        return self.reseeding is not None and step % self.reseeding.every == 0
+
+    def _parts(self, step: int) -> bool:
+        if self.density_monitor is not None:
+            return self._looked and self.density_monitor.found()[0] > self._most
+        return self.correction is not None and step % self.correction.every == 0
+
+    def _share(self, dt: float) -> float:
+        """Return how much of what crowds a step moves apart: all where the scene says when, else at a rate that knows of no steps."""
+        return (
+            min(1.0, dt / self._pace)
+            if self.density_monitor is not None and self._pace > 0.0
+            else 1.0
+        )
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns that `apply` fills."""
+        evens = ("reseeded",) if self.reseeding is not None else ()
+        return (*evens, *CORRECTION_COLUMNS) if self._scene.correction is not None else evens
+
+    def notes(self) -> list[str]:
+        """Return why nothing keeps the particles apart where the scene leaves that to the program."""
+        if self._scene.density_correction is not None or self.density_monitor is not None:
+            return []
+        none = "density correction is off: it is not available with periodic axes"
+        return [none] if self._scene.endless else []
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the solution that the next correction starts from, if there was one."""
+        return {} if self.correction is None else {STATE: self.correction.x.numpy().copy()}
+
+    def expect(self, state: Mapping[str, np.ndarray]) -> None:
+        """Get ready for a state of this scene, which may be from before or after the first correction."""
+        if self.density_monitor is not None:
+            self.correction = (self.correction or self._made()) if STATE in state else None
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from a checkpoint's `state`."""
+        if self.correction is not None:
+            self.correction.x.assign(state[STATE])
+
+    def _made(self) -> DensityCorrection:
+        return make_density_correction(self._scene, self._grid, self._boundary)

@@ -1,0 +1,176 @@
+"""Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.kernels import Rows
+from warp_lcp.multigrid.cycle import CycleStage
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.operators.sparse import GATHER
+
+Strength = list[float]  # mean weights along x, y and z, in units of the largest
+
+# ratios of weights that differ by this factor between places, or from the mean weights', ask for a
+# hierarchy of their own
+TURN = 10.0
+SHARE = 0.01  # of the sampled blocks that must do so
+LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
+# cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
+EDGES = {2: 8, 3: 4}
+# the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
+SAMPLES = {2: 24, 3: 8}
+
+
+class MultipleSemicoarsening(Hierarchy):
+    """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
+
+    Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong
+    axis differs from place to place no order of coarsening suits all of them. Each hierarchy deals
+    with the places that it suits, and each cycle starts from what the one before has left, so that
+    they share the finest level and need no residuals between them.
+
+    Args:
+        strengths: of each companion.
+    """
+
+    def __init__(
+        self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any
+    ) -> None:
+        settings = options.pop("settings", None) or CycleSettings()
+        # a launch of all levels starts from x = 0: the finest one stays out of it
+        fewer = math.prod(stencil.padding.counts) - 1
+        names = ("one_launch_cpu", "one_launch_cuda", "one_launch_cluster")
+        settings = replace(
+            settings, **{name: min(getattr(settings, name), fewer) for name in names}
+        )
+        super().__init__(stencil, real, **options, settings=settings)
+        # W-cycles save a step in ten and cost two to four times as much
+        options["settings"] = replace(settings, gamma=1)
+        self.companions = [
+            Hierarchy(stencil, real, **options, strength=strength, finest=self.finest)
+            for strength in strengths
+        ]
+        self._marks = wp.zeros_like(self.finest.changed)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the levels hold, the finest one once; shared weights not counted."""
+        return super().nbytes + sum(c.nbytes - self.finest.nbytes for c in self.companions)
+
+    def refresh(self) -> None:
+        """Take the operator's rows and weights again."""
+        super().refresh()
+        for companion in getattr(self, "companions", ()):
+            companion.refresh()
+
+    def rebuild_changed(self) -> None:
+        """Coarsen what the finest level's marked rows change; the last hierarchy clears the marks."""
+        wp.copy(self._marks, self.finest.changed)
+        for part in (self, *self.companions):
+            wp.copy(self.finest.changed, self._marks)
+            part.rebuilding.run()
+
+    def _last_leg(self) -> tuple[CycleStage, ...]:
+        """Return the stages of the last leg of a linear cycle."""
+        return self.companions[0]._last_leg()
+
+    def _stages(self, *, projected: bool) -> Iterator[CycleStage]:
+        """Yield a cycle on each hierarchy, the first from x = 0; linear ones forth and back, which is symmetric."""
+        parts = [*self.companions, self, *(() if projected else self.companions[::-1])]
+        for place, part in enumerate(parts):
+            yield from part.cycles[projected].stages(from_zero=place == 0)
+
+
+def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarchy:
+    """Return the hierarchy of a stencil; options as of `Hierarchy`."""
+    strengths = turns(stencil) if stencil.ghosts is None else []
+    return (
+        MultipleSemicoarsening(stencil, real, strengths, **options)
+        if strengths
+        else Hierarchy(stencil, real, **options)
+    )
+
+
+def turns(stencil: PaddedStencil) -> list[Strength]:
+    """Return the ways in which cells are coupled that the mean weights do not tell; none where the strong axes are the same everywhere.
+
+    Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor
+    surfaces and cut cells, which are few in a block, from equal ones; where a block's ratios of
+    weights along the axes differ from the median block's by `TURN`, the direction turns.
+    """
+    if stencil.weights is None or stencil.pattern is not None:
+        return []
+    logs = _sampled(stencil)
+    centered = logs - logs.mean(axis=1, keepdims=True)
+    if (
+        len(logs) == 0
+        or (_mismatch(centered, np.median(centered, axis=0)) > math.log(TURN)).mean() < SHARE
+    ):
+        return []
+    long = _long(stencil)
+    relative = logs - logs.max(axis=1, keepdims=True)
+    ways, way_of = np.unique(relative > -math.log(TURN), axis=0, return_inverse=True)
+    mean, found = np.log(np.maximum(np.array(stencil.mean_weights)[long], 1e-300)), []
+    for way in range(len(ways)):
+        members = relative[way_of == way]
+        if len(members) < SHARE * len(relative):
+            continue
+        typical = np.median(members, axis=0)
+        if _mismatch(typical[None], mean)[0] > math.log(TURN):
+            strength = np.full(3, LEAST)
+            strength[long] = np.exp(typical)
+            found.append(strength.tolist())
+    return found
+
+
+def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return by how much the ratios of rows of weights differ from others, as a logarithm."""
+    return np.ptp(logs - other, axis=1)
+
+
+def _long(stencil: PaddedStencil) -> list[int]:
+    """Return the axes of more than one cell, 0, 1, 2 = x, y, z."""
+    return [axis for axis, n in enumerate(reversed(stencil.padding.counts)) if n > 1]
+
+
+def _sampled(stencil: PaddedStencil) -> np.ndarray:
+    """Return the mean logarithms of the weights along the long axes, a row a block that has open faces along all of them."""
+    cells, long, device = stencil.padding.counts, _long(stencil), stencil.device
+    dimension = max(len(long), 2)
+    edges = [min(n, EDGES[dimension]) for n in cells]
+    blocks = [n // edge for n, edge in zip(cells, edges, strict=True)]
+    samples = [min(n, SAMPLES[dimension]) for n in blocks]
+    shape, sides = stencil.padding.shape, (math.prod(samples), math.prod(edges))
+    along = [
+        # samples are spread evenly over the blocks
+        (np.arange(m) * n // m * edge + 1)[:, None] + np.arange(edge)
+        for m, n, edge in zip(samples, blocks, edges, strict=True)
+    ]
+    places = np.ravel_multi_index(np.ix_(*(at.ravel() for at in along)), shape)
+    places = places.reshape(
+        [n for pair in zip(samples, edges, strict=True) for n in pair]
+    ).transpose(0, 2, 4, 1, 3, 5)
+    order = wp.array(places.ravel(), dtype=wp.int32, device=device)
+    assert stencil.weights is not None
+    # by block, axis, face
+    faces = np.stack([_gathered(w, order).reshape(sides) for w in stencil.weights], axis=1)
+    least = LEAST * faces.max(axis=(1, 2), keepdims=True)
+    totals = np.log(np.where(faces > 0, np.maximum(faces, least), 1.0)).sum(axis=2)
+    counts = np.count_nonzero(faces, axis=2)
+    counted = (2 * counts >= sides[1])[:, long].all(axis=1)  # few open faces tell nothing
+    return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
+
+
+def _gathered(weights: wp.array[Any], order: wp.array[Any]) -> np.ndarray:
+    taken = wp.empty(order.size, dtype=weights.dtype, device=order.device)
+    GATHER.bind(
+        Rows.flat(order.size, order.device), source=weights, order=order, taken=taken
+    ).launch()
+    return taken.numpy().astype(np.float64)
