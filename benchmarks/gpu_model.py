@@ -93,7 +93,7 @@ class Work:
             / 1e3
         )
 
-    def terms(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.Count]) -> dict[str, float]:
+    def terms(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]) -> dict[str, float]:
         """Return the time [ms] that each limit holds launches: that of a launch is the slowest one."""
         found = {
             "barriers": BARRIER * self.stages / 1e3,
@@ -110,7 +110,7 @@ class Work:
             found[limit] = found.get(limit, 0.0) + limits[limit]
         return found
 
-    def uncounted(self, counts: dict[str, gpu_counts.Count]) -> float:
+    def uncounted(self, counts: dict[str, gpu_counts.InstructionCount]) -> float:
         """Return the share of the bytes that passes move which have not been counted."""
         moved = [size for size, key in zip(self.bytes, self.keys, strict=True) if key not in counts]
         return sum(moved) / max(sum(self.bytes), 1.0)
@@ -324,7 +324,7 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
     return "\n".join(lines)
 
 
-def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.Count]) -> str:
+def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]) -> str:
     """Return a table of what holds solves on GPUs, from the work at n / 2 and at n and counted passes."""
     names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
     lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
@@ -343,7 +343,7 @@ def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.
     return "\n".join(lines)
 
 
-def counted(counts: dict[str, gpu_counts.Count]) -> Iterator[gpu_counts.Count]:
+def counted(counts: dict[str, gpu_counts.InstructionCount]) -> Iterator[gpu_counts.InstructionCount]:
     """Count passes, and note each by its key."""
     for one in gpu_counts.counts():
         counts[one.key] = one
@@ -383,7 +383,7 @@ def main() -> None:
             f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as "
             "predicted\n"
         )
-        counts = dict[str, gpu_counts.Count]()
+        counts = dict[str, gpu_counts.InstructionCount]()
         for line in gpu_counts.table(counted(counts), given.size):
             print(line, flush=True)
         if given.solves:

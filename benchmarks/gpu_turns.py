@@ -130,7 +130,7 @@ def worker(device: str, sizes: Sizes) -> None:
         print(f"\n{ANSWER}{json.dumps(found)}", flush=True)
 
 
-class Worker:
+class TreeWorker:
     """A process that does the work from a source tree.
 
     Args:
@@ -229,7 +229,7 @@ def run(given: argparse.Namespace) -> int:
     if given.base is not None:
         trees["other tree"] = given.base.resolve(), "1"
     workers = {
-        name: Worker(tree, quads, rehearse=given.rehearse, device=device)
+        name: TreeWorker(tree, quads, rehearse=given.rehearse, device=device)
         for name, (tree, quads) in trees.items()
     }
     turns = Turns(given.out, list(workers))
