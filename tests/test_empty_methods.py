@@ -17,7 +17,7 @@ ALLOWED = {
     "Scene": "a scene without particles, sides and joints; the models of its simulators have them",
     "ParticleScene": "what a material says of itself; sand says it all with constants",
     "Sweep": "what sweeps a method that moves x by itself: nothing",
-    "Program.fits": "a recording for a GPU has launch dimensions that may be too small",
+    "CommandBuffer.fits": "a recording for a GPU has launch dimensions that may be too small",
     "_Loop._merits": "merit functions are those of boxes",
     "_Shape.unit_length": "a mesh counts in units of its size",
 }

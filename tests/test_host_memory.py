@@ -11,12 +11,12 @@ import warp_lcp
 ROOT = Path(warp_lcp.__file__).parent
 VIEWS = ("reshape", "ravel", "view", "T")
 WRITES = {  # function: why it may
-    "rows/fields.py:copy": "sparse fields are the CPU's",
-    "rows/fields.py:unload": "sparse fields are the CPU's",
-    "rows/vectors.py:_add_across": "on the CPU only; assigned on CUDA",
+    "kernels/fields.py:copy": "sparse fields are the CPU's",
+    "kernels/fields.py:unload": "sparse fields are the CPU's",
+    "kernels/vectors.py:_add_across": "on the CPU only; assigned on CUDA",
     "solvers/staggering.py:accept": "assigned afterwards",
-    "reduced/multigrid_ahead.py:run": "on the CPU only, where the beginning is recorded",
-    "reduced/multigrid_residual.py:set": "on the CPU only; filled on CUDA",
+    "reduced/device_iteration.py:run": "on the CPU only, where the beginning is recorded",
+    "reduced/residual_and_active_set.py:set": "on the CPU only; filled on CUDA",
 }
 
 

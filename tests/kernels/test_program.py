@@ -55,7 +55,7 @@ def threads(request, monkeypatch):
     """Set the number of threads, and split small work too."""
     before = wl.get_threads()
     wl.set_threads(request.param)
-    for module in ("team", "wave", "program"):
+    for module in ("thread_pool", "fused_kernel", "launch_graph"):
         monkeypatch.setattr(f"warp_lcp.kernels.{module}.CELLS", 64)
     yield request.param
     wl.set_threads(before)

@@ -255,11 +255,11 @@ def test_an_interruption_is_heard_between_pieces():
         SOLVE
         + """
 import signal, threading
-from warp_lcp.kernels.launch_graph import Program
+from warp_lcp.kernels.launch_graph import CommandBuffer
 from warp_lcp.kernels.vectors import ADD, rows_of
 import warp as wp
 x, one = wp.zeros(1 << 22, dtype=wp.float32, device="cpu"), wp.full(1 << 22, 1.0, dtype=wp.float32, device="cpu")
-program = Program(x.device)
+program = CommandBuffer(x.device)
 for _ in range(100_000):
     ADD.bind(rows_of(x), z=one, x=x).launch(program.launch) if _ == 0 else program.record(program._commands[0])
 def interrupt():

@@ -97,8 +97,8 @@ if (last == nx && nx > 1) fill_one(nx - 1);
 //   box        float32 field, source
 SIMD for (int i = first; i < last; ++i) field[i] = source[i];
 
-// kernel warp_lcp.grid.window_reduction.add_rows: Add up what a pass has found in the rows of a window, a
-// column each; of the last columns the largest. The order is that of NumPy's pairwise summation:
+// kernel warp_lcp.grid.window_reduction.add_rows: Sums of what a pass has found in the rows of a
+// window, a column each; of the last columns the largest. The order is that of NumPy's pairwise summation:
 // 8 accumulators over up to 128 values, their sums added in pairs; of a box without whole planes,
 // rows that fit 8192 values one after another.
 //   compute    float64
