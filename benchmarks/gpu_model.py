@@ -93,7 +93,9 @@ class Work:
             / 1e3
         )
 
-    def terms(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]) -> dict[str, float]:
+    def terms(
+        self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]
+    ) -> dict[str, float]:
         """Return the time [ms] that each limit holds launches: that of a launch is the slowest one."""
         found = {
             "barriers": BARRIER * self.stages / 1e3,
@@ -324,7 +326,9 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
     return "\n".join(lines)
 
 
-def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]) -> str:
+def limits_table(
+    small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]
+) -> str:
     """Return a table of what holds solves on GPUs, from the work at n / 2 and at n and counted passes."""
     names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
     lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
@@ -343,7 +347,9 @@ def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.
     return "\n".join(lines)
 
 
-def counted(counts: dict[str, gpu_counts.InstructionCount]) -> Iterator[gpu_counts.InstructionCount]:
+def counted(
+    counts: dict[str, gpu_counts.InstructionCount],
+) -> Iterator[gpu_counts.InstructionCount]:
     """Count passes, and note each by its key."""
     for one in gpu_counts.counts():
         counts[one.key] = one
