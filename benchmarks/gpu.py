@@ -1,9 +1,10 @@
-"""A verdict on a GPU from one command, in the source tree: `python -m benchmarks.gpu`; one page is left in out/gpu.
+"""Check the library on a GPU and write a report: `python -m benchmarks.gpu`.
 
-What holds on the CPU must hold on the device: equal answers, of each kernel too, the same bits in
-every run, graphs as launches, odd grids, hundreds of steps, memory that stays. Then times, beside
-what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels reach. A claim
-that fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's
+Run it in the source tree; the report is one page in out/gpu. It checks on the device what holds on
+the CPU: equal answers, also of each kernel; the same bits in every run; graphs against single
+launches; odd grids; hundreds of steps; constant memory use. Then it measures times, compares them
+with the estimates of `benchmarks/gpu_model.py`, and reports the share of the memory bandwidth that
+kernels reach. Failed checks are reported as well. `--rehearse` does all of it on the CPU in CUDA's
 form (`benchmarks/emulated_cuda.py`).
 """
 
@@ -72,7 +73,11 @@ class GpuVerdict:
         self.steps = 10 if rehearsal else gpu_cases.STEPS
 
     def claim(self, name: str, found: Callable[[], str | None]) -> None:
-        """Try a claim: `found` returns what it saw, or raises AssertionError with what is wrong; None where it cannot be tried."""
+        """Run one check and record its outcome.
+
+        `found` returns the text to report. It raises AssertionError if the check fails, and returns
+        None if the check cannot be made.
+        """
         start = time.perf_counter()
         try:
             text, holds = found(), True
@@ -131,7 +136,10 @@ class GpuVerdict:
         return f"{len(found)} cases, at most {worst:.1g} of what is allowed"
 
     def each_kernel(self) -> str:
-        """Launch each kernel here and there on equal arrays, in a process of its own: what crashes there leaves this page."""
+        """Compare each kernel's results on the device with those on the CPU.
+
+        The comparison runs in a process of its own, so that a crash there does not end the report.
+        """
         command = [
             sys.executable,
             "-m",
@@ -350,7 +358,10 @@ class GpuVerdict:
         )
 
     def _step_time(self, n: int, *, on_device: bool) -> float:
-        """Return the time of a step of the dam break [s], with `LaunchGraph.on_device` or without."""
+        """Return the time of a dam break step [s], by CUDA graphs or single launches.
+
+        `LaunchGraph.on_device` selects graphs.
+        """
         with mock.patch.object(LaunchGraph, "on_device", on_device):
             simulation = gpu_cases.simulation("dam-break", self.device, n)
             for count in (10, 20):  # until it moves, and what is timed

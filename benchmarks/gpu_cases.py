@@ -1,4 +1,7 @@
-"""What must come out alike on every device: `python -m benchmarks.gpu_cases FILE [DEVICE]` writes it down."""
+"""Results that must be equal on every device, written to a file.
+
+Run `python -m benchmarks.gpu_cases FILE [DEVICE]`.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,10 @@ Arrays = dict[str, np.ndarray]
 
 
 def obstacle(shape: tuple[int, ...], device: str, *, periodic: bool = False) -> wl.LCP:
-    """Return a problem with AIR, SOLID and bounds on a grid of any shape, the same on every device."""
+    """Return a problem with AIR, SOLID and bounds on a grid of any shape.
+
+    It is the same on every device.
+    """
     rng = np.random.default_rng(sum(shape))
     cells = rng.choice([wl.FLUID, wl.FLUID, wl.FLUID, wl.AIR, wl.SOLID], shape)
     cells.flat[0] = wl.FLUID

@@ -1,11 +1,11 @@
-"""What the passes of a solve cost a GPU, counted on the host: instructions, registers, and the limit that holds each of them.
+"""Instruction counts of a solve's kernels on a GPU, and the limit of each kernel.
 
-The passes over the finest grid are heard in CUDA's form (`benchmarks/emulated_cuda.py`), compiled
-for sm_90, and one warp of each is executed on the memory that the solve has left
-(`benchmarks/machine_counts.py`). A pass takes as long as the slowest of: its instructions at one a
-clock and scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the
-bytes of its fields at `SHARE` of the bandwidth; and a latency of memory for each plane of a thread,
-as often as the multiprocessors are filled.
+The counts are made on the host. The kernels over the finest grid are recorded in CUDA's form
+(`benchmarks/emulated_cuda.py`) and compiled for sm_90, and one warp of each is executed on the
+memory that the solve has left (`benchmarks/machine_counts.py`). A kernel takes as long as the
+slowest of: its instructions at one a clock and scheduler; those in float64 at their rate;
+wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of the bandwidth; and
+a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
 """
 
 from benchmarks import emulated_cuda  # before the package
@@ -52,7 +52,11 @@ AREAS = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU: multiprocessors, clock [GHz], bandwidth [GB/s], float64 instructions of a warp a clock, warps, of each multiprocessor."""
+    """Rates and sizes of a GPU.
+
+    Multiprocessors, clock [GHz], bandwidth [GB/s]; of each multiprocessor: float64 instructions of
+    a warp a clock, and warps.
+    """
 
     processors: int
     clock: float
@@ -116,7 +120,10 @@ class InstructionCount:
 
 
 def key(name: str) -> str:
-    """Return the name of a pass without how threads take cells: the same on small grids and large."""
+    """Return the name of a kernel, the same for small and large grids.
+
+    How threads share the cells is left out of it.
+    """
     return " ".join(
         word for word in name.split() if not re.fullmatch(r"quads|(at|of)\d(or\d)?", word)
     )
@@ -128,7 +135,10 @@ def kinds(given: dict[str, Any]) -> str:
 
 
 def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
-    """Return the passes over the finest grid that solves of a full basin bind, as CUDA launches them on large grids, by name."""
+    """Return the kernels over the finest grid in solves of a full basin, by name.
+
+    They are bound as CUDA launches them on large grids.
+    """
     cells = np.full(SHAPE, wl.FLUID, dtype=np.int8)
     cells[-1] = wl.AIR
     wall = np.zeros(SHAPE, dtype=bool)
@@ -195,7 +205,10 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
 
 
 def cells_of(bound: BoundKernel) -> int:
-    """Return how many cells, or entries of a list, a pass visits; with ghosts those of the larger grid of a transfer."""
+    """Return the number of cells, or list entries, that a kernel visits.
+
+    Ghost cells count; of a transfer, those of the finer grid.
+    """
     rows, L = bound.rows, bound.layout
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 

@@ -1,9 +1,10 @@
 # mypy: ignore-errors
-"""Kernels of a device against the same on the CPU, one by one: `python -m benchmarks.gpu_kernels [DEVICE]`, in the source tree.
+"""Comparison of each kernel on a device with the same kernel on the CPU.
 
-While solves and steps run, each kernel is launched once more on the CPU, with copies of all arrays
-as they were before, and what both have written is compared. With `--rehearse` the device is the CPU
-in CUDA's form and another order of threads, against the CPU's own form.
+Run `python -m benchmarks.gpu_kernels [DEVICE]` in the source tree. While solves and steps run, each
+kernel is launched once more on the CPU, with copies of all arrays from before the launch, and the
+results of both are compared. With `--rehearse` the device is the CPU in CUDA's form with another
+order of threads, against the CPU's own form.
 """
 
 import importlib
@@ -102,7 +103,10 @@ def among(name, patterns):
 
 
 def arrays_in(given):
-    """Yield the arrays of parameters, those in structs too, with the types of their elements and their bytes."""
+    """Yield the arrays of parameters, element types and sizes in bytes.
+
+    Arrays in structs count as well.
+    """
     for value, kind in given:
         if isinstance(value, array_t):
             shape, strides = value.shape[: value.ndim], value.strides[: value.ndim]
@@ -236,7 +240,10 @@ class KernelCheck:
         self._here, self.busy = {}, False
 
     def launch(self, kernel, addresses, run):
-        """Launch a kernel, whose bounds and arguments are at addresses, by `run`, and compare where that is still to be done."""
+        """Launch a kernel by `run`, and compare it if it is still to be compared.
+
+        The launch bounds and arguments are at the addresses.
+        """
         name, kinds = f"{kernel.module.name}:{kernel.key}", [arg.type for arg in kernel.adj.args]
         types = [type(launch_bounds_t((1,) * kernel.adj.kernel_dim)), *map(native, kinds)]
         bounds, *values = (
@@ -263,7 +270,10 @@ class KernelCheck:
         return done
 
     def _launch_here(self, kernel, name, bounds, values):
-        """Launch on the CPU; a kernel of blocks that is told how many threads one has is told that it has one."""
+        """Launch a kernel on the CPU.
+
+        A kernel of blocks that takes the number of threads of a block gets 1.
+        """
         labels = [arg.label for arg in kernel.adj.args]
         if "threads" in labels:
             threads = values[labels.index("threads")]
@@ -348,7 +358,10 @@ def largest(a):
 
 
 def difference(here, there, size):
-    """Return the largest difference as a share of a size, or of a number that is larger; of integers, whether there is one."""
+    """Return the largest difference, relative to the larger of size and number.
+
+    For integers: whether any number differs.
+    """
     other = bits(here) != bits(there)
     if here.dtype.kind != "f":
         return float(other.any())
@@ -361,7 +374,11 @@ def difference(here, there, size):
 
 
 def spoiled(a, written, allowed):
-    """Return numbers of which one that was written is wrong: by three times what is allowed, if there is one that is no infinity."""
+    """Return a copy of results with one wrong number, to test the comparison.
+
+    A number that was written and is finite is changed by three times the tolerance, if there is
+    one.
+    """
     wrong, finite = a.copy(), written & (np.abs(a) < ENDLESS)
     at = int(np.argmax(finite if finite.any() else written))
     wrong[at] = (
@@ -384,7 +401,10 @@ def templates():
 
 @contextlib.contextmanager
 def as_on_cpu(module):
-    """Have a module loaded in the CPU's own form, from where Warp keeps that, beside the emulated one."""
+    """Use the CPU's own form of a module in a `with` block, not the emulated one.
+
+    Kernels come from Warp's own cache.
+    """
     with contextlib.ExitStack() as stack:
         if EMULATED:
             stack.enter_context(mock.patch.multiple(codegen, **templates()))

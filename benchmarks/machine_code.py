@@ -1,4 +1,6 @@
-"""Machine code of NVIDIA GPUs (SASS of sm_90): made by `ptxas`, printed by `cuobjdump` and `nvdisasm`, read from that.
+"""Parser of the machine code of NVIDIA GPUs (SASS of sm_90).
+
+`ptxas` makes the code; `cuobjdump` and `nvdisasm` print it.
 
 The tools are in the extra `ptxas`; no GPU is needed.
 """
@@ -30,7 +32,10 @@ def tools_missing() -> list[str]:
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction: its guard (predicate, whether it is negated), its operation with modifiers, its operands."""
+    """One instruction: guard, operation with modifiers, operands.
+
+    The guard is a predicate and whether it is negated.
+    """
 
     guard: tuple[str, bool] | None
     name: str

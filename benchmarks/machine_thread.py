@@ -55,7 +55,9 @@ class Memory:
         self.shared: dict[int, int] = {}
 
     def read(self, at: int, count: int) -> bytes:
-        """Return bytes; those up to 64 KiB outside of an array, which guarded loads do not use, are 0.
+        """Return bytes of memory.
+
+        Bytes up to 64 KiB outside of an array are 0: guarded loads read them and drop the values.
 
         Raises:
             KeyError: there is no array near the address.
@@ -286,7 +288,10 @@ class Lane:
 
     @staticmethod
     def _predicate_first(operands: list[str]) -> str | None:
-        """Take a predicate that stands before the operands away from them; None if there is none."""
+        """Split a leading predicate from the operands.
+
+        The predicate is None if there is none.
+        """
         return operands.pop(0) if PREDICATE.match(operands[0]) else None
 
     # moves
@@ -686,5 +691,8 @@ ALIASES = {
 
 
 def constants_of(parameters: bytes, block: int, blocks: int) -> bytes:
-    """Return a kernel's constant memory: the size of a block, the number of blocks, and the parameters."""
+    """Return a kernel's constant memory.
+
+    It holds the size of a block, the number of blocks, and the parameters.
+    """
     return struct.pack("<6I", block, 1, 1, blocks, 1, 1).ljust(PARAMETERS, b"\0") + parameters

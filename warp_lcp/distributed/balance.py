@@ -1,4 +1,7 @@
-"""Cuts by load: the boxes of ranks end where the busiest has least to do, and are cut anew when material has moved so far that it pays."""
+"""Load balancing: boxes whose busiest rank has the least work.
+
+The grid is repartitioned when material has moved far enough for that to pay.
+"""
 
 from __future__ import annotations
 
@@ -45,16 +48,16 @@ class Load:
     def best(
         self, ranks: int, start: Parts | None = None, *, rank: int | None = None
     ) -> tuple[float, Parts] | None:
-        """Return what the busiest rank has to do at least, and the cuts for that; None: there are too many ranks for the grid.
+        """Return the least work of the busiest rank, and the cuts for it.
 
-        Cuts along one axis are the best there are for those along the others (dynamic programming);
-        the axes take turns.
+        Returns None if there are too many ranks for the grid. Cuts along one axis are optimal for
+        the given cuts along the others (dynamic programming); the axes are optimized in turn.
 
         Args:
-            ranks: how many.
-            start: cuts to start from as well, so that what is found is no worse.
-            rank: look at what falls to this one where all look, each at some numbers of boxes along
-                x, y, z; None: at all.
+            ranks: number of ranks.
+            start: cuts to start from as well, so that the result is no worse than they are.
+            rank: search only this rank's share of the numbers of boxes along x, y, z, where all
+                ranks search together; None: search all of them.
         """
         total, found = float(self.material.sum()), list[tuple[float, Parts]]()
 
@@ -79,7 +82,10 @@ class Load:
         return min(found) if found else None
 
     def _improved(self, cut: Parts) -> tuple[float, Parts] | None:
-        """Return better cuts, as many along each axis, and what the busiest rank then has to do; None: there is no room for them."""
+        """Return improved cuts and the work of the busiest rank.
+
+        The number of boxes along each axis stays. Returns None if they do not fit into the grid.
+        """
         work = math.inf
         for _ in range(ROUNDS):
             before = work
@@ -96,7 +102,10 @@ class Load:
         return work, cut
 
     def _along(self, axis: int, cut: Parts) -> tuple[float, list[int]] | None:
-        """Return the best cuts along an axis for those along the others, and what the busiest rank then has to do; None: there are none."""
+        """Return the optimal cuts along an axis, and the work of the busiest rank.
+
+        The cuts along the other axes are fixed. Returns None if the boxes do not fit.
+        """
         n, ranks, others = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
         ends = np.append(np.arange(0, n, self.edge), n)
         beside, material = (
@@ -164,11 +173,13 @@ class Balance:
         return part.ranks.size > 1 and step % self.every == 0
 
     def rebalance(self, part: Subdomain, particles: Particles, a_cell: int) -> Decomposition | None:
-        """Return boxes that are so much better that the ranks should have them; collective. None: those they have will do.
+        """Return boxes with a better balance, if they are worth the change; collective.
+
+        Returns None if the present boxes are good enough.
 
         Args:
-            part: where this rank works.
-            particles: this rank's, whose totals have been found.
+            part: the subdomain of this rank.
+            particles: this rank's, whose totals have been computed.
             a_cell: particles of a full cell.
         """
         now, layers, fixed = part.decomposition, part.layers, self.fixed
@@ -195,7 +206,10 @@ class Balance:
 
 
 def edge_of_blocks(counts: Triple, ranks: int) -> int:
-    """Return the edge of blocks of cells: they are the cells that multigrid gathers, or finer where ranks are many."""
+    """Return the edge of the blocks of cells whose load is measured.
+
+    Blocks are the cells that multigrid gathers, or finer where ranks are many.
+    """
     edge = 1
     while math.prod(-(-n // edge) for n in counts) > max(GATHERED, BLOCKS * ranks):
         edge *= 2

@@ -1,4 +1,8 @@
-"""Work that ranks end alike: what fails on one fails on all, with a message that names it, and none waits for ever."""
+"""Raise an exception on all ranks if one raises.
+
+An error on one rank ends the operation on all of them with a message that names the rank, so that
+no rank waits for ever.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,10 @@ SHOWN = 3  # failures in one message
 
 
 class RankFailed(RuntimeError):
-    """Another rank has failed in a way that no message was planned for. The message names the rank and the error."""
+    """An unexpected error of another rank.
+
+    The message names the rank and the error.
+    """
 
 
 @dataclass(frozen=True)
@@ -228,7 +235,10 @@ def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
 
 
 def on_root(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Have the root rank alone run a method of an object with a `collective`: the others get None, and its error is theirs."""
+    """Run a method on the root rank alone; errors are raised on all ranks.
+
+    The object has a `collective`. The other ranks get None.
+    """
 
     @functools.wraps(method)
     def collective(self: Any, *arguments: Any, **options: Any) -> Any:

@@ -1,4 +1,8 @@
-"""Components that may reach over several ranks: each finds the parts in its box, which are then joined as the nodes of a graph."""
+"""Connected components over several ranks.
+
+Each rank finds the parts in its box. The parts are the nodes of a graph, whose components are then
+found.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,10 @@ GROUND = 0  # what holds a component, among the nodes of the graph
 
 
 def nodes_of(ranks: Ranks, counts: np.ndarray) -> tuple[int, int]:
-    """Return the node of this rank's first part, and how many nodes there are, of how many parts each rank has."""
+    """Return the node of this rank's first part, and the number of all nodes.
+
+    The argument is the number of parts of each rank.
+    """
     return 1 + int(counts[: ranks.rank].sum()), 1 + int(counts.sum())
 
 

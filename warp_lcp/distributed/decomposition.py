@@ -1,4 +1,7 @@
-"""How a grid's cells are shared by the ranks: boxes, one a rank, whose cuts lie where coarse cells end."""
+"""Domain decomposition: one box of cells a rank.
+
+Cuts lie on the boundaries of coarse cells.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,8 @@ class Decomposition:
         >>> from warp_lcp.distributed import Decomposition, Ranks
         >>> def operator(n):
         ...     boxes = Decomposition((n, n, n), Ranks.world())
-        ...     return wl.GridPoisson(np.full(boxes.box.counts[::-1], wl.FLUID), decomposition=boxes)
+        ...     cells = np.full(boxes.box.counts[::-1], wl.FLUID)
+        ...     return wl.GridPoisson(cells, decomposition=boxes)
     """
 
     def __init__(
@@ -240,7 +244,9 @@ class Decomposition:
 
 
 def parts(n: int, p: int) -> list[int]:
-    """Return how many of n cells each of p ranks has: about as many, with cuts at multiples of a power of two.
+    """Return the number of cells of each of p ranks, for n cells.
+
+    The numbers are about equal, with cuts at multiples of a power of two.
 
     >>> parts(129, 2), parts(100, 3)
     ([64, 65], [32, 32, 36])
@@ -256,7 +262,10 @@ def parts(n: int, p: int) -> list[int]:
 
 
 def _processes(counts: Triple, size: int) -> Triple:
-    """Return the ranks along x, y, z with the least cells at cuts; of equal ones those that cut z, whose planes lie in one piece."""
+    """Return the ranks along x, y, z with the fewest cells at cuts.
+
+    Among equals, the numbers that cut z are chosen: planes of constant z are contiguous.
+    """
     nx, ny, nz = counts
     found = [
         ((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz))
@@ -272,7 +281,10 @@ def _processes(counts: Triple, size: int) -> Triple:
 
 
 def cuttings(counts: Triple, size: int) -> list[Triple]:
-    """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
+    """Return all numbers of ranks along x, y, z whose product is `size`.
+
+    Each rank has at least one cell.
+    """
     divisors = [p for p in range(1, size + 1) if size % p == 0]
     triples = [
         (px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0
@@ -289,7 +301,9 @@ Corners = tuple[np.ndarray, np.ndarray]  # low and high x, y, z of a box of mate
 def balanced_processes(
     counts: Triple, size: int, *, layers: int, states: Sequence[Sequence[Corners]]
 ) -> Triple | None:
-    """Return the ranks along x, y, z for which the busiest has least to do; None if there are too many for the grid.
+    """Return the ranks along x, y, z with the least work of the busiest rank.
+
+    Returns None if there are too many ranks for the grid.
 
     Args:
         counts: cells (nx, ny, nz).

@@ -17,13 +17,13 @@ LEAST_RIGHT = 2
 
 
 def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
-    """Return how many cells a face's velocity goes in a time step that may take particles out of the ghost layers; 0: none does.
+    """Return how many cells particles may leave the ghost layers by; 0: none does.
 
-    A particle at most looks at faces three quarters of its way from where it starts, so that those
-    deep in the box may be faster. Values that are not finite are left to the particles to tell.
+    A particle reads faces up to three quarters of its path from its start, so faces deep in the box
+    may be faster. Values that are not finite are not counted: the particles report them.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         velocity: of each component on the faces [m/s].
         dt: time step [s].
     """
@@ -45,10 +45,13 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
 
 
 class Refill:
-    """Called after every layer that velocities are continued by: fills the ghost layers before what is wrong in them comes near the box.
+    """Halo exchange of ghost layers during velocity extrapolation.
+
+    The extrapolation calls it after every layer. Ghost layers are filled before wrong values in
+    them can reach the box.
 
     Args:
-        part: where this rank works; its ghost layers have been filled.
+        part: the subdomain of this rank; its ghost layers have been filled.
     """
 
     def __init__(self, part: Subdomain) -> None:

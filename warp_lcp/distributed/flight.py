@@ -1,4 +1,7 @@
-"""Bodies of material in flight that reach over several ranks: which trees of cells, one rank's each, make one body."""
+"""Airborne bodies of material that extend over several ranks.
+
+A body consists of trees of cells, each of one rank, which are joined at the cuts.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,10 @@ class TreesAtCuts:
         ]
 
     def _planes(self, axis: int, side: int) -> list[Window]:
-        """Return the cells of the box at a cut, and those beyond it, with the rings at the domain's sides."""
+        """Return the box's cells at a cut and the cells beyond it.
+
+        The rings at the domain's sides are included.
+        """
         known, place = self._part.known, 2 - axis
         first, planes = (
             self._part.owned.high[place] - 1 if side else self._part.owned.low[place],
@@ -53,10 +59,10 @@ class TreesAtCuts:
         return planes
 
     def join(self, trees: int, seen: Window | None, *found: wp.array) -> BodyNumbers:
-        """Number the bodies that this rank knows, first those that several ranks have trees of; collective.
+        """Number the bodies of this rank, those on several ranks first; collective.
 
         Args:
-            trees: how many this rank has found.
+            trees: number of trees that this rank has found.
             seen: the cells that it has looked at; None: none.
             found: parent, number and held of `GridPart.join_trees`.
         """
@@ -102,7 +108,10 @@ class TreesAtCuts:
         number: np.ndarray,
         held: np.ndarray,
     ) -> Plane:
-        """Return those of a plane's cells that were seen, and their nodes with this rank's first tree as 1, int32, in their shape."""
+        """Return the cells of a plane that were seen, and their nodes.
+
+        The nodes count from 1 for this rank's first tree; int32, in the cells' shape.
+        """
         inside = None if seen is None else plane.common(seen)
         if inside is None:
             return (slice(0), slice(0), slice(0)), np.zeros((0, 0, 0), dtype=np.int32)

@@ -115,7 +115,10 @@ class Halo:
         return np.where(number >= 0, names[np.maximum(node, 0)], -1).astype(np.int32)
 
     def _edges(self, node: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray:
-        """Return the pairs of nodes of this rank and its neighbors between which a face at a cut is open, shape (n, 2)."""
+        """Return pairs of nodes of neighboring ranks that an open face connects.
+
+        The face lies at a cut. Shape (n, 2).
+        """
         found, grid = [], node.reshape(self.shape).copy()
         # ghost cells at the domain's sides are not written
         for axis in self.decomposition.cut_axes:
@@ -166,7 +169,11 @@ class Halo:
         )
 
     def _fill_through_host(self, field: wp.array[Any]) -> None:
-        """Fill a field on a device: what lies within the width of the cuts goes through the host's memory, PETSc needs no CUDA then."""
+        """Fill a field on a device.
+
+        Cells within `width` of the cuts are copied through the host's memory, so that PETSc needs
+        no CUDA.
+        """
         assert self._forest is not None
         host = self._staging.setdefault(
             field.dtype, np.zeros(self.shape, dtype=wp.dtype_to_numpy(field.dtype))
@@ -181,7 +188,10 @@ class Halo:
             )
 
     def _slabs(self, *, ghost: bool) -> list[tuple[slice, ...]]:
-        """Return the slabs of a stored field beside this rank's cuts: ghost cells, or the cells that other ranks' ghost cells repeat."""
+        """Return the slabs of a stored field beside this rank's cuts.
+
+        They are ghost cells, or the cells that other ranks have as ghost cells.
+        """
         found, w = [], self.width
         for axis, side in self.cuts:
             n = self.shape[2 - axis]
@@ -193,7 +203,9 @@ class Halo:
 
 
 class Gathering:
-    """Collects what the ranks store for their boxes into one field of the whole grid on every rank; both have one layer of ghost cells.
+    """Gathers a field of all boxes into one field of the whole grid on every rank.
+
+    Both fields have one layer of ghost cells.
 
     Args:
         decomposition: the boxes.
@@ -290,19 +302,21 @@ def star_forest(
     shifts: Sequence[Triple] = ((0, 0, 0),),
     into: StarForest | None = None,
 ) -> StarForest:
-    """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
+    """Return a star forest that fills ghost cells; collective.
+
+    Its leaves are this rank's ghost cells, its roots the cells of other ranks that they repeat.
 
     Args:
-        ranks: who have the boxes.
-        owned: the cells that each rank is the one to know; they do not overlap.
+        ranks: that have the boxes.
+        owned: the cells that each rank owns; they do not overlap.
         stored: the cells that each rank stores.
-        filled: the ghost cells that are wanted lie in it; None: all.
+        filled: region of the ghost cells to fill; None: all.
         layers: of numbers of those cells, one behind the other.
-        whole: the cells of other fields, in which what each rank knows is wanted, this one too;
-            None: leaves lie among the roots.
-        which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx);
-            None: all.
-        shifts: cells along x, y, z by which what ranks know lies around this one again.
+        whole: the cells of other fields that receive the values of all ranks, this rank's too;
+            None: leaves and roots lie in the same field.
+        which: mask of the stored cells to fill, bool of their shape (nz, ny, nx); None: all.
+        shifts: periodic images: cells along x, y, z by which owned cells are repeated around this
+            rank.
         into: a forest that this one replaces, see `StarForest.replace`; None: there is none.
     """
     mine, roots = ranks.rank, layers * stored[ranks.rank].cells

@@ -14,7 +14,9 @@ LONGEST = 5e-3  # seconds of such a sleep
 
 
 class InterruptibleWait:
-    """Tells others, such as a `Watchdog`, whether this process is inside an operation that other ranks take part in.
+    """State of collective operations: whether this process is inside one.
+
+    Others read it, such as a `Watchdog`.
 
     Attributes:
         native: entries and exits of operations in native code, and the error of the first one that
@@ -61,7 +63,10 @@ waiting = InterruptibleWait()  # MPI's world is one a process, and its main thre
 
 
 def finish(request: Any, seconds: float = math.inf) -> bool:
-    """Wait for a request of MPI without using up a core, and return whether it has ended within some seconds."""
+    """Wait for an MPI request for some seconds; return whether it has ended.
+
+    The wait does not use a core.
+    """
     begun = time.monotonic()
     while not request.Test():
         waited = time.monotonic() - begun

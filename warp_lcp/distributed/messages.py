@@ -1,4 +1,7 @@
-"""Messages between ranks, now or as operations of the team: a program's passes and the exchanges between them are one table then."""
+"""Messages between ranks, at once or as operations of the thread pool.
+
+Recorded, the kernels of a program and the exchanges between them form one operation table.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +89,8 @@ for (int i = 0; i < 2; ++i)
     for (int p = 0; p < count; ++p)
         if (!told[1]) {
             const unsigned long long* pair = pairs + 3*p;
-            told[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], (void*)pair[2], (void*)replace_); }
+            told[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], \
+(void*)pair[2], (void*)replace_); }
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
@@ -99,18 +103,21 @@ def copy_to_leaves(
     count: int,
     told_: wp.uint64,
 ):
-    """Call PetscSFBcastBegin for each pair, a unit and the addresses of roots and leaves, then PetscSFBcastEnd.
+    """Copy roots to leaves: PetscSFBcastBegin for each pair, then PetscSFBcastEnd.
 
-    `forest_` is the address of the star forest's handle, read in each run.
+    A pair is three addresses: the unit, the roots and the leaves. `forest_` is the address of the
+    star forest's handle, read in each run.
     """
 
 
 @wp.func_native("""
 #ifndef __CUDA_ARCH__
-unsigned long long* told = (unsigned long long*)told_; double* sums = (double*)sums_; double* of_all = (double*)of_all_;
+unsigned long long* told = (unsigned long long*)told_; double* sums = (double*)sums_; \
+double* of_all = (double*)of_all_;
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 typedef int Fault; typedef Fault (*Call)(const void*, int, void*, void*, int, void*, void*);
-if (!told[1]) told[1] = ((Call)gather_)(sums, count, (void*)unit_, of_all, count, (void*)unit_, (void*)comm_);
+if (!told[1]) told[1] = ((Call)gather_)(sums, count, (void*)unit_, \
+of_all, count, (void*)unit_, (void*)comm_);
 for (int c = 0; c < count; ++c) {
     double sum = of_all[c];
     for (int r = 1; r < ranks; ++r) sum += of_all[r*count + c];
@@ -200,7 +207,9 @@ def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = 
 
 
 def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-    """Copy roots to leaves over a star forest, many of them at once: their messages are under way together.
+    """Copy roots to leaves of a star forest, many pairs at once.
+
+    Their messages are in transit together.
 
     Raises:
         RuntimeError: PETSc has failed.
@@ -245,7 +254,10 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
 
 
 def adding(comm: Any, sums: np.ndarray) -> Operation:
-    """Return what replaces float64 sums by those over all ranks, in their order, as an operation of the team."""
+    """Return an operation that replaces float64 sums by those over all ranks.
+
+    The partial sums are added in the order of the ranks. The operation runs in the thread pool.
+    """
     library, of_all = _library(), np.empty((comm.size, sums.size))
     given = [
         ctypes.cast(library.gather, ctypes.c_void_p).value,

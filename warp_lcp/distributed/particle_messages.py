@@ -99,10 +99,10 @@ class ParticleMessages:
         self._packing, self._unpacking, self._settling, self._search, self._giving = graphs
 
     def _take_boxes(self) -> list[int]:
-        """Set the boxes that are searched, and return how many each neighbor has, this rank behind them.
+        """Set the search boxes; return the number of particles for each neighbor.
 
-        Particles are in a neighbor's sight in its box and within REACH of it, at every periodic
-        shift of it; in that of this rank itself at those other than 0.
+        This rank comes last. A neighbor needs the particles in its box and within REACH of it, at
+        every periodic shift; this rank itself needs those at nonzero shifts.
         """
         part, joined, mine = self.part, self.part.decomposition.joined, self.part.ranks.rank
         counts, origin = np.array(part.grid.counts), np.array(part.grid.origin)
@@ -125,10 +125,12 @@ class ParticleMessages:
         return [sum(rank == other for other, _ in seen) for rank in ranks]
 
     def exchange(self, *, positions_only: bool) -> int:
-        """Exchange what neighbors must know, with what lies behind the others, and return how many particles have come; collective.
+        """Exchange particles with the neighbors; return how many have arrived; collective.
+
+        Arrived particles are stored behind the others.
 
         Args:
-            positions_only: positions and places come alone.
+            positions_only: send positions and places alone.
         """
         particles, count = self._particles, self._particles.count
         self._fetch(positions_only=positions_only)
@@ -179,7 +181,7 @@ class ParticleMessages:
         return own, end, self._others.host[:free].astype(np.int64)
 
     def give_places(self) -> None:
-        """Give particles places that lie in the order of their cells, and have been numbered by these."""
+        """Renumber the particles' places in the order of their cells."""
         self._count.value = self._particles.count
         self._place.reserve(self._particles.count)
         self._giving.run()
@@ -299,7 +301,10 @@ class ParticleMessages:
 
 
 def bounds_of(part: Subdomain) -> dict[str, float]:
-    """Return what tells the side of a rank's box from the other, for kernels: sides that are not cut have no end."""
+    """Return the bounds of a rank's box, for kernels.
+
+    Sides that are not cuts are unbounded.
+    """
     bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
     low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
     high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
@@ -308,7 +313,10 @@ def bounds_of(part: Subdomain) -> dict[str, float]:
 
 
 def beyond(counts: Sequence[int], spacing: float) -> np.ndarray:
-    """Return the least coordinates [m] for which kernels find the cell beyond the last along x, y, z, float32."""
+    """Return the coordinates [m] beyond the last cell along x, y, z.
+
+    They are the least float32 numbers that kernels assign to the cell beyond the last.
+    """
     one, inverse = np.float32(1.0), np.float32(1.0 / spacing)
     end = np.array(counts, dtype=np.float32) * np.float32(spacing)
     while (short := end * inverse + one < np.array(counts, dtype=np.float32) + one).any():

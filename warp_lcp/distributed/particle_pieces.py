@@ -101,7 +101,10 @@ def take_pieces(
 def _numbers(
     pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str], signature: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the numbers that all pieces have alike, after a look whether they have all else, and belong to a scene."""
+    """Return the numbers that all pieces share.
+
+    The pieces are first checked: they must agree in everything else and belong to a scene.
+    """
     missing = sorted({name for piece in pieces for name in (*names, *others) if name not in piece})
     if missing or not pieces:
         raise ValueError(
@@ -120,7 +123,10 @@ def _numbers(
 
 
 def cells_of(part: Subdomain, position: np.ndarray) -> np.ndarray:
-    """Return the cells (x, y, z) of the whole domain that positions [m] lie in, as kernels find them, shape (n, 3)."""
+    """Return the cells (x, y, z) of positions [m], as kernels compute them.
+
+    They count over the whole domain. Shape (n, 3).
+    """
     inverse, one = np.float32(1.0 / part.grid.spacing), np.float32(1.0)
     cells = np.zeros((len(position), 3), dtype=np.int64)
     for axis in range(part.grid.dimension):

@@ -1,11 +1,12 @@
-"""Particles that belong to the rank whose box they are in: they move on to others, and cells at a cut know those beside them.
+"""Distributed particles: migration between ranks, and ghost particles at cuts.
 
-In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then
-its own alone. Sums take all in one order that does not depend on the ranks, so that those around a
-face have the same bits on any number of ranks: that of the last sort by cell, which a number stands
-for, the particle's `place`. Until the next sort ghosts lie behind the others, and what comes takes
-the room of what goes: `runs` tell the order. Messages go from rank to rank: their lengths change
-from step to step, so that a star forest would have to be made anew each time.
+A particle belongs to the rank of its box. In a step a rank has its own particles and copies of
+those within a cell of its box, the ghosts; later its own alone. Sums over particles have one order
+that does not depend on the ranks, so that sums at a face have the same bits on any number of ranks:
+the order of the last sort by cell. A particle's number in that order is its `place`. Until the next
+sort, ghosts are stored behind the others, and new particles take the memory of those that have
+left: `runs` describe the order. Messages go from rank to rank. Their lengths change from step to
+step, so a star forest would have to be rebuilt each time.
 """
 
 from __future__ import annotations
@@ -86,7 +87,10 @@ class ParticleMigration(ParticleExchange):
 
     @property
     def expected(self) -> int:
-        """How many particles all ranks had before the last totals, with those that had been added and removed since then."""
+        """Number of particles of all ranks.
+
+        It is the last total, with the particles added and removed since then.
+        """
         return self._expected
 
     def state(self) -> dict[str, np.ndarray]:
@@ -94,7 +98,11 @@ class ParticleMigration(ParticleExchange):
         return {"place": self.place.copy()}
 
     def arrange(self, *, sort: bool) -> None:
-        """Hand particles that have left the box to their ranks, take in those that came, with ghosts, and bring all into order."""
+        """Migrate particles to the ranks of their boxes, add ghosts, and sort.
+
+        Particles that have left the box are sent; those that arrive, and ghosts, are brought into
+        order.
+        """
         self.drop_ghosts()
         if self._neighbors:
             self._exchange()
@@ -106,7 +114,10 @@ class ParticleMigration(ParticleExchange):
                 self._find_runs()
 
     def look_around(self) -> None:
-        """Let ghosts be there with their positions alone; own particles stay this rank's, wherever they are."""
+        """Make ghosts available with their positions alone.
+
+        Own particles stay on this rank, wherever they are.
+        """
         if self.particles.offsets is not None:
             self.arrange(sort=True)
         elif self._neighbors:
@@ -117,7 +128,10 @@ class ParticleMigration(ParticleExchange):
 
     @contextmanager
     def with_ghosts(self, step: int) -> Iterator[None]:
-        """Let the particles around this rank's box be there, arranged as in a step of this number."""
+        """Restore the particles around this rank's box.
+
+        They are arranged as in the step of this number.
+        """
         self.particles.arrange(step)
         self._lie_in_order()
         yield
@@ -142,7 +156,7 @@ class ParticleMigration(ParticleExchange):
         self.particles.set_runs(wp.array(runs, dtype=wp.int32, device=self.part.grid.device))
 
     def _order_first(self, count: int) -> None:
-        """Bring the first particles into the order of their places, of which others have been added or gone."""
+        """Sort the first particles by place, after some were added or removed."""
         place = self.place[:count]
         if (place[1:] < place[:-1]).any():
             self._take(
@@ -174,7 +188,10 @@ class ParticleMigration(ParticleExchange):
         self._placed = self.particles.count
 
     def next_place(self) -> int:
-        """Return a place behind those of all ranks' particles, when this rank's own are there alone, numbered; collective."""
+        """Return a place behind the particles of all ranks; collective.
+
+        This rank has its own particles alone, numbered.
+        """
         self.drop_ghosts()
         self.particles.number()
         return max(NEW, 1 + int(self.part.ranks.max(self.place.max(initial=0))))

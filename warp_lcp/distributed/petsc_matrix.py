@@ -1,8 +1,9 @@
-"""The grid operator as PETSc's Mat and a multigrid cycle as PETSc's PC: for KSP, SNES and TAO, matrix-free.
+"""Grid operator as a PETSc Mat, and multigrid cycle as a PETSc PC; matrix-free.
 
-Vectors are those of a DMDA with one degree of freedom a cell: each rank's cells one after another,
-x fastest, without ghost cells. Warp reads and writes them where PETSc keeps them; fields have a
-ring of ghost cells, so each product and each cycle costs two strided copies.
+They serve KSP, SNES and TAO. Vectors are those of a DMDA with one degree of freedom a cell: each
+rank's cells one after another, x fastest, without ghost cells. Warp reads and writes them in
+PETSc's memory. Fields have a ring of ghost cells, so each product and each cycle costs two strided
+copies.
 """
 
 from __future__ import annotations
@@ -72,7 +73,10 @@ class VectorCopies:
         return v
 
     def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
-        """Set the field to scale v on the unknowns and to 0 on the other cells; its ghost cells stay as they are."""
+        """Set the field to scale v on the unknowns, and to 0 on the other cells.
+
+        Ghost cells keep their values.
+        """
         values = v.getArray(readonly=True)  # PETSc counts accesses: it ends with the array
         ENTER.bind(
             self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale
@@ -81,7 +85,10 @@ class VectorCopies:
     def leave(
         self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
     ) -> None:
-        """Set v to scale times the field on the unknowns and to `others` (0 if None) on the other cells."""
+        """Set v to scale times the field on the unknowns.
+
+        On the other cells v becomes `others`, or 0 if that is None.
+        """
         given = None if others is None else others.getArray(readonly=True)
         values = v.getArray()
         seen, target = None if given is None else self._seen(given, 0), self._seen(values, 1)
@@ -137,7 +144,10 @@ class StencilMatrix:
     def createSubMatrix(  # noqa: N802  # PETSc's name
         self, matrix: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, out: PETSc.Mat | None = None
     ) -> PETSc.Mat:
-        """Return B on some rows and columns, as products with zeros elsewhere: methods for bounds solve on free cells."""
+        """Return the submatrix of B on some rows and columns.
+
+        Its products are those of B with zeros elsewhere. Methods for bounds solve on free cells.
+        """
         return petsc().Mat().createSubMatrixVirtual(matrix, rows, columns)
 
     def getDiagonal(self, matrix: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802  # PETSc's name
@@ -151,7 +161,9 @@ class StencilMatrix:
 
 
 class CyclePreconditioner:
-    """One linear multigrid cycle, as the context of a PC of PETSc's type `python`: symmetric positive definite.
+    """One linear multigrid cycle, as the context of a PC of PETSc's type `python`.
+
+    The preconditioner is symmetric positive definite.
 
     Args:
         hierarchy: rebuilt for the free set by the caller.
@@ -277,10 +289,10 @@ class PetscGrid:
         return ksp
 
     def _keep(self, thing: Any) -> Any:
-        """Return an object whose methods are Python's, with one reference more as long as this grid lives.
+        """Return a proxy of a Python object with one reference more.
 
-        When a program ends, PETSc ends what is left of its objects, and Python has ended already:
-        it must not come to these.
+        The reference lives as long as this grid. At the end of a program PETSc destroys its
+        remaining objects after Python has ended, and must not destroy these.
         """
         thing.incRef()
         self._kept.append(thing)

@@ -24,12 +24,15 @@ class PlaceOrder:
     loose: np.ndarray = field(default_factory=_none)
 
     def changed(self, numbers: np.ndarray, before: int, count: int) -> PlaceOrder:
-        """Return what is known when there are other particles of some numbers, and `count` instead of those there were `before`."""
+        """Return the order after particles of some numbers were replaced.
+
+        There are then `count` particles, where there were `before`.
+        """
         loose = np.concatenate([self.loose, numbers, np.arange(before, count)])
         return PlaceOrder(self.places, np.unique(loose[loose < count]))
 
     def runs(self, place: np.ndarray, count: int) -> np.ndarray:
-        """Return begin and end of each run of particles in order, one run after another, shape (2 runs,).
+        """Return begin and end of each sorted run of particles, shape (2 runs,).
 
         Args:
             place: of the particles as they are, and of others behind them that are in any order.

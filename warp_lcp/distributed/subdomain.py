@@ -1,4 +1,4 @@
-"""The part of a staggered grid that a rank works on: its own box of cells, and layers of other ranks' cells around it."""
+"""Subdomain of a staggered grid: a rank's box and its ghost layers."""
 
 from __future__ import annotations
 
@@ -100,12 +100,13 @@ def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Ope
 
 
 class Subdomain(GridPart):
-    """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
+    """Subdomain of a rank: the cells of its box and ghost layers around it.
 
-    The outermost layer is the ring that every staggered grid has around its cells. At the domain's
-    sides the ring is that of the whole grid, at cuts it is the last of the ghost layers: there the
-    sides of the part must be open, see `cuts`. Along an axis without an end that is cut, the part
-    goes on beyond the domain's sides, with the cells that lie there again.
+    Ghost layers hold the cells of the domain within `layers` of the box. The outermost layer is the
+    ring that every staggered grid has around its cells. At the domain's sides the ring is that of
+    the whole grid, at cuts it is the last of the ghost layers: there the sides of the part must be
+    open, see `cuts`. Along a periodic axis that is cut, the part continues beyond the domain's
+    sides with the periodic images of the cells.
 
     Args:
         decomposition: the boxes of all ranks.
@@ -114,7 +115,7 @@ class Subdomain(GridPart):
         device: a Warp device or its name.
         layers: ghost cells at cuts, the ring included.
         mailbox: carries messages between neighbors; None: MPI's.
-        balance: when ranks look for other boxes.
+        balance: when to repartition.
 
     Attributes:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
@@ -192,7 +193,10 @@ class Subdomain(GridPart):
 
     @property
     def at_once(self) -> bool:
-        """Whether launches cannot be recorded where ranks exchange halos in them: on CUDA that goes through the host."""
+        """Whether launches with halo exchanges cannot be recorded.
+
+        On CUDA the exchange goes through the host.
+        """
         return bool(self.grid.device.is_cuda)
 
     @property
@@ -202,7 +206,10 @@ class Subdomain(GridPart):
 
     @property
     def stored(self) -> Window:
-        """Stored cells that this rank is the one to know: those of the box and the ring beyond the domain's sides."""
+        """Stored cells that this rank owns.
+
+        They are the cells of the box and the ring beyond the domain's sides.
+        """
         known = self.known
         return Window.of(known.low[::-1], known.high[::-1], self.grid.device)
 
@@ -236,16 +243,22 @@ class Subdomain(GridPart):
         return self.balance.should_rebalance(self, step)
 
     def rebalance(self, particles: Particles, a_cell: int) -> Subdomain | None:
-        """Return the part with better boxes, see `Balance.rebalance`; None: those there are will do. Collective."""
+        """Return the part with better boxes, see `Balance.rebalance`; collective.
+
+        Returns None if the present boxes are good enough.
+        """
         better = self.balance.rebalance(self, particles, a_cell)
         return None if better is None else self.repartition(better)
 
     def migrate(self, piece: Piece, particles: Sequence[str], before: Subdomain) -> Piece:
-        """Return the piece of a state that lies in this box, given that of the box before, as all ranks do; collective."""
+        """Return the piece of a state in this box, from the former boxes; collective."""
         return migrate(piece, particles, before, self)
 
     def of_pieces(self, pieces: Sequence[Piece]) -> Subdomain | None:
-        """Return the part with the boxes of pieces of a state, this one if they are the same; None: ranks cannot have them. Collective."""
+        """Return the part with the boxes of pieces of a state; collective.
+
+        Returns this part if the boxes are the same, and None if the ranks cannot have them.
+        """
         with self.decomposition.collective.led():
             cuts = cuts_of(pieces, self)
         if cuts is None or cuts == self.decomposition.parts:
@@ -260,7 +273,10 @@ class Subdomain(GridPart):
         signature: np.ndarray,
         solids: np.ndarray | None,
     ) -> tuple[Piece, Piece, Piece]:
-        """Return what of pieces lies in this box; collective. See `warp_lcp.distributed.particle_pieces.take_pieces`."""
+        """Return the contents of pieces that lie in this box; collective.
+
+        See `warp_lcp.distributed.particle_pieces.take_pieces`.
+        """
         return take_pieces(self, particles, like, signature, pieces, solids)
 
     @property
@@ -269,11 +285,15 @@ class Subdomain(GridPart):
         return self.box.low, self.box.high
 
     def where(self) -> dict[str, np.ndarray]:
-        """Return `box`, int64 (2, 3), the box's first cell and the one behind its last, and `counts`, int64 (3,), the whole grid's."""
+        """Return the arrays that describe the box in a piece.
+
+        `box`, int64 (2, 3), is the box's first cell and the one behind its last; `counts`, int64
+        (3,), are the whole grid's cells.
+        """
         return {"box": np.array(self.corners), "counts": np.array(self.decomposition.counts)}
 
     def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what fields have in the box, shape (..., nz, ny, nx), and numbers among them as they are."""
+        """Return fields on the box, shape (..., nz, ny, nx); numbers are unchanged."""
         cells = fields_of(fields)
         return {
             name: np.ascontiguousarray(self.box_of(values)) if name in cells else values
@@ -281,11 +301,17 @@ class Subdomain(GridPart):
         }
 
     def refill(self) -> Refill:
-        """Return what fills ghost cells again while velocities are continued, before what is wrong in them comes near the box."""
+        """Return a function that fills ghost cells during velocity extrapolation.
+
+        It exchanges halos before wrong values in the ghost cells can reach the box.
+        """
         return Refill(self)
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
-        """Return how many cells velocities of any rank move particles out of its ghost layers in a time step; 0: none does."""
+        """Return how many cells velocities move particles out of the ghost layers.
+
+        The number is the largest of all ranks for a time step; 0: no particle leaves them.
+        """
         return float(self.ranks.max(too_far(self, velocity, dt)))
 
     def notes(self) -> list[str]:
@@ -300,7 +326,10 @@ class Subdomain(GridPart):
         ]
 
     def coarser(self, layers: int) -> StaggeredGrid | None:
-        """Return this rank's part of the grid of cells of twice the edge; None if a cut lies in one, or a box is thinner than `layers`."""
+        """Return this rank's part of the grid with cells of twice the edge.
+
+        Returns None if a cut lies inside a coarse cell, or a box is thinner than `layers`.
+        """
         if self.across is None:
             return super().coarser(layers)
         boxes, grid = self.decomposition.coarser((2, 2, self.dimension - 1)), self.grid
@@ -316,7 +345,7 @@ class Subdomain(GridPart):
 
     @property
     def row_ranks(self) -> Any:
-        """The ranks that have cells of the same rows along x, in their order; None if rows are not cut."""
+        """Ranks with cells of the same rows along x, in order; None if x is not cut."""
         return (
             self.ranks.in_rows(self.decomposition.processes[0])
             if 0 in self.decomposition.cut_axes
@@ -332,7 +361,10 @@ class Subdomain(GridPart):
         )
 
     def _at_sides(self, box: CellBox) -> list[list[bool]]:
-        """Tell whether a box ends at the domain's lower and upper sides along x, y, z, beyond which nothing goes on."""
+        """Return whether a box ends at the domain's lower and upper sides.
+
+        One pair for each of x, y, z. Periodic sides do not count.
+        """
         counts, joined = self.decomposition.counts, self.decomposition.joined
         ends = [
             [n == 0 for n in box.low],
@@ -348,11 +380,11 @@ class Subdomain(GridPart):
         which: np.ndarray | None = None,
         into: StarForest | None = None,
     ) -> StarForest:
-        """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
+        """Return a star forest that fills ghost cells and rings; collective.
 
         Args:
             layers: of a field.
-            width: how far from the box; None: all.
+            width: distance from the box in cells; None: all.
             parts: the fields are of `grid.refined(parts)`.
             which: of a field's cells, bool; None: all.
             into: a forest that this one replaces, in recorded exchanges too; None: there is none.
@@ -383,7 +415,10 @@ class Subdomain(GridPart):
         )
 
     def _with_sides(self, box: CellBox, parts: int = 1) -> CellBox:
-        """Return a box, refined, with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
+        """Return a box, refined, with the ring cells that its rank owns.
+
+        They lie beyond the domain's sides that the box touches.
+        """
         found = self._refined(box, parts)
         low, high = list(found.low), list(found.high)
         at_low, at_high = self._at_sides(box)
@@ -399,14 +434,15 @@ class Subdomain(GridPart):
         parts: int = 1,
         forest: StarForest | None = None,
     ) -> None:
-        """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
+        """Fill the ghost cells of fields of the part, or of stacks of them; collective.
 
-        On the CPU it may be recorded among launches, which all ranks then run alike.
+        A stack has equally many layers. On the CPU the exchange may be recorded among launches,
+        which all ranks then run alike.
 
         Args:
             fields: any types, the last axes z, y, x; or the host's views of their memory, which
                 cost less to fill often.
-            width: how far from the box; None: all.
+            width: distance from the box in cells; None: all.
             parts: the fields are of `grid.refined(parts)`.
             forest: of `forest`, for such fields; None: one that is made once.
         """
@@ -421,12 +457,12 @@ class Subdomain(GridPart):
         self.filling(*fields, forest=forest).launch()
 
     def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
-        """Return `fill` over a star forest of several ranks, to run now or within a recorded program."""
+        """Return `fill` over a star forest, to run now or in a recorded program."""
         operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
         return Task(partial(_fill, forest, fields), operation)
 
     def _fill_again(self, forest: StarForest, fields: Sequence[Any]) -> None:
-        """Fill fields that have been filled before: the exchange is kept, with what it costs to make it."""
+        """Fill fields that were filled before, by the exchange set up then."""
         key = forest, *((field.ptr, field.dtype) for field in fields)
         if key not in self._fillings:
             if len(self._fillings) >= MOST_KEPT:
@@ -438,7 +474,10 @@ class Subdomain(GridPart):
         run_table(self._fillings[key])
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
-        """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""
+        """Gather fields of the part into fields of the whole grid; collective.
+
+        Every rank gets the whole fields.
+        """
         if self._gathering is None:
             boxes, cells = self.decomposition.boxes, CellBox((0, 0, 0), self.decomposition.counts)
             stored = [self._cells(box).grown(1) for box in boxes]
@@ -459,7 +498,10 @@ class Subdomain(GridPart):
         wp.copy(field, whole[self._cells(self.box).grown(1).moved((1, 1, 1)).slices])
 
     def box_of(self, field: wp.array, ring: int = 0) -> Any:
-        """Return the view of a field, host or device, or of layers of one, on the cells of the box and on so many cells around it."""
+        """Return the view of a field on the box and some cells around it.
+
+        The field may be on the host or a device, and may have layers.
+        """
         low, high = self.owned.low, self.owned.high
         edge = (ring if self.dimension == 3 else 0, ring, ring)
         box = (slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))
@@ -467,7 +509,10 @@ class Subdomain(GridPart):
 
     @property
     def known(self) -> CellBox:
-        """The stored cells that this rank is the one to know: those of the box and the ring beyond the domain's sides."""
+        """Stored cells that this rank owns.
+
+        They are the cells of the box and the ring beyond the domain's sides.
+        """
         return self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
 
     def known_of(self, field: np.ndarray) -> np.ndarray:
@@ -475,12 +520,19 @@ class Subdomain(GridPart):
         return field[self.known.slices]
 
     def stored_box_of(self, field: wp.array) -> Any:
-        """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""
+        """Return the view of a field on the box and one cell around it.
+
+        It has the stored shape of such a box.
+        """
         low, high = self.owned.low, self.owned.high
         return field[low[0] - 1 : high[0] + 1, low[1] - 1 : high[1] + 1, low[2] - 1 : high[2] + 1]
 
     def box_like(self, field: wp.array) -> wp.array:
-        """Return a field of the box with a ring: memory of the field itself where boxes are layers of planes, else one of zeros."""
+        """Return a field of the box with a ring.
+
+        It shares the part's memory where boxes are layers of planes; otherwise it is a new field of
+        zeros.
+        """
         view = self.stored_box_of(field)
         return (
             view
@@ -495,7 +547,10 @@ class Subdomain(GridPart):
             copy_cells(box, view)
 
     def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
-        """Write the solution of a problem on the box to a field of the part, in ghost cells as others have it; collective."""
+        """Write the solution of a problem on the box to the part; collective.
+
+        Ghost cells get the values of the ranks that own them.
+        """
         if x.dtype is not wp.float64:  # of a method in single precision
             convert(x.flatten(), spare.flatten())
             x = spare
@@ -509,9 +564,7 @@ class Subdomain(GridPart):
         return 0, 0, 0
 
     def gathered(self, values: np.ndarray) -> np.ndarray | None:
-        """Return what all ranks have of a field in their boxes as an array of the whole grid on the root rank; None elsewhere.
-
-        Collective.
+        """Return a field of the whole grid on the root rank, None elsewhere; collective.
 
         Args:
             values: of this part without its ring.
@@ -540,7 +593,10 @@ class Subdomain(GridPart):
     def make_boundary(
         self, scene: ParticleScene, solids: Sequence[PlacedSolid]
     ) -> tuple[Boundary, list[str]]:
-        """Return solids and walls of the part as the whole grid would have them, and warnings; collective."""
+        """Return solids and walls of the part, and warnings; collective.
+
+        They are those of the whole grid.
+        """
         return boundary_of_part(scene, self, solids)
 
     def exchange_of(self, particles: Particles) -> ParticleMigration:
@@ -548,7 +604,10 @@ class Subdomain(GridPart):
         return ParticleMigration(self, particles)
 
     def nearest(self, cells: np.ndarray) -> np.ndarray:
-        """Return cells (x, y, z) of the part, shape (n, 3), along axes without an end those images that are nearest to the box."""
+        """Return the images of cells (x, y, z) that are nearest to the box.
+
+        Shape (n, 3). Images exist along periodic axes.
+        """
         for axis in self.joined:
             count = self.decomposition.counts[axis]
             first = self.owned.low[2 - axis] - 1 - (count - self.box.counts[axis]) // 2
@@ -556,7 +615,10 @@ class Subdomain(GridPart):
         return cells
 
     def near(self, window: Window, layers: int) -> Window | None:
-        """Return the cells of a window in the box and some layers around it: a window that moves there, for recorded launches."""
+        """Return a window clipped to the box and some layers around it.
+
+        It follows a window that moves, for recorded launches.
+        """
         if layers not in self._near:
             low, high = self.owned.low[::-1], [h - 1 for h in self.owned.high[::-1]]
             around = self.grid.window(low, high, grow=layers)

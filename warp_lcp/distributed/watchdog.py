@@ -1,4 +1,4 @@
-"""A thread on each rank that sees when ranks wait for one that does not come, and ends all with its name."""
+"""Deadlock watchdog: names the rank that does not answer and aborts."""
 
 from __future__ import annotations
 
@@ -97,21 +97,21 @@ class HeartbeatTable:
 
 
 class Watchdog:
-    """A `with` block in which all ranks end, with a message, once one has kept the others waiting for too long.
+    """A `with` block that ends all ranks once one keeps the others waiting too long.
 
-    On each rank a thread tells by a small file, some times within the limit, what its main thread
-    does. A rank that has waited so long reads what the others have told, and says who is late. Time
-    in which processes are stopped, by Ctrl-Z or a batch system, does not count. Before there is a
-    folder that all see, ranks of one machine hear of each other.
+    On each rank a thread writes a heartbeat several times within the limit: a small file with the
+    state of its main thread. A rank that has waited for the limit reads the other heartbeats and
+    names the late rank. Time in which processes are stopped, by Ctrl-Z or a batch system, does not
+    count. Before there is a folder that all ranks see, heartbeats are shared on one machine.
 
     Args:
         ranks: all of them.
         limit: seconds that a rank may keep the others waiting; 0: any.
         end: takes the message, and ends all processes.
-        watched: what the main thread waits in.
+        watched: state of the main thread's collective operations.
 
     >>> from types import SimpleNamespace
-    >>> with Watchdog(Ranks(SimpleNamespace(rank=0, size=1)), 600.0, print):  # one rank waits for nobody
+    >>> with Watchdog(Ranks(SimpleNamespace(rank=0, size=1)), 600.0, print):  # a single rank
     ...     pass
     """
 
@@ -193,7 +193,11 @@ class Watchdog:
                 return
 
     def _look(self, mine: HeartbeatMessages) -> str:
-        """Return what is wrong; "" while ranks go on, or have not yet told twice that they do not."""
+        """Return the error message; "" while ranks make progress.
+
+        It is also "" until two different heartbeats of each rank, or none for long, show that it
+        does not.
+        """
         # a rank that computes waits for nobody
         patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)
         posts: dict[int, HeartbeatMessages | None] = {self._ranks.rank: mine}

@@ -1,12 +1,12 @@
 # mypy: ignore-errors
-"""CUDA graphs of a step's launches: captured once, their arguments are read from memory of the device.
+"""CUDA graphs of a step's launches, whose arguments lie in device memory.
 
-What changes from run to run (windows, list lengths, replaced arrays, `Scalar`s) stands in memory of
-the host, see `memory.py`. The arguments of all kernels of a graph lie one after another in one
-array of the device, the *image*. Each run gathers the changed numbers in one pinned buffer. The
-graph copies it to the device, writes its bytes to their places in the image (one kernel), and
-launches the kernels, each of which reads its arguments from there. Launch dimensions are those of
-the largest rows; threads beyond the present ones return at once.
+A graph is captured once. Quantities that change from run to run (windows, list lengths, replaced
+arrays, `Scalar`s) stand in memory of the host, see `memory.py`. The arguments of all kernels of a
+graph lie one after another in one array of the device, the *image*. Each run gathers the changed
+numbers in one pinned buffer. The graph copies it to the device, writes its bytes to their places in
+the image (one kernel), and launches the kernels, each of which reads its arguments from there.
+Launch dimensions are those of the largest rows; threads beyond the present ones return at once.
 """
 
 import ast
@@ -41,7 +41,8 @@ BEYOND = {
 plane_, row_, chunk_ = wp.tid()
 if row_ >= given_[0].{{0}}.rows or chunk_ >= given_[0].{{0}}.chunks:
     return
-if wp.int64((plane_ * given_[0].{{0}}.rows + row_) * given_[0].{{0}}.chunks + chunk_) >= given_[0].{FIRST}:
+if wp.int64((plane_ * given_[0].{{0}}.rows + row_) * given_[0].{{0}}.chunks + chunk_) \
+>= given_[0].{FIRST}:
     return
 """,
 }
@@ -61,7 +62,10 @@ def patch_kernel(
 
 @functools.cache
 def pass_from_memory(form: Any) -> Any:
-    """Return the struct of a pass's arguments, and the kernel that reads them from the first element of an array of such structs."""
+    """Return a kernel's argument struct, and the kernel that reads it from memory.
+
+    That kernel takes an array of such structs and reads the first element.
+    """
     if form.pattern is not None and form.pattern.touch is not None:
         raise NotRecordable(f"{form.declared.label}: a stencil of Warp functions")
     run, Fields = form.run, form.fields
@@ -93,7 +97,9 @@ _KERNELS: dict[Any, Any] = {}
 
 
 def kernel_from_memory(kernel: Any, sized: int) -> Any:
-    """Return the struct of a Warp kernel's arguments, and the same kernel with arguments from an array of one such struct.
+    """Return the struct of a Warp kernel's arguments, and a kernel that reads it.
+
+    That kernel takes an array of one such struct instead of arguments.
 
     Args:
         kernel: the kernel.
@@ -214,7 +220,10 @@ class DeviceGraph(CommandBuffer):
         self._add(kernel, struct, room, memory, patches, bound)
 
     def _hold(self, memory: Any) -> tuple[int, ...]:
-        """Return the launch dimensions for rows in memory, which `fits` compares with those of a later run."""
+        """Return the launch dimensions for rows in memory.
+
+        `fits` compares them with those of a later run.
+        """
         self._extents.append((memory, memory.room))
         return memory.room
 
@@ -291,7 +300,10 @@ class DeviceGraph(CommandBuffer):
         self._prepare_patches(image)
 
     def _prepare_patches(self, image: wp.array[Any]) -> None:
-        """Make the buffer of what changes, its copy to the device, and the launch that writes it to the image."""
+        """Create the buffer of changing arguments, its copy, and the patch launch.
+
+        The launch writes the bytes to the image.
+        """
         places: dict[tuple[int, int], int] = {}
         size, source, place = 0, [], []
         for at, address, count in self._patches:
@@ -332,7 +344,10 @@ class DeviceGraph(CommandBuffer):
         return self._captured(commands)
 
     def run(self) -> None:
-        """Launch the graph, or have it wait for others, see `joined.py`; the first time launch by launch, which loads the kernels."""
+        """Launch the graph, or queue it to be joined with others, see `joined_graphs.py`.
+
+        The first run launches kernel by kernel, which loads the kernels.
+        """
         settle(self)  # whose buffer is still to be read
         if self._buffer is not None:
             self._refresh()
@@ -340,7 +355,10 @@ class DeviceGraph(CommandBuffer):
             self.launch_now()
 
     def launch_now(self) -> None:
-        """Launch the graph with what its buffer holds; loops that are new launch a graph of their own."""
+        """Launch the graph with the arguments in its buffer.
+
+        New loops launch a graph of their own.
+        """
         if self._runs:
             super().run()
         else:
@@ -362,7 +380,10 @@ class DeviceGraph(CommandBuffer):
             self._copied = noted(self.device, self._copied)
 
     def _refresh(self) -> None:
-        """Bring what has changed to the pinned buffer, once the copy of an earlier run has read it."""
+        """Write changed arguments to the pinned buffer.
+
+        It waits until the copy of an earlier run has read the buffer.
+        """
         address = self._buffer.ctypes.data
         for begin, source, count in self._sources:
             ctypes.memmove(address + begin, source, count)
@@ -375,11 +396,13 @@ class DeviceGraph(CommandBuffer):
 
 
 class Upload(DeviceGraph):
-    """Copy of an array of the host to one of the device, launched as a recorded stretch; nothing is copied that has not changed.
+    """Copy of a host array to the device, launched as a recorded stretch.
+
+    An unchanged array is not copied.
 
     Args:
         host: NumPy array, read in each run.
-        array: of the same bytes, on the device, which nothing else writes.
+        array: of the same bytes, on the device; nothing else writes to it.
     """
 
     def __init__(self, host: np.ndarray, array: wp.array[Any]) -> None:
@@ -398,7 +421,7 @@ class Upload(DeviceGraph):
         return True
 
     def run(self) -> None:
-        """Launch the copy, or have it wait for others; do nothing if the host's array is as it was."""
+        """Launch or queue the copy, if the host's array has changed."""
         address = self._sources[0][1]
         if self._sent and np.array_equal(
             self._buffer,

@@ -14,7 +14,9 @@ SLAB_PIECES, SLAB_PLANES = 4, 8
 
 
 def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
-    """Return into how many slabs planes are cut, and how many planes each has but the last: an even number, coarser planes stand for two.
+    """Return the number of slabs, and the planes of each but the last.
+
+    The planes of a slab are an even number, because a coarser plane stands for two.
 
     Args:
         planes: to cut, at least twice `least`.
@@ -31,11 +33,13 @@ def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
 
 
 class FusedKernel:
-    """Passes each of which follows some planes behind the one before: a CPU streams through memory once; on CUDA, launches.
+    """Fused kernels: each runs some planes behind the one before.
+
+    A CPU then streams through memory once. On CUDA they are separate launches.
 
     Args:
-        name: of the kernel, as a pass has one.
-        stages: at most four passes, each with how many planes it is behind the first.
+        name: of the kernel, as a stencil kernel has one.
+        stages: at most four kernels, each with how many planes it is behind the first.
 
     Raises:
         ValueError: there are too many, or the first is behind.

@@ -30,7 +30,10 @@ class HostArray:
         self._upload: Any = None  # the copy as a node of CUDA graphs
 
     def send(self) -> None:
-        """Bring `array` up to date; with graphs of steps, the copy waits among recorded stretches, see `joined.py`."""
+        """Bring `array` up to date.
+
+        With graphs of steps the copy is queued among recorded stretches, see `joined_graphs.py`.
+        """
         if self._shared:
             return
         if not LaunchGraph.on_device:

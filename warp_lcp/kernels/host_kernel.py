@@ -18,7 +18,9 @@ from warp_lcp.kernels.stencil_kernel import StencilKernel
 
 
 class HostKernel(threading.local):
-    """Memory and recorded launch of a kernel for loops too small for NumPy; each Python thread has its own.
+    """Memory and recorded launch of a kernel for loops that are slow in NumPy.
+
+    Each Python thread has its own.
 
     Args:
         kernel: has `reals` (float64) and `indices` (int32) as `whole`, float64 fields of its tasks

@@ -79,7 +79,10 @@ _sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}
 
 @contextmanager
 def joined(device: wp.Device) -> Iterator[None]:
-    """Join the graphs of recorded stretches that follow each other; on the CPU, and without graphs of steps, do nothing."""
+    """Join the graphs of consecutive recorded stretches.
+
+    On the CPU, and without graphs of steps, it does nothing.
+    """
     if not (device.is_cuda and LaunchGraph.on_device):
         yield
         return
@@ -93,7 +96,10 @@ def joined(device: wp.Device) -> Iterator[None]:
 
 
 def waits(program: DeviceGraph) -> bool:
-    """Have a stretch wait, whose changed numbers are in its buffer; return False where it is to be launched now."""
+    """Queue a stretch whose changed arguments are in its buffer.
+
+    Returns False if it is to be launched now.
+    """
     if not (WAITING.depth and program.has_run) or WAITING.idle:
         WAITING.idle = False
         return False
@@ -118,7 +124,10 @@ def settle(program: DeviceGraph | None = None) -> None:
 
 
 def _graph_of(programs: list[DeviceGraph]) -> Any:
-    """Return the graph of a sequence of stretches; None where the sequence has come for the first time."""
+    """Return the graph of a sequence of stretches.
+
+    Returns None when the sequence comes for the first time.
+    """
     key = tuple(map(id, programs))
     references, graph = _sequences.get(key, ((), None))
     if len(references) != len(programs) or any(
@@ -152,7 +161,10 @@ def _settle_before_warp() -> None:
 
 
 def _settling(plain: Callable[..., Any], *, idle: bool) -> Callable[..., Any]:
-    """Return a function of Warp that launches first what waits; `idle`: the device has nothing left to do after it."""
+    """Return a function of Warp that first launches the queued stretches.
+
+    `idle`: the device has finished all work after it.
+    """
 
     @functools.wraps(plain)
     def called(*args: Any, **options: Any) -> Any:

@@ -1,6 +1,7 @@
-"""Kernels of a header: their roles stand above their row functions, and Python takes the kernels by name.
+"""Kernels of a header file: parser of their declarations.
 
-A declaration is a comment of a description and of lines with three blanks, a role and what has it;
+The roles of a kernel's arguments stand above its row function; Python takes the kernels by name. A
+declaration is a comment of a description and of lines with three blanks, a role and its arguments;
 more blanks continue a line:
 
     // kernel cycle.sweep: a Jacobi sweep, y = x + omega (b - A x) / d, clipped to the bounds
@@ -11,12 +12,12 @@ more blanks continue a line:
     //   numbers    S omega; bool from_zero, projected
     SIMD for (int k = 0; k < n; ++k) ...
 
-Roles are the words of `StencilKernel`, except that `name?` marks an array that may be None. Fields and
-numbers stand as in C: a type, then names. A type is Warp's (`float32`, `int8`, `vec3`), `int` or
-`bool` of Python, a capital letter for the type of the arrays given, `T` for the type of
-computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python.
-`constants AXIS, ROUNDED = 0`: Python computes the first, the second has a usual value.
-`module multigrid`: compiled in one Warp module with others that have the line.
+Roles are the words of `StencilKernel`, except that `name?` marks an array that may be None. Fields
+and numbers stand as in C: a type, then names. A type is Warp's (`float32`, `int8`, `vec3`), `int`
+or `bool` of Python, a capital letter for the type of the arrays passed in, `T` for the type of
+computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python. `constants
+AXIS, ROUNDED = 0`: Python computes the first, the second has a default value. `module multigrid`:
+compiled in one Warp module with others that have the line.
 """
 
 from __future__ import annotations

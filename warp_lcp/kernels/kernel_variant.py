@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Forms of row passes: a pass whose types and constants are known, its C++ source and its kernel."""
+"""Kernel variants: C++ source and Warp kernel of a declaration with fixed types.
+
+The constants are fixed as well.
+"""
 
 import ctypes
 import functools
@@ -67,7 +70,10 @@ def form_of(
     *,
     quads: Quads | None = None,
 ) -> "KernelVariant":
-    """Return the form of a pass with these types, constants, stencil and bounds, by `quads` of cells if told."""
+    """Return the variant with these types, constants, stencil and bounds.
+
+    `quads`: a thread takes four cells.
+    """
     return KernelVariant(declared, dict(letters), dict(constants), shape, bounds, quads=quads)
 
 
@@ -79,7 +85,10 @@ TOGETHER: dict[
 def make_kernels_of_module(
     form: "KernelVariant", letters: Any, shape: str | Pattern, bounds: str
 ) -> None:
-    """Make the kernels that belong to a form's module before Warp loads it: for one more it would compile all of them again."""
+    """Create all kernels of a variant's module before Warp loads it.
+
+    If a kernel were added later, Warp would compile all of them again.
+    """
     if not form.declared.module or form.pattern is not None:
         return
     for other in TOGETHER[form.declared.module]:
@@ -166,7 +175,11 @@ class KernelVariant:
     def _source(
         self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any
     ) -> str:
-        """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
+        """Return the kernel's body in C++.
+
+        It is a loop over pieces with pointers by name, the shared functions, the row function and
+        the sums.
+        """
         d, pattern = self.declared, self.pattern
         assert not (self.quads and (pattern or not d.quads)), d.label
         into = not {*d.ring}.isdisjoint(d.writes)
@@ -306,7 +319,10 @@ class KernelVariant:
         )
 
     def _source_of_quads(self, head: list[str], macros: dict[str, Any], of: Any) -> str:
-        """Return the body for quads: a loop over planes, in it the row function twice, for four cells and for fewer."""
+        """Return the kernel's body for quads in C++.
+
+        It is a loop over planes with the row function twice: for four cells and for fewer.
+        """
         d = self.declared
         found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
         sums = (
@@ -373,7 +389,10 @@ class KernelVariant:
         return made
 
     def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
-        """Return C++ that declares the fields at a quad's first cell, by name; `kept`: in registers, as `quad.h` does."""
+        """Return C++ that declares the fields at a quad's first cell, by name.
+
+        `kept`: they are held in registers, as `quad.h` does.
+        """
         d = self.declared
         made = []
         of_other = "in_other_" if kept else "in_"
@@ -414,7 +433,10 @@ class KernelVariant:
         return made
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
-        """Return the struct of arguments as C has it: structs and arrays, which fill whole eight bytes, side by side, then numbers."""
+        """Return the C layout of the argument struct.
+
+        Structs and arrays come first, side by side, as they fill whole eight bytes; then numbers.
+        """
         parts = [] if stencil is None else [stencil.struct.__ctype__()]
         if bounds is not None:
             lower, least, upper, most, code = bounds
@@ -431,7 +453,10 @@ class KernelVariant:
         return b"".join(parts).ljust(self._size, b"\0")
 
     def struct_of(self, bound: "BoundKernel") -> Any:
-        """Return the struct of arguments for Warp, which keeps them alive; a capture on the CPU looks for the arrays by name."""
+        """Return the argument struct for Warp, which keeps the arrays alive.
+
+        A capture on the CPU finds the arrays in it by name.
+        """
         stencil, bounds = bound.kept
         members = {name: bound.given[name] for name in self.types}
         if stencil is not None:
@@ -510,7 +535,10 @@ class KernelVariant:
         return form_of(self.declared, *self._chosen, quads=quads)
 
     def dim(self, layout: Any) -> tuple[int, ...]:
-        """Return the dimensions of a launch of the kernel: by quads one, for three would be divided in 64 bits."""
+        """Return the dimensions of a launch of the kernel.
+
+        Quads use one dimension, because three would be divided in 64 bits.
+        """
         return (math.prod(threads(layout)),) if self.quads else threads(layout)
 
     def entry(self, bound: "BoundKernel") -> TableEntry:

@@ -1,4 +1,7 @@
-"""Launches that are recorded once and run again: on the CPU by a team of threads in native code, on CUDA as a graph."""
+"""Launches that are recorded once and repeated.
+
+On the CPU a thread pool executes them in native code; on CUDA they form a graph.
+"""
 
 from __future__ import annotations
 
@@ -56,12 +59,18 @@ def recording(program: CommandBuffer) -> Iterator[None]:
 
 
 def loops_on_device(device: wp.Device) -> bool:
-    """Return whether loops run on the device, without the host: on the CPU by the team, on CUDA from driver 12.4."""
+    """Return whether loops run on the device, without the host.
+
+    The thread pool runs them on the CPU; CUDA needs driver 12.4.
+    """
     return bool(wp.is_conditional_graph_supported()) if device.is_cuda else team() is not None
 
 
 def device_program(launch: Any = None) -> Any:
-    """Return the `DeviceGraph` that records what this thread launches; None: there is none, or `launch` records."""
+    """Return the `DeviceGraph` that records this thread's launches.
+
+    Returns None if there is none, or if `launch` records.
+    """
     program = RECORDING.program
     if (
         program is None
@@ -82,7 +91,11 @@ class Launch(Protocol):
 
 
 def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: Any) -> Any:
-    """Launch a kernel by Warp; a default argument that holds `wp.launch` itself would pass by what waits, see `joined.py`."""
+    """Launch a kernel by Warp at once.
+
+    A default argument that held `wp.launch` itself would bypass queued stretches, see
+    `joined_graphs.py`.
+    """
     return wp.launch(kernel, dim, inputs, device=device, **options)
 
 
@@ -113,7 +126,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Conditional:
-    """A program that is launched if a number on the device is not 0: in a graph, or by the team, without the host."""
+    """A program that is launched if a number on the device is not 0.
+
+    A graph or the thread pool decides, without the host.
+    """
 
     condition: wp.array[Any]
     program: CommandBuffer
@@ -136,7 +152,10 @@ class Loop:
 
 
 def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
-    """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
+    """Call a function or run an operation of the thread pool, or record it.
+
+    It runs at once if `launch` launches at once.
+    """
     program = getattr(launch, "__self__", None)
     if not isinstance(program, CommandBuffer):
         program = RECORDING.program
@@ -150,7 +169,11 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
 
 @contextmanager
 def together(device: wp.Device) -> Iterator[Launch]:
-    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches now or records."""
+    """Yield a launch function that records one table for the thread pool.
+
+    The table runs at the end of the block. On CUDA the function launches at once or records a
+    graph.
+    """
     if device.is_cuda or team() is None:
         yield launch
         return
@@ -161,9 +184,10 @@ def together(device: wp.Device) -> Iterator[Launch]:
 
 @contextmanager
 def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
-    """Record what is launched within by `warp_lcp.kernels`; the team works through it as one table afterwards. Nothing is read within.
+    """Record the launches of a `with` block as one table for the thread pool.
 
-    On CUDA, and where fields are shared `across` ranks, launches are done at once.
+    The table runs at the end of the block. Nothing may be read from the device within. Launches run
+    at once on CUDA, and where `across` is a communicator of several ranks.
     """
     if device.is_cuda or across is not None or is_recording() or team() is None:
         yield
@@ -200,17 +224,19 @@ def launch_ranges(
     sized: int = 0,
     extent: Any = None,
 ) -> None:
-    """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
+    """Launch or record a kernel whose first argument begins with a range of tasks.
+
+    A thread takes such a range.
 
     Args:
         kernel: with as many coordinates of a thread as `dim` has.
         dim: of the launch where there is no such range.
-        cells: what a task costs, in cells of a usual pass.
+        cells: cost of a task, in cells of a usual kernel.
         inputs: arguments; numbers may be `Scalar`.
-        device: where.
+        device: of the launch.
         launch: of a program; None: now.
         ordered: whether tasks write what others read or write.
-        first: what of the first argument recorded launches read from memory.
+        first: patches of the first argument, which recorded launches read from memory.
         sized: address of the number of tasks then; 0: that of `dim`.
         extent: memory whose `room` bounds the launch dimensions on CUDA; None: they are always
             `dim`.
@@ -245,7 +271,10 @@ def launch_ranges(
 
 
 def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]:
-    """Return what of a kernel's arguments, a struct in C, is read from memory: numbers and arrays that others replace."""
+    """Yield the kernel arguments that are read from memory in each run.
+
+    They are numbers and replaceable arrays; the arguments are a struct in C.
+    """
     for i, value in enumerate(inputs):
         if type(value) is Scalar:
             yield (getattr(native, f"p{i}").offset, *value.address(kernel.adj.args[i].type))
@@ -274,7 +303,10 @@ def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 
 
 
 def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
-    """Copy an array to another of the same type and size whose elements lie side by side, now or among recorded launches."""
+    """Copy an array to another one of the same type and size, now or recorded.
+
+    Both are contiguous.
+    """
     program = RECORDING.program
     if program is None:
         wp.copy(to, source)
@@ -372,7 +404,10 @@ class CommandBuffer:
             self.record(_alone(kernel, dim, inputs))
 
     def record(self, what: Any) -> None:
-        """Record a recorded launch, an operation of the team, a task of the host or, where loops run on the device, a conditional."""
+        """Record a launch, an operation, a host task or a conditional.
+
+        An operation belongs to the thread pool; conditionals need loops on the device.
+        """
         if isinstance(what, Conditional) and not self.device.is_cuda:
             self._arguments.append(what)
             self._commands += [
@@ -400,7 +435,10 @@ class CommandBuffer:
 
     @property
     def has_run(self) -> bool:
-        """Whether all of its kernels are loaded: it has run, or they were loaded as they were recorded, on the CPU."""
+        """Whether all of its kernels are loaded.
+
+        They are after a run, and on the CPU after recording.
+        """
         return self._runs > 0 or not self.device.is_cuda
 
     def extend(self, other: CommandBuffer) -> None:
@@ -460,7 +498,10 @@ class CommandBuffer:
         return self._runs > 0  # the first run loads the kernels
 
     def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
-        """Return what launches a graph, or has the team work through a table, that repeats the launches."""
+        """Return a function that repeats the launches.
+
+        It launches a graph, or runs a table in the thread pool.
+        """
         if not self.device.is_cuda and team() is not None:
             return partial(_run_while, condition.numpy(), OperationTable(self._commands, condition))
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
@@ -502,7 +543,10 @@ class CommandBuffer:
             command.launch()
 
     def differs(self, other: CommandBuffer) -> str:
-        """Say where operations differ from another program's in more than what they read from memory; "" if nowhere."""
+        """Return where operations differ from another program's; "" if nowhere.
+
+        Arguments that are read from memory may differ.
+        """
         if len(self._commands) != len(other._commands):
             return f"{len(self._commands)} operations, {len(other._commands)} before"
         for at, (mine, its) in enumerate(zip(self._commands, other._commands, strict=True)):
@@ -516,7 +560,10 @@ class CommandBuffer:
 
 
 def _identity(argument: Any) -> Hashable:
-    """Return by what a recording knows an argument: an array by its address, unless it is replaced by others; a list by its elements."""
+    """Return the identity of an argument in a recording.
+
+    An array is known by its address, unless it is replaceable; a list by its elements.
+    """
     if isinstance(argument, wp.array):
         slot = getattr(argument, "slot", None)
         return (argument.ptr, argument.shape) if slot is None else slot.address
@@ -535,10 +582,11 @@ class NotRecordable(Exception):
 
 
 class LaunchGraph:
-    """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
+    """Recorded launches of a part of a step, between two decisions of the host.
 
-    On CUDA it is one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where
-    launches must go through Warp, `record` is called in each run.
+    They are recorded in the first run; on the CPU, later runs are one native call. On CUDA it is
+    one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where launches must go
+    through Warp, `record` is called in each run.
 
     Args:
         device: where the kernels run.
@@ -602,7 +650,10 @@ class LaunchGraph:
         self._programs = {}
 
     def _recorded(self, arguments: tuple[Any, ...]) -> CommandBuffer | None:
-        """Return the program of some arguments; None where a graph of CUDA cannot hold it, so that it is launched in each run."""
+        """Return the program of some arguments.
+
+        Returns None where a CUDA graph cannot hold it, so that it is launched in each run.
+        """
         if not self.device.is_cuda:
             program = CommandBuffer(self.device)
             with recording(program):

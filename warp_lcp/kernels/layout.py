@@ -65,10 +65,13 @@ ANYWHERE = Alignment()
 
 @wp.struct
 class RowLayout:
-    """Where the rows lie, and how threads share them: a thread takes a chunk of a row in a slab of planes."""
+    """Position of the rows in memory, and how threads share them.
 
-    # of the tasks that a team's thread takes, see `warp_lcp.kernels.thread_pool`: the first, one past the
-    # last; 0: one task a thread
+    A thread takes a chunk of a row in a slab of planes.
+    """
+
+    # Range of tasks of a thread of the pool, see `warp_lcp.kernels.thread_pool`: the first, one
+    # past the last; 0: one task a thread.
     begin: int
     end: int
     base: wp.int64  # element of the first cell
@@ -143,7 +146,10 @@ def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> N
 
 
 def put(struct: Any, members: Mapping[str, Any]) -> Any:
-    """Set members of a Warp struct whose types have been checked, and return it: in a third of the time that attributes take."""
+    """Set members of a Warp struct and return it, without checking their types.
+
+    It takes a third of the time of setting attributes.
+    """
     native = struct.__ctype__()
     for name, value in members.items():
         kind = type(value)
@@ -164,7 +170,10 @@ def put(struct: Any, members: Mapping[str, Any]) -> Any:
 
 
 def copy_of(struct: Any) -> Any:
-    """Return a copy of a Warp struct, in a fraction of the time that it takes to make one with others in it."""
+    """Return a copy of a Warp struct.
+
+    It takes a fraction of the time of constructing one with nested structs.
+    """
     native = struct.__ctype__()
     made = object.__new__(type(struct))
     made.__dict__.update(struct.__dict__, _ctype=type(native).from_buffer_copy(native))
@@ -209,10 +218,16 @@ class Pattern:
     def word(self) -> str:
         """What tells its kernels from others."""
         mask = sum(1 << (x + 1 + 3 * (y + 1) + 9 * (z + 1)) for x, y, z in self.offsets)
-        return f"compact_{'symmetric_' * self.symmetric}{self.kind}{_number_of(self.functions)}_{mask:x}"
+        return (
+            f"compact_{'symmetric_' * self.symmetric}{self.kind}"
+            f"{_number_of(self.functions)}_{mask:x}"
+        )
 
     def source(self) -> list[str]:
-        """Return C++ that `stencil.h` needs: a function of the piece's cell for each weight, and a macro that visits all of them."""
+        """Return C++ for `stencil.h`: weight functions and a macro that visits them.
+
+        There is one function of the piece's cell for each weight.
+        """
         made = [
             f"const auto weight{i} = [&](long long k) -> T {{ return (T)({self._expression(i)}); "
             f"}};"
@@ -240,7 +255,10 @@ class Pattern:
 
     @functools.cached_property
     def touch(self) -> Any:
-        """A Warp function that calls all of them, so that whatever calls it has their code; None of others."""
+        """A Warp function that calls all weight functions; None if there are none.
+
+        A kernel that calls it contains their code.
+        """
         touch = None
         for function in self.functions:
             touch = touch if isinstance(function, float) else _touching(function, touch)
@@ -271,7 +289,10 @@ def _touching(function: Any, before: Any) -> Any:
 
 @functools.cache
 def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
-    """Return the struct of a stencil whose diagonal and weights have these types: a 7-point one, unless it has a pattern."""
+    """Return the struct of a stencil with these types of diagonal and weights.
+
+    It is a 7-point stencil, unless there is a pattern.
+    """
     fields, numbers = (
         (("wx", "wy", "wz"), ("cx", "cy", "cz"))
         if pattern is None
@@ -316,7 +337,10 @@ def _blank_stencil(d: Any) -> Any:
 
 
 def make_struct(name: str, members: dict[str, Any]) -> Any:
-    """Return a Warp struct with these members. Make one once: annotations of arrays do not compare equal."""
+    """Return a Warp struct with these members.
+
+    Make each struct once: annotations of arrays do not compare equal.
+    """
     return wp.struct(
         type(name, (), {"__annotations__": members, "__module__": __name__, "__qualname__": name})
     )
@@ -324,20 +348,20 @@ def make_struct(name: str, members: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows that a pass visits.
+    """The rows that a kernel visits.
 
     Attributes:
-        summed: their layout for a pass that sums.
+        summed: their layout for a kernel that sums.
         single: their layout for one that does not: a plane a thread.
         size: elements of a field.
         other_size: elements of a field of the other level of a transfer; 0: there is none.
         device: where the fields are.
         place: first stored cell of a box.
         ends: one past the last stored cell (k, j, i) of a box.
-        weight: cells of a usual pass that one costs as much as.
-        memory: a `warp_lcp.kernels.memory.RowsMemory` that recorded launches read in each run; None:
-            rows are always these.
-        quads: their layout for a pass on CUDA that does not sum and whose threads take quads of
+        weight: cost of a cell, in cells of a usual kernel.
+        memory: a `warp_lcp.kernels.memory.RowsMemory` that recorded launches read in each run;
+            None: the rows never change.
+        quads: their layout for a kernel on CUDA that does not sum and whose threads take quads of
             cells; threads that sum take as many there. None: threads take cells.
         alignments: where rows of fields begin, and those of the other level.
     """
@@ -363,7 +387,10 @@ class Rows:
         whole: bool = False,
         more: int = 0,
     ) -> "Rows":
-        """Return the rows of a padded grid and `more` beyond, or what their spans have of them; a thread takes a `whole` one."""
+        """Return the rows of a padded grid and `more` beyond, or those of its spans.
+
+        `whole`: a thread takes a whole row.
+        """
         steps, counts = (
             (padding.plane + padding.row + 1, padding.plane, padding.row),
             tuple(n + more for n in padding.counts),
@@ -382,7 +409,10 @@ class Rows:
     def part(
         padding: Padding, device: wp.Device, low: Sequence[int], high: Sequence[int]
     ) -> "Rows":
-        """Return the cells low <= (k, j, i) < high of a padded grid, from -1 and up to one more than there are for ghosts; whole rows."""
+        """Return the cells low <= (k, j, i) < high of a padded grid.
+
+        Ghost cells have the indices -1 and n. A thread takes whole rows.
+        """
         strides, counts = (
             (padding.plane, padding.row, 1),
             tuple(end - begin for begin, end in zip(low, high, strict=True)),
@@ -394,7 +424,10 @@ class Rows:
 
     @staticmethod
     def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
-        """Return the ghost cells beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z."""
+        """Return the ghost cells beyond a side of the grid.
+
+        The axis is 0, 1, 2 for x, y, z; the end is 0 for the lower and 1 for the upper side.
+        """
         low, high = [0, 0, 0], list(padding.counts)
         low[2 - axis], high[2 - axis] = (
             (padding.counts[2 - axis], padding.counts[2 - axis] + 1) if end else (-1, 0)
@@ -437,12 +470,18 @@ class Rows:
 
     @staticmethod
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
-        """Return a flat field as one row, on CUDA as rows as long as there are threads that sum; `serial`: one row for one thread."""
+        """Return a flat field as one row; on CUDA, as rows for the threads that sum.
+
+        `serial`: one row for one thread.
+        """
         return _flat(size, device.alias, serial)
 
     @staticmethod
     def of_fields(layout: Layout) -> "Rows":
-        """Return a layout's stored fields as one row, without the chunks of it that have never been in use; sums have the same order."""
+        """Return a layout's stored fields as one row, without unused chunks.
+
+        Chunks that were never in use are skipped. Sums have the same order.
+        """
         if layout.rows is None:
             layout.rows = Rows.flat(layout.size, layout.device)
             if layout.chunks is not None:
@@ -467,7 +506,9 @@ class Rows:
         cells: int | None = None,
         slab: int | None = None,
     ) -> "Rows":
-        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells`, of `slab` planes if it sums.
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid.
+
+        A thread takes some `cells`, of `slab` planes if it sums.
 
         Raises:
             ValueError: low is not between 0 and high.
@@ -502,7 +543,10 @@ class Rows:
     def entries(
         count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1
     ) -> "Rows":
-        """Return a list's entries as the row of a box; a thread takes some `cells` of them, which cost as much as `weight` of a grid."""
+        """Return a list's entries as the row of a box.
+
+        A thread takes some `cells` of them. An entry costs as much as `weight` cells of a grid.
+        """
         return replace(Rows.box((0, 0, 0), (1, 1, count), device, cells=cells), weight=weight)
 
     @staticmethod
@@ -516,7 +560,10 @@ class Rows:
 
     @staticmethod
     def by_turns(size: int, device: wp.Device, width: int, *, quads: bool = False) -> "Rows":
-        """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
+        """Return a flat field as rows of a width.
+
+        A thread of a kernel that sums takes the same position of each row, its neighbor the next.
+        """
         planes = -(-size // width)
         ends = np.full((planes, 1, 2), (0, width))
         ends[-1:, 0, 1] -= planes * width - size
@@ -544,9 +591,11 @@ class Rows:
         *,
         quads: bool = False,
     ) -> "Rows":
-        """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells.
+        """Return rows by strides and counts.
 
-        Threads on CUDA take some `cells` each, or four where `quads` and a pass has it so.
+        The arguments are the first cell's element, the steps from plane to plane and row to row,
+        and counts of planes, rows, cells. Threads on CUDA take some `cells` each, or four where
+        `quads` is set and the kernel allows it.
 
         Raises:
             TypeError: spans are of another type.
@@ -602,7 +651,10 @@ class Rows:
 
     @functools.cached_property
     def _pairs(self) -> dict[tuple[int, Any], tuple["Rows", "Rows"]]:
-        """Rows with another level's beside them: of each level and factors that have been asked for, and which that is."""
+        """Cache of rows paired with those of another level.
+
+        The key is the other level and the factors between both.
+        """
         return {}
 
     def _beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":

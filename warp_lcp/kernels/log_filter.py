@@ -1,4 +1,7 @@
-"""What a user hears of Warp: one line when kernels are compiled, instead of a banner and a line for every module."""
+"""Log filter for Warp: one line when kernels are compiled.
+
+It replaces Warp's banner and its line for every module.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +22,16 @@ LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+
 
 
 class KernelMessages:
-    """A logger for Warp that says once for each device that kernels are being compiled, when the first of them has been.
+    """A logger for Warp that reports once for each device that kernels are compiled.
 
-    It drops Warp's banner and what Warp says of each module of this library; all else goes where it
-    went. `wp.config.log_level` has its usual meaning: above `wp.LOG_INFO` there is no line either,
-    at `wp.LOG_DEBUG` Warp says all that it says without this library, and so it does after
-    `wp.set_logger(None)`.
+    The line appears when the first kernel has been compiled. The logger drops Warp's banner and its
+    messages about modules of this library; all else passes through. `wp.config.log_level` has its
+    usual meaning: above `wp.LOG_INFO` there is no line either. At `wp.LOG_DEBUG`, and after
+    `wp.set_logger(None)`, all messages of Warp appear.
 
     Args:
         logger: takes the rest.
-        stream: takes the line; the error stream as it is then unless given.
+        stream: takes the line; default: the error stream at the time of the line.
     """
 
     def __init__(self, logger: wp.Logger, stream: TextIO | None = None) -> None:
@@ -60,9 +63,10 @@ class KernelMessages:
 
 @functools.cache
 def start_warp() -> None:
-    """Start Warp if nothing has, without what its native code writes of a CUDA driver that is not there: no setting of Warp's drops that.
+    """Start Warp, without its native message about a missing CUDA driver.
 
-    At `wp.LOG_DEBUG` it is written. What Warp says in Python, its logger drops.
+    No setting of Warp drops that message. At `wp.LOG_DEBUG` it is written. Warp's messages from
+    Python go to its logger. Does nothing if Warp has started.
 
     Raises:
         OSError: there is no place for compiled kernels.

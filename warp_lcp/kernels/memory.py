@@ -86,7 +86,10 @@ def value_of(number: Any) -> Any:
 
 
 class Slot:
-    """Address of an array that other arrays replace between runs; the current array has it as attribute `slot`."""
+    """Address of an array that is replaced between runs.
+
+    The current array has it as attribute `slot`.
+    """
 
     __slots__ = ("_held", "_length", "_memory", "address")
 
@@ -111,12 +114,12 @@ class Slot:
 
 
 class RowsMemory:
-    """Rows that change between runs: their layout, the first cell of a box, and the number of tasks.
+    """Rows that change between runs: layout, first cell of a box, number of tasks.
 
     Attributes:
         layout: native struct of the layout.
         place: first (k, j, i) of a box.
-        tasks: of a pass over the rows.
+        tasks: number of tasks of a kernel over the rows.
     """
 
     __slots__ = ("layout", "place", "tasks")
@@ -126,7 +129,10 @@ class RowsMemory:
         self.place, self.tasks = (ctypes.c_int32 * 3)(), ctypes.c_int64()
 
     def patches(self, place: int | None) -> list[tuple[int, int, int]]:
-        """Return what a launch reads; `place`: offset of `k0` in its arguments, None: it has none."""
+        """Return the patches of a launch.
+
+        `place`: offset of `k0` in its arguments; None: it has none.
+        """
         found = [(0, ctypes.addressof(self.layout), LAYOUT_BYTES)]
         return (
             found
@@ -149,7 +155,10 @@ class RowsMemory:
         self.tasks.value = planes * rows * chunks
 
     def take_entries(self, count: int, cells: int) -> int:
-        """Take the entries of a list over on the CPU, as `Rows.entries` with so many `cells` a task; return the number of tasks."""
+        """Set the rows to the entries of a list, on the CPU; return the tasks.
+
+        The layout is that of `Rows.entries` with so many `cells` a task.
+        """
         chunks = -(-count // cells)
         self.take_box(count, 1, 1, cells, chunks, (0, 0, 0))
         return chunks
@@ -169,12 +178,12 @@ class RowsMemory:
 
 
 class DeviceRows(RowsMemory):
-    """Rows that change between runs, on CUDA: with the launch dimensions that they take, and those that a graph is captured with.
+    """Rows that change between runs, on CUDA, with their launch dimensions.
 
     Attributes:
         extent: threads of a launch (slabs, rows, chunks) now.
-        room: those of a captured launch: the largest that have been asked for, those beyond the
-            rows return at once.
+        room: those of a captured launch: the largest requested so far. Threads beyond the rows
+            return at once.
         places: number of threads, of which each has a place for its sums.
     """
 

@@ -1,9 +1,10 @@
-"""C++ of headers as text: so Warp sees changes, which it does not through `#include`, and errors name file and line.
+"""C++ headers as text with resolved includes.
 
+Warp sees changes of the text, which it does not through `#include`, and errors name file and line.
 A header of an area has sections: kernels, which `kernel_file.py` reads, and snippets that several
-of them include. A section begins with a line `// kernel NAME: description` or
-`// snippet NAME: description` and ends where the next one begins. `#include "NAME"` stands for the
-body of a section of the same file, `#include "FILE.h:NAME"` for one of a file beside it or in
+of them include. A section begins with a line `// kernel NAME: description` or `// snippet NAME:
+description` and ends where the next one begins. `#include "NAME"` stands for the body of a section
+of the same file, `#include "FILE.h:NAME"` for one of a file beside it or in
 `warp_lcp/kernels/headers`, `#include "FILE.h"` for the whole file.
 """
 

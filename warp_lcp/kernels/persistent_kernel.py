@@ -28,7 +28,10 @@ MOST = 5  # forms
 
 @wp.struct
 class EmptyArguments:
-    """Fields of a form that a sequence does not have; of eight bytes, as all structs of arguments are."""
+    """Arguments of an unused kernel variant of a persistent kernel.
+
+    Eight bytes, as all structs of arguments are multiples of that.
+    """
 
     unused: wp.int64
 
@@ -39,19 +42,21 @@ def nothing(L: RowLayout, F: EmptyArguments, slab: int, row: int, chunk: int, co
 
 
 class PersistentKernel:
-    """A table of passes on the device, which one launch works through: grids of 16^3 cells take less time than launches.
+    """A table of kernels on the device that one launch executes.
+
+    Grids of 16^3 cells take less time than launches.
 
     Args:
-        name: of the kernel, as a pass has one.
-        stages: the passes in order, of five forms at most, without sums. Those that are the same
-            object are kept once.
+        name: of the kernel, as a stencil kernel has one.
+        stages: the kernels in order, of five variants at most, without sums. Those that are the
+            same object are stored once.
 
     Attributes:
-        tasks: the most of a pass.
+        tasks: the largest number of tasks of a kernel.
         threads: of the launch.
 
     Raises:
-        ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
+        ValueError: no kernel, too many variants, a kernel that sums, or kernels on several devices.
     """
 
     def __init__(self, name: str, stages: list[BoundKernel]) -> None:
@@ -150,7 +155,10 @@ def has_clusters(device: wp.Device) -> bool:
 
 @functools.cache
 def _shared(form: KernelVariant | None) -> Any:
-    """Return the struct of a pass with its arguments, and the function by which threads share its rows."""
+    """Return the struct of a kernel with its arguments, and its sharing function.
+
+    The function distributes the kernel's rows over threads.
+    """
     run, Fields = (form.run_in_turn, form.fields) if form else (nothing, EmptyArguments)
     Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
     pieces = wp.array(dtype=Piece)

@@ -1,4 +1,7 @@
-"""Numbers that kernels leave on a device for the host, which waits for the device whenever it reads: those of a device come together."""
+"""Small results on a device that the host reads in one copy.
+
+The host waits for the device whenever it reads, so the numbers of a device are copied together.
+"""
 
 from __future__ import annotations
 

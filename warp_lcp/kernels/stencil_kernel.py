@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""Row passes: declared by fields with roles and a C++ row function, launched by name, composed to waves.
+"""Stencil kernels: fields with roles and a C++ row function, launched by name.
 
-A row function sees a piece: pointers to its first cell, the number n of its cells, the offsets ym,
-yp, zm, zp of the rows beside it.
+They can be composed to fused kernels. A row function sees a piece: pointers to its first cell, the
+number n of its cells, the offsets ym, yp, zm, zp of the rows beside it.
 """
 
 import functools
@@ -139,7 +139,10 @@ class StencilKernel:
     module: str = ""
 
     def __post_init__(self) -> None:
-        """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
+        """Check names, and create the variant of a box at once.
+
+        Otherwise a Warp module that is loaded already would be compiled again with it.
+        """
         self._check_names()
         if self.module:
             TOGETHER.setdefault(self.module, []).append(self)
@@ -211,7 +214,10 @@ class StencilKernel:
 
     @functools.cached_property
     def quads(self) -> bool:
-        """Whether a thread can take four cells of a row at a time on CUDA: of passes over the rows of grids."""
+        """Whether a thread can take four cells of a row at a time on CUDA.
+
+        Only kernels over the rows of grids can.
+        """
         elsewhere = self.box or self.ring or {*self.by_row} - {*FLAGGED}
         return not (elsewhere or self.ordered or self.by_cell)
 
@@ -237,16 +243,16 @@ class StencilKernel:
         bounds: list[Any] | None = None,
         **given: Any,
     ) -> "BoundKernel":
-        """Check and take what a launch needs.
+        """Check the arguments of a launch and bind them.
 
         Args:
-            rows: which rows.
+            rows: the rows to visit.
             structs: dataclasses whose members have the names of arguments; the kernel takes those
                 that it declares.
-            stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `PrecomputedProduct` product in
-                place of one.
+            stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `PrecomputedProduct`
+                in place of one.
             bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
-            given: arrays, numbers, and constants that are not as usual, by name; they override
+            given: arrays, numbers, and constants other than their defaults, by name; they override
                 members of structs.
 
         Raises:
@@ -265,7 +271,10 @@ class StencilKernel:
         stencil: Any = None,
         bounds: list[Any] | None = None,
     ) -> "BoundKernel":
-        """Bind as `bind` does, for functions that hand on the structs and keywords of their callers; `given` changes."""
+        """Bind as `bind` does, with structs and keywords as containers.
+
+        It serves functions that pass on the arguments of their callers. `given` is modified.
+        """
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
             raise TypeError(
@@ -364,7 +373,10 @@ class StencilKernel:
         return {**dict(zip(names, values, strict=True)), **given}
 
     def _plan(self, kinds: tuple[type, ...]) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-        """Return the arguments that structs of these classes have, and for each class what gets them, or None."""
+        """Return the arguments that structs of these classes have.
+
+        For each class: a function that gets them, or None.
+        """
         if others := [kind.__name__ for kind in kinds if not is_dataclass(kind)]:
             raise TypeError(f"{self.label}: {others[0]} is not a dataclass")
         shares = [[f.name for f in fields(kind) if f.name in self._wanted] for kind in kinds]
@@ -379,7 +391,11 @@ class StencilKernel:
     def words(
         self, letters: dict[str, Any], constants: Mapping[str, float], shape: str, bounds: str
     ) -> list[str]:
-        """Return what tells a form from others: kinds of stencil and bounds, types, constants that differ from the usual ones."""
+        """Return the key of a kernel variant.
+
+        It holds the kinds of stencil and bounds, the types, and the constants that differ from
+        their defaults.
+        """
         differing = [
             f"{name.lower()}{value}"
             for name, value in constants.items()
@@ -444,7 +460,10 @@ class StencilKernel:
 
     @functools.cached_property
     def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
-        """Names of the arrays of each length, with the attribute of rows that it is; None: of any."""
+        """Names of the arrays of each length.
+
+        The key is the attribute of rows with that length; None: any length.
+        """
         sized = (
             ("size", {**self.reads, **self.writes}),
             ("other_size", self.other),
@@ -503,7 +522,10 @@ def _getter(names: list[str]) -> Any:
 
 
 def in_blocks(fields: list[Any]) -> bool:
-    """Return whether the memory of all fields begins with a block of 16 bytes, and stays where it is."""
+    """Return whether all fields begin with an aligned block of 16 bytes.
+
+    Their memory must not be replaced later.
+    """
     arrays = [value for value in fields if isinstance(value, wp.array) and value.size]
     return all(
         value.ptr % BLOCK_BYTES == 0 and getattr(value, "slot", None) is None for value in arrays
@@ -558,7 +580,10 @@ class BoundKernel(NamedTuple):
             perform(made, launch)
 
     def operation(self) -> Operation | None:
-        """Return the pass for the team, cut into ranges of tasks; None where it has no task, or is not for the team."""
+        """Return the kernel for the thread pool, cut into ranges of tasks.
+
+        Returns None where it has no task, or does not suit the pool.
+        """
         recorded = self.rows.memory is not None and is_recording()
         if (
             self.rows.device.is_cuda
@@ -573,7 +598,10 @@ class BoundKernel(NamedTuple):
         return ranges(self.stage(), cost, ordered=self.form.declared.ordered, sized=sized)
 
     def patches(self) -> list[Patch]:
-        """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
+        """Return the patches of a recorded launch, which it reads from memory.
+
+        They are rows, numbers, and replaceable arrays.
+        """
         d, native, patches = self.form.declared, self.form.native, []
         if self.rows.memory is not None:
             patches += self.rows.memory.patches(LAYOUT_BYTES + native.k0.offset if d.box else None)

@@ -1,9 +1,9 @@
 # mypy: ignore-errors
-"""A team of threads that runs tables of CPU launches in native code: all cores of a machine in one process, with the bits of one.
+"""A thread pool that executes tables of CPU launches in native code.
 
-A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes
-the next: `headers/team.h` says how. What is computed depends neither on who does it nor on how it
-is cut.
+One process uses all cores of a machine, with the bits of one thread. A kernel is cut into ranges of
+tasks, a fused kernel into slabs of planes, and an idle thread takes the next one, see
+`headers/team.h`. The results depend neither on the thread nor on the cuts.
 """
 
 from __future__ import annotations
@@ -178,7 +178,11 @@ class OperationKind:
         )
 
     def content(self) -> tuple[Any, ...]:
-        """Return what it does: the kernel, its arguments but for what is patched, and the patches; of a copy, its words."""
+        """Return the content of the operation, to compare recordings.
+
+        It is the kernel, its arguments without the patched ones, and the patches; of a copy, its
+        words.
+        """
         if not isinstance(self.kept, tuple) or not isinstance(self.kept[0], TableEntry):
             return self.words
         memory = bytearray(self.kept[1])
@@ -429,7 +433,10 @@ class ThreadPool:
         self.size = 1
 
     def _retire(self, words: Any) -> None:
-        """Keep the words before as long as a thread that came late may read them: what they tell of is done, and may go."""
+        """Keep the former words while a late thread may still read them.
+
+        The operations that they describe are done and may be freed.
+        """
         seen = {self.words[THREADS + 8 * me] for me in range(1, self.size)}
         self._retired = [old for old in self._retired if old.buffer_info()[0] in seen]
         if self._posted is not None:
@@ -444,7 +451,10 @@ class ThreadPool:
 
 
 def patience(table: OperationTable) -> int:
-    """Return after how many nanoseconds the interpreter looks after signals, and after the deadline of a loop."""
+    """Return the time between returns to the interpreter [ns].
+
+    The interpreter then handles signals, and the deadline of a loop.
+    """
     return PATIENCE if table.again is None else int(min(PATIENCE, 1e9 * seconds_left()))
 
 
@@ -467,7 +477,9 @@ ALIGNED = {1: "B", 2: "H", 4: "I", 8: "Q"}  # formats of `struct` by their align
 
 
 class Signature:
-    """Types of a Warp kernel's arguments: packs them as C has them, in a tenth of the time that Warp takes to record a launch.
+    """Types of a Warp kernel's arguments, to pack them as C structs.
+
+    Packing takes a tenth of the time that Warp takes to record a launch.
 
     Attributes:
         entries: by launch dimensions: the kernel as C calls it, and the struct of its arguments.
@@ -522,7 +534,10 @@ class Signature:
 
 
 def _format(kind: Any) -> str:
-    """Return how `struct` packs an argument of a type, aligned as in C; "" for one that it does not."""
+    """Return the `struct` format of an argument type, aligned as in C.
+
+    It is "" for a type that cannot be packed.
+    """
     if kind in FORMATS:
         return FORMATS[kind]
     if isinstance(kind, wp.array):
@@ -566,7 +581,10 @@ def launched_alone(launch: Any, kept: Any = None) -> Operation:
 
 @functools.cache
 def _system() -> list[int]:
-    """Return the addresses of what the team needs of the system, and the number of its clock; [] where there is no such thing."""
+    """Return the addresses of system functions, and the number of the clock.
+
+    Returns [] where the system does not have them.
+    """
     try:
         library = ctypes.CDLL(None)
         addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM]
@@ -584,7 +602,10 @@ def trial_kernel(a: wp.array(dtype=wp.float32), first: int, value: float):
 
 @functools.cache
 def _entry() -> TableEntry | None:
-    """Return the executor, tried on a launch whose result is known; None, with a notice, where this Warp's launches are not as expected."""
+    """Return the executor, after a test launch with a known result.
+
+    Returns None, with a notice, if this Warp's launches do not work as expected.
+    """
     try:
         made = TableEntry(
             wp.launch(team_kernel, 1, [0, 0, 0, 0, 0, 0], device="cpu", record_cmd=True)

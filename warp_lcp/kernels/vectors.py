@@ -1,7 +1,7 @@
-"""Flat fields: conversions, inner products, deterministic sums. The only vector primitives that the solvers use.
+"""Flat fields: conversions, inner products, deterministic sums.
 
-Every operator stores its fields as flat arrays (see `warp_lcp.kernels.fields`), so that these serve
-all of them.
+They are the only vector primitives that the solvers use. Every operator stores its fields as flat
+arrays (see `warp_lcp.kernels.fields`), so that these serve all of them.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def add_up_kernel(
     out: wp.array(dtype=wp.float64),
     slot: int,
 ):
-    """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
+    """Sum every `segments`-th block of a column of n partial sums.
 
-    Columns are counted from the one after `before` others.
-
-    The order of the additions does not change from run to run.
+    out[slot + column * segments + segment] is the sum of blocks segment, segment + segments, ... of
+    the column, computed by one block of threads. Columns are counted from the one after `before`
+    others. The order of the additions does not change from run to run.
     """
     t = wp.tid()
     block = t // threads
@@ -102,13 +102,19 @@ def largest_kernel(
 
 
 class Communicator(Protocol):
-    """Who else has a part of the unknowns: the ranks of a distributed problem. All methods are collective, with one answer for all."""
+    """Communicator of a distributed problem: the ranks that share the unknowns.
+
+    All methods are collective and return the same on all ranks.
+    """
 
     def sum(self, values: Any) -> Any:
         """Return sums over all parts, entry by entry."""
 
     def adding(self, sums: np.ndarray) -> Operation:
-        """Return what replaces float64 sums by those over all parts, in place, as an operation of the team."""
+        """Return an operation that replaces float64 sums by those over all ranks.
+
+        It works in place and runs in the thread pool.
+        """
 
     def max(self, values: Any) -> Any:
         """Return the largest over all parts, entry by entry."""
@@ -121,7 +127,10 @@ class Communicator(Protocol):
 
 
 def segments_of(n: int) -> int:
-    """Return how many blocks of a GPU add up a column first: one would take long over very many partial sums."""
+    """Return how many GPU blocks add up a column first.
+
+    One block would take long for very many partial sums.
+    """
     return CUDA_SEGMENTS if n > CUDA_SEGMENTS * CUDA_BLOCK else 1
 
 
@@ -137,10 +146,12 @@ def fold(
     most: int | None = None,
     before: int = 0,
 ) -> None:
-    """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
+    """Reduce columns of n partial results on CUDA, by a sum or a maximum.
+
+    The results of the columns go to out[slot], out[slot + 1], ...
 
     Args:
-        kernel: one of the two.
+        kernel: `add_up_kernel` or `largest_kernel`.
         partials: of one column after another.
         n: of each.
         columns: how many.
@@ -148,8 +159,8 @@ def fold(
         slot: of the first.
         between: memory of columns * segments_of(n) numbers, where these are more than the columns.
         launch: of a program.
-        most: of n, where that is a `Scalar`.
-        before: columns before the first that is taken.
+        most: upper bound of n, where n is a `Scalar`.
+        before: columns before the first that is reduced.
     """
     device, segments = partials.device, segments_of(n if most is None else most)
     launch = launch_recorded if is_recording() and not hasattr(launch, "__self__") else launch
@@ -202,7 +213,7 @@ class Reduction:
         )
 
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = launch_now) -> None:
-        """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
+        """Sum the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         device = self.partials.device
         if device.is_cpu:  # Warp's tiles are not for several threads at a time
             rows = Rows.flat(columns, device)
@@ -263,7 +274,10 @@ class Sums(Reduction):
     def of(
         self, declared: StencilKernel, *structs: DataclassInstance, slot: int = 0, **given: Any
     ) -> np.ndarray:
-        """Launch a pass, bound as by `StencilKernel.bind`; return its sums, which are in `scalars` from a slot on."""
+        """Launch a kernel, bound as by `StencilKernel.bind`; return its sums.
+
+        They are in `scalars` from a slot on.
+        """
         with as_one_table(self.rows.device, self._across):
             self._launch(declared, structs, given, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
@@ -295,12 +309,14 @@ class Sums(Reduction):
 
 
 class Tally:
-    """What a pass finds in the rows that it is given each time: sums, and the largest of something; the same bits on every run.
+    """Sums and a maximum of a kernel over rows that change.
+
+    They have the same bits in every run.
 
     Args:
-        declared: the pass.
-        device: where.
-        places: of the most rows that it is given, else memory is made when they come.
+        declared: the kernel.
+        device: of the fields.
+        places: of the most rows that are visited; more memory is allocated if larger rows come.
     """
 
     def __init__(self, declared: StencilKernel, device: wp.Device, places: int = 0) -> None:
@@ -325,7 +341,10 @@ class Tally:
         bounds: list[Any] | None = None,
         **given: Any,
     ) -> None:
-        """Launch the pass, bound as by `StencilKernel.bind`, over rows; what it finds replaces what was found."""
+        """Launch the kernel over rows, bound as by `StencilKernel.bind`.
+
+        Its results replace the former ones.
+        """
         self.launch(rows, structs, given, stencil, bounds)
 
     def launch(

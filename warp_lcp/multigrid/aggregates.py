@@ -1,4 +1,7 @@
-"""Projected multigrid cycles on the aggregates of a sparse matrix: a cold start that finds most of the active set at once."""
+"""Monotone multigrid on aggregates of a sparse matrix, with projected cycles.
+
+It is a cold start that finds most of the active set at once.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,10 @@ def restrict_kernel(
     high: f64,
     e: f64,
 ):
-    """Sum y over an aggregate; bound its correction by the narrowest of the members' gaps over `factor`, and begin it at 0."""
+    """Restrict y to an aggregate: its sum, the correction's bounds and start.
+
+    The bounds are the narrowest of the members' gaps over `factor`; the correction begins at 0.
+    """
     j = wp.tid()
     total, least, most = wp.float64(0.0), wp.float64(-wp.inf), wp.float64(wp.inf)
     for k in range(first[j], first[j + 1]):
@@ -54,7 +60,10 @@ def restrict_kernel(
 @no_type_check
 @forward_kernel(module="warp_lcp.aggregates")
 def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f64, x: f64):
-    """Add `factor` times its aggregate's correction to each unknown, projected; unknowns of none stay."""
+    """Add `factor` times its aggregate's correction to each unknown, projected.
+
+    Unknowns of no aggregate keep their values.
+    """
     i = wp.tid()
     j = owner[i]
     if j >= 0:
@@ -75,7 +84,10 @@ def settle_kernel(
     enough: wp.float64,
     x: f64,
 ):
-    """Sweep a small level forth and back by one thread, until the largest change is small beside the first one."""
+    """Sweep a small level forward and backward with one thread, until it converges.
+
+    It stops when the largest change is small beside the first one.
+    """
     n = x.shape[0]
     first, change = wp.float64(0.0), wp.float64(1.0)
     for sweep in range(sweeps):
@@ -166,7 +178,10 @@ class AggregateLevel:
     def descend(
         self, coarse: AggregateLevel, *, projected: bool, from_zero: bool
     ) -> list[CycleStage]:
-        """Return steps 1 to 3 of a cycle: a projected Gauss-Seidel sweep; sums and bounds of aggregates, from x_c = 0."""
+        """Return steps 1 to 3 of a cycle.
+
+        A projected Gauss-Seidel sweep; sums and bounds of the aggregates; x_c = 0.
+        """
         assert self.aggregation is not None, "not the coarsest level"
         if "down" not in self._legs:
             parts, bounds = self.aggregation, [self.x, self.lower, self.upper]
@@ -205,7 +220,10 @@ class AggregateLevel:
         return self._legs["up"]
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
-        """Return the stages of a `CoarsestSolver`: projected Gauss-Seidel by one thread, until it converges."""
+        """Return the stages of a `CoarsestSolver`.
+
+        One thread makes projected Gauss-Seidel sweeps until they converge.
+        """
         A, last = self.A, wp.float64(ENOUGH)
         inputs = [
             A.indptr,
@@ -231,12 +249,13 @@ class AggregateLevel:
 
 
 class MonotoneAggregation:
-    """Projected W-cycles: sweeps within the bounds, and corrections of whole aggregates within their members' gaps (Kornhuber 1994).
+    """Projected W-cycles: sweeps, and corrections of aggregates (Kornhuber 1994).
 
-    A coarse unknown may move by what its most confined member may, so that no bound is overstepped
-    and nothing need be projected afterwards: an obstacle problem's energy falls in every cycle.
-    That frees or holds whole aggregates at once, where a Newton step moves the boundary of the
-    active set by about one row. Aggregates are those of A's symmetric part, coarse matrices P'A P.
+    Sweeps stay within the bounds, corrections within the narrowest gap of an aggregate's members.
+    So no bound is violated and nothing need be projected afterwards: the energy of an obstacle
+    problem falls in every cycle. That frees or holds whole aggregates at once, where a Newton step
+    moves the boundary of the active set by about one row. Aggregates are those of A's symmetric
+    part, coarse matrices P'A P.
 
     Args:
         A: the matrix, with a positive diagonal.
@@ -248,7 +267,10 @@ class MonotoneAggregation:
         self._fields: tuple[Any, ...] = ()
 
     def refresh(self) -> bool:
-        """Coarsen A as it is now, if it has changed since; return whether it is a matrix for this (`suits_multigrid`)."""
+        """Coarsen A if it has changed; return whether the method suits it.
+
+        See `suits_multigrid`.
+        """
         if self._version == self.A.version:
             return len(self._levels) > 1
         self._version, device = self.A.version, self.A.device
@@ -277,7 +299,10 @@ class MonotoneAggregation:
     def cycle(
         self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
     ) -> None:
-        """Move x (float64, within its bounds) by one cycle. It is recorded, and recorded anew where a field is another."""
+        """Apply one cycle to x (float64, within its bounds).
+
+        The cycle is recorded, and recorded again when a field is replaced.
+        """
         fields = tuple(field.ptr for field in (x, b, lower, upper))
         if self._program is None or self._fields != fields:
             finest = replace(self._levels[0], x=x, b=b, lower=lower, upper=upper)
@@ -305,7 +330,10 @@ def symmetric_part(host: scipy.sparse.csr_array) -> scipy.sparse.csr_matrix:
 
 
 def aggregated(strength: scipy.sparse.csr_matrix, stall: float) -> Any:
-    """Return which unknowns belong together, None where that leaves more than a share `stall` of them."""
+    """Return the aggregate of each unknown.
+
+    Returns None if more than a share `stall` of the unknowns remain.
+    """
     found, _ = standard_aggregation(strength)
     return None if found.nnz == 0 or found.shape[1] > stall * strength.shape[0] else found
 
@@ -329,11 +357,11 @@ SPLIT_KEEPS = 0.9  # the largest share of the unknowns that a split may keep
 
 
 def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
-    """Return P, P'A P and the points, for a scipy.sparse matrix A that is nearly an M-matrix; None where it does not get smaller.
+    """Return P, P'A P and the points of a nearly M-matrix A.
 
-    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the
-    bounds of the coarse problem are those of unknowns, where those of aggregates would have to be
-    averaged.
+    A is a scipy.sparse matrix. Returns None where the coarse matrix is not smaller. A coarse
+    unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the bounds of the
+    coarse problem are those of unknowns, where those of aggregates would have to be averaged.
     """
     A, P, points = scipy.sparse.csr_matrix(host), None, np.arange(host.shape[0])
     while len(points) * LEAST > host.shape[0]:

@@ -1,8 +1,8 @@
-"""Algebraic multigrid for the principal systems of a sparse matrix: PyAMG's aggregates, cycled and coarsened anew on the device.
+"""Algebraic multigrid for the principal systems of a sparse matrix.
 
-Which unknowns make up a coarse one is decided once, on A. When the free set or the shift changes,
-only numbers are computed again: the Galerkin products P' M P go into patterns that are known, by
-lists of places made once.
+PyAMG forms the aggregates; cycles and coarsening run on the device. The aggregation is computed
+once, on A. When the free set or the shift changes, only numbers are recomputed: the Galerkin
+products P' M P go into known patterns, by lists of positions made once.
 """
 
 from __future__ import annotations
@@ -119,7 +119,10 @@ class AlgebraicLevel:
         self.P: DeviceMatrix | None = None
 
     def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
-        """Take the prolongation from a coarser level; `hosts` are A, P, R = P', the patterns of A P and of the coarse matrix."""
+        """Set the prolongation from a coarser level.
+
+        `hosts` are A, P, R = P', and the patterns of A P and of the coarse matrix.
+        """
         device, (host, P, R, AP, coarse_host) = self.device, hosts
         turn = (
             scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape)
@@ -138,7 +141,10 @@ class AlgebraicLevel:
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False
     ) -> BoundKernel:
-        """Return the sweep y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
+        """Return the sweep y = x + omega (b - A x), scaled by the rows' l1 norms.
+
+        x is taken as 0 if from_zero.
+        """
         A = self.A
         return SMOOTH.bind(
             A.rows,
@@ -161,7 +167,10 @@ class AlgebraicLevel:
     def descend(
         self, coarse: AlgebraicLevel, *, projected: bool, from_zero: bool
     ) -> list[CycleStage]:
-        """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and b_c = P'(b - A x)."""
+        """Return steps 1 and 2 of a cycle.
+
+        A pair of Chebyshev-Jacobi sweeps, and b_c = P'(b - A x).
+        """
         assert not projected, "smoothed aggregates know no bounds"
         key = "down", from_zero
         if key not in self._legs:
@@ -231,7 +240,10 @@ class AlgebraicHierarchy:
         self.r, self.z = self.levels[0].b, self.levels[0].x
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
+        """Set the free set and the shift D >= 0, and coarsen.
+
+        The set is a uint8 field, the shift a float64 field; None: 0.
+        """
         finest, A = self.levels[0], self.source
         FILL.bind(
             finest.A.rows,
@@ -296,7 +308,10 @@ class AlgebraicHierarchy:
         return program
 
     def _solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
-        """Return the stages of a `CoarsestSolver`: multiply by the inverse, or sweep where the level is too large for that."""
+        """Return the stages of a `CoarsestSolver`.
+
+        They multiply by the inverse, or sweep where the level is too large for that.
+        """
         last, weights = self.levels[-1], self.settings.weights
         if not self.inverts:  # forth and back, so that the whole is symmetric
             pairs = range(self.settings.last_sweeps)
@@ -321,7 +336,10 @@ class AlgebraicHierarchy:
         return self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
 
     def _find_entries(self, host: Matrix, pattern: Matrix) -> wp.array[Any]:
-        """Return which entry of A each entry of the pattern is, -1 for none; empty if the patterns are one."""
+        """Return the index in A of each entry of the pattern, -1 if A lacks it.
+
+        Empty if both patterns are equal.
+        """
         if _alike(host, pattern):
             return wp.empty(0, dtype=wp.int32, device=self.device)
         order = np.full(pattern.nnz, -1, dtype=np.int32)
@@ -337,7 +355,11 @@ def _coarsen(
     settings: AlgebraicSettings,
     most: int,
 ) -> list[AlgebraicLevel]:
-    """Return the levels of a matrix, `A` on the host, whose entries are stored in `pattern`; nodes aggregate where there are blocks."""
+    """Return the levels of a matrix.
+
+    `A` is on the host; its entries are stored in `pattern`. Nodes are aggregated where there are
+    blocks.
+    """
     device, B, block = source.device, source.near_null_space, source.block
     values = np.zeros(pattern.nnz)
     values[_places(A, pattern)] = A.data
@@ -382,7 +404,10 @@ def _coarsen(
 
 
 def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
-    """Return the pattern of A B, sorted. SciPy drops entries that cancel; those of positive numbers do not."""
+    """Return the pattern of A B, sorted.
+
+    The product is that of positive numbers: SciPy drops entries that cancel, and these do not.
+    """
     product = (_ones(A) @ _ones(B)).tocsr()
     product.sort_indices()
     return product
@@ -400,7 +425,10 @@ def _alike(A: Matrix, B: Matrix) -> bool:
 
 
 def _places(A: Matrix, pattern: Matrix) -> np.ndarray:
-    """Return where each entry of A is in a sorted pattern that has them all; SciPy's sum of both would drop zeros."""
+    """Return the position of each entry of A in a sorted pattern that has them all.
+
+    SciPy's sum of both would drop zeros.
+    """
     if _alike(A, pattern):
         return np.arange(A.nnz)
     n = np.int64(A.shape[0])

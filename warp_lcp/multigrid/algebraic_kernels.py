@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Kernels of the algebraic hierarchy that are no passes over rows: places of products, and the inverse of the coarsest level."""
+"""Kernels of the algebraic hierarchy that do not run over rows.
+
+They find positions of products and the inverse of the coarsest level.
+"""
 
 from typing import Any
 
@@ -22,7 +25,10 @@ def places_kernel(
     place: wp.array(dtype=wp.uint16),
     n: int,
 ):
-    """Where in its row of the product each product of two entries belongs; by one thread, once a pattern. `at` is memory for a row."""
+    """Find the position of each product of two entries in its row of the product.
+
+    One thread does it, once a pattern. `at` is memory for a row.
+    """
     c = wp.int64(0)
     for i in range(n):
         for q in range(out_ptr[i], out_ptr[i + 1]):
@@ -75,7 +81,10 @@ def factor_kernel(matrix: MATRIX, rounding: wp.float64):
 
 @forward_kernel(module="warp_lcp.algebraic")
 def invert_kernel(factors: MATRIX, inverse: MATRIX):
-    """Column c of the inverse from the factors, a column a thread; rows and columns of unknowns that were taken out are 0."""
+    """Compute column c of the inverse from the factors, one thread a column.
+
+    Rows and columns of eliminated unknowns are 0.
+    """
     c = wp.tid()
     n = factors.shape[0]
     for r in range(n):

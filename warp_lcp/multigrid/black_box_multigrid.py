@@ -1,12 +1,13 @@
-"""Multigrid for compact stencils in 2-D that point sweeps do not smooth: operator-dependent transfers, relaxation of lines.
+"""Black-box multigrid for compact stencils in 2-D (Dendy).
 
-Coarse cells are every second one along an axis. A cell between two of them shares in each by its
-row's weights (Dendy's black-box multigrid): the prolongation by those of (A + A')/2, the
-restriction by those of A' (as de Zeeuw has it), so that coarse matrices R A P of convection keep
-the wind's direction. They are compact again. Rows of one color after those of the other are solved
-for as tridiagonal systems, then columns; on the way up in the reverse order. With W-cycles a Krylov
-method takes about ten iterations from 128 to 1024 cells a side, for winds at Peclet numbers up to
-1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
+It serves stencils that point sweeps do not smooth, by operator-dependent transfers and line
+relaxation. Coarse cells are every second one along an axis. A cell between two of them interpolates
+from each by its row's weights: the prolongation by those of (A + A')/2, the restriction by those of
+A' (as de Zeeuw has it), so that coarse matrices R A P of convection keep the wind's direction. They
+are compact again. Rows of one color after those of the other are solved for as tridiagonal systems,
+then columns; on the way up in the reverse order. With W-cycles a Krylov method takes about ten
+iterations from 128 to 1024 cells a side, for winds at Peclet numbers up to 1e4 that turn, for
+anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class LineFields:
 
 
 class LineLevel:
-    """One grid, see `CycleLevel`: its stored stencil, factors of its lines, and shares in the next coarser one.
+    """One level, see `CycleLevel`: stencil, line factors and transfer weights.
 
     Args:
         padding: counts of cells and of stored cells.
@@ -297,7 +298,11 @@ class BlackBoxMultigrid:
         shift: wp.array[Any] | None = None,
         weight: wp.array[Any] | None = None,
     ) -> None:
-        """Take another free set (stored uint8 field) and shift (float64), write one over the diagonal to `weight`, and coarsen."""
+        """Set the free set and the shift, and coarsen.
+
+        The set is a stored uint8 field, the shift float64. One over the diagonal is written to
+        `weight`.
+        """
         self._fill(free, shift, weight)
         self._building.run()
 
@@ -337,14 +342,18 @@ class BlackBoxMultigrid:
 
 
 def takes_points(A: Operator) -> TypeGuard[HasStencil]:
-    """Return whether an operator's systems are a `Hierarchy`'s: it has a stencil, is symmetric, and needs no lines."""
+    """Return whether a `Hierarchy` suits an operator.
+
+    It must have a stencil, be symmetric, and need no line relaxation.
+    """
     return has(A, HasStencil) and A.symmetric and not needs_lines(A)
 
 
 def needs_lines(A: HasStencil) -> bool:
-    """Return whether an operator's stencil is one of these: compact and in 2-D, and not what point sweeps on aggregates solve as fast.
+    """Return whether black-box multigrid suits an operator.
 
-    Those are symmetric with weights >= 0, alike along both axes.
+    Its stencil must be compact and in 2-D, and not of the kind that point sweeps on aggregates
+    solve as fast: symmetric with weights >= 0, alike along both axes.
     """
     s = A.stencil
     if s.pattern is None or s.padding.counts[0] > 1 or any(s.periodic):

@@ -65,7 +65,10 @@ def beside(L: RowLayout, periodic: wp.vec3i, r: int, axis: int, way: int):
 
 @functools.cache
 def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
-    """Return `factor`, L D L' by one thread, and `invert`, by one block, each in a module of its own: they take long to compile."""
+    """Return the kernels `factor` and `invert`, each in a module of its own.
+
+    `factor` computes L D L' by one thread, `invert` works by one block. Each takes long to compile.
+    """
     name = f"{'variable' if variable else 'uniform'}_{d_type.__name__}_{real.__name__}"
     Stencil = stencil_struct(d_type, real if variable else wp.float32)
 
@@ -139,7 +142,10 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def eliminate(least: wp.float64, c: int, t: int, threads: int, old: square, new: square):
-        """One step of Gauss-Jordan from `old` to `new`, so that no thread reads what another has written since the last barrier."""
+        """Make one step of Gauss-Jordan elimination from `old` to `new`.
+
+        With two arrays no thread reads what another has written since the last barrier.
+        """
         m = old.shape[0]
         pivot = old[c, c]
         pinned = pivot <= least

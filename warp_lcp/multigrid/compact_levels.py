@@ -1,4 +1,7 @@
-"""Levels of a hierarchy whose stencils are compact: patterns of aggregates, and memory of the weights."""
+"""Hierarchy levels with compact stencils.
+
+Patterns of aggregates, and memory of the weights.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,11 @@ Counts = tuple[int, int, int]
 
 
 def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
-    """Return the neighbors of aggregates of so many cells along x, y, z: those of cells, and theirs along axes that are aggregated."""
+    """Return the offsets of neighbors of aggregates.
+
+    An aggregate has so many cells along x, y, z. Its neighbors are those of its cells, and theirs
+    along axes that are aggregated.
+    """
     found = set()
     for offset in pattern.offsets:
         steps = [
@@ -40,5 +47,8 @@ def weights_block(
 
 
 def mask(pattern: Pattern) -> int:
-    """Return the offsets of a pattern's stored weights as bits, (z + 1, y + 1, x + 1) in the base of 3."""
+    """Return the offsets of a pattern's stored weights as bits.
+
+    Bits are numbered by (z + 1, y + 1, x + 1) in the base of 3.
+    """
     return sum(1 << (x + 1 + 3 * (y + 1) + 9 * (z + 1)) for x, y, z in pattern.offsets)

@@ -45,7 +45,10 @@ class CycleLevel(Protocol):
 
     @property
     def visits(self) -> int:
-        """Cycles on this level in each cycle on the next finer one; see `CoarsestSolver` for the coarsest."""
+        """Cycles on this level in each cycle on the next finer one.
+
+        See `CoarsestSolver` for the coarsest level.
+        """
 
     def descend(self, coarse: Any, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
         """Return steps 1 and 2; x is taken for 0 if `from_zero`."""

@@ -1,13 +1,14 @@
-"""Passes of a hierarchy: of its cycles, with the legs that are waves of them and stream memory once, and those that build its levels.
+"""Kernels of a hierarchy: those of its cycles, and those that build its levels.
 
-Coarser levels are the Galerkin product with piecewise-constant 2 x 2 x 2 aggregates. They keep the
-7-point stencil on every level and cope with any mask: the weight between two aggregates is the sum
-over the faces between them. A cell's excess is its diagonal less its faces to other unknowns: what
-AIR, held unknowns and the shift contribute. An aggregate's diagonal is the sum of its cells'
-excesses plus its outer faces, a sum of positive numbers: taking inner faces off the diagonals would
-cancel. Weights along axes that are not aggregated are not too stiff, so they are multiplied by
-`stiffen`, the over-correction that the prolongation applies to all; the excess, whose held
-neighbors are one cell and not one aggregate away, by `held`.
+Legs of a cycle are fused kernels that stream memory once. Coarser levels are the Galerkin product
+with piecewise-constant 2 x 2 x 2 aggregates. They keep the 7-point stencil on every level and allow
+any mask: the weight between two aggregates is the sum over the faces between them. A cell's excess
+is its diagonal less its faces to other unknowns: the contributions of AIR, held unknowns and the
+shift. An aggregate's diagonal is the sum of its cells' excesses plus its outer faces, a sum of
+positive numbers; subtracting inner faces from the diagonals would cancel. The Galerkin product is
+too stiff along aggregated axes. Weights along axes that are not aggregated are not too stiff, so
+they are multiplied by `stiffen`, the over-correction that the prolongation applies to all; the
+excess, whose held neighbors are one cell and not one aggregate away, by `held`.
 """
 
 from dataclasses import dataclass

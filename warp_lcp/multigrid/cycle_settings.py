@@ -1,4 +1,7 @@
-"""How multigrid cycles go: those of a Galerkin hierarchy of a grid, and those of an algebraic one."""
+"""Settings of multigrid cycles.
+
+Those of a Galerkin hierarchy of a grid, and those of an algebraic one.
+"""
 
 from __future__ import annotations
 

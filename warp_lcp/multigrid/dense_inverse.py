@@ -1,4 +1,7 @@
-"""Coarsest solver of a grid: a dense inverse, made on the device; projected sweeps if there are bounds."""
+"""Coarsest solver of a grid: a dense inverse, computed on the device.
+
+With bounds it makes projected sweeps.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +91,11 @@ class DenseInverse:
         ).launch(program.launch)
 
     def _record_seven_points(self, program: CommandBuffer, *, by_block: bool) -> None:
-        """Record L D L' and the columns of the inverse; on CUDA, Gauss-Jordan elimination by one block."""
+        """Record the computation of the inverse.
+
+        The CPU computes L D L' and the columns of the inverse; CUDA uses Gauss-Jordan elimination
+        by one block.
+        """
         s, changed, real, m = (
             self.level.stencil,
             self.level.changed,
@@ -119,7 +126,10 @@ class DenseInverse:
         ).launch(program.launch)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
-        """Return the stages of a `CoarsestSolver`: once, whatever `visits` is, for this is the solution."""
+        """Return the stages of a `CoarsestSolver`.
+
+        They run once, whatever `visits` is, because the result is the exact solution.
+        """
         return self._sweeps(from_zero=from_zero) if projected else [self.product]
 
     def _sweeps(self, *, from_zero: bool) -> Iterator[CycleStage]:

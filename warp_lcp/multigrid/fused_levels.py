@@ -60,7 +60,10 @@ class FusedCoarseLevels:
 
 
 def cells_of_one_launch(settings: CycleSettings, device: wp.Device) -> int:
-    """Return the most cells of a level that runs in one launch with those below it; 0: none does."""
+    """Return the most cells of a level that is fused with those below it.
+
+    They run in one launch. 0: no level is fused.
+    """
     if device.is_cpu:
         return settings.one_launch_cpu
     block, cluster = settings.one_launch_cuda, settings.one_launch_cluster
@@ -68,7 +71,10 @@ def cells_of_one_launch(settings: CycleSettings, device: wp.Device) -> int:
 
 
 def first_small(levels: Listed[StencilLevel], cells: int) -> int:
-    """Return the index of the first of the last levels that have at most so many cells each and are stored alike."""
+    """Return the index of the first level to fuse.
+
+    It and all levels below it have at most so many cells each and are stored alike.
+    """
     first = len(levels)
     while (
         first > 0

@@ -1,7 +1,7 @@
-"""Legs of a cycle on a level of which other processes have parts: ghost cells, and cells beside cuts.
+"""Legs of a cycle on a distributed level, with ghost cells and halo exchange.
 
-A leg streams through memory once, as in one process, and waits for one exchange: cells beside
-those of others are computed again, or ahead.
+A leg streams through memory once, as in one process, and waits for one exchange: cells beside those
+of other processes are computed twice, or ahead.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ BESIDE = 4
 
 
 def whole_counts(stencil: PaddedStencil) -> tuple[int, int, int]:
-    """Return the cells (nz, ny, nx) of a stencil's grid, also of those that other processes have."""
+    """Return the shape (nz, ny, nx) of a stencil's whole grid.
+
+    Cells of other processes count.
+    """
     return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
 
 
@@ -76,7 +79,10 @@ for _T in (wp.uint8, wp.float32, wp.float64):
 
 
 def share_changes(level: StencilLevel, launch: Launch) -> None:
-    """Fill the diagonal's ghost cells; mark rows beside those that changed: their faces depend on them."""
+    """Fill the diagonal's ghost cells, and mark rows beside changed ones.
+
+    The faces of marked rows depend on the changed cells.
+    """
     s, counts = level.stencil, level.stencil.padding.counts
     assert s.ghosts is not None
     d, sides = s.d.reshape(s.padding.shape), []
@@ -94,7 +100,10 @@ def share_changes(level: StencilLevel, launch: Launch) -> None:
 
 
 def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner]]:
-    """Return the cells of a box within `depth` of others', as boxes low <= (k, j, i) < high that do not overlap."""
+    """Return the cells of a box within `depth` of those of other processes.
+
+    They are boxes low <= (k, j, i) < high that do not overlap.
+    """
     low, high, found = [0, 0, 0], list(stencil.padding.counts), list[tuple[Corner, Corner]]()
     for axis, end in stencil.ghosts.cuts if stencil.ghosts is not None else ():
         a, first, last = 2 - axis, low.copy(), high.copy()

@@ -99,7 +99,10 @@ class Hierarchy:
         self.refresh()
 
     def _is_coarsest(self, level: StencilLevel) -> bool:
-        """Whether a dense inverse of a level is cheap; on several processes, whether it is gathered."""
+        """Return whether a dense inverse of a level is cheap.
+
+        On several processes: whether the level is gathered.
+        """
         ghosts, counts = level.stencil.ghosts, whole_counts(level.stencil)
         if ghosts is not None:
             return (
@@ -111,7 +114,10 @@ class Hierarchy:
         )
 
     def _coarsest_solver(self) -> CoarsestSolver:
-        """Return what solves on the coarsest levels: small ones in one launch, the last one by its dense inverse."""
+        """Return the solver of the coarsest levels.
+
+        Small levels are fused in one launch; the last one is solved by its dense inverse.
+        """
         self._dense = dense = DenseInverse(self.levels[-1])
         compact = self.finest.stencil.pattern is not None
         cells = 0 if compact else cells_of_one_launch(self.settings, self.device)
@@ -129,7 +135,10 @@ class Hierarchy:
         return solve
 
     def _gather(self, *, bounded: bool) -> CoarsestSolver:
-        """Return what solves on the last level that processes share: on every one of them, a hierarchy of the whole grid."""
+        """Return the solver of the last distributed level.
+
+        Every process has a hierarchy of the whole grid from there on.
+        """
         last, (nz, ny, nx) = self.levels[-1], whole_counts(self.levels[-1].stencil)
         assert last.stencil.ghosts is not None
         gathering, strength = last.stencil.ghosts.gathering, tuple(self._strength)
@@ -326,7 +335,10 @@ class Hierarchy:
         return self.cycles[projected].stages()
 
     def _coarser(self, fine: StencilLevel, *, bounded: bool) -> StencilLevel:
-        """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""
+        """Return the next level: aggregates of two cells along some axes.
+
+        All axes are coarsened, or only the strong ones where axes differ much.
+        """
         s, counts = fine.stencil, fine.stencil.padding.counts
         whole = whole_counts(s)
         factors = self._factors(whole)
@@ -395,7 +407,10 @@ def _finest_level(
     bounds: Pair | None,
     shifted: bool,
 ) -> StencilLevel:
-    """Return the level of an operator's stencil: its weights, and a diagonal of its own, 0 so far."""
+    """Return the level of an operator's stencil.
+
+    It has the operator's weights, and a diagonal of its own, 0 so far.
+    """
     d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
     weights = stencil.weights
     if weights is not None and weights[0].dtype is not real:

@@ -1,4 +1,7 @@
-"""Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
+"""Multiple semicoarsening, for anisotropy whose direction varies in space.
+
+There is a hierarchy for each direction of strong coupling.
+"""
 
 import math
 from collections.abc import Iterator
@@ -29,12 +32,13 @@ SAMPLES = {2: 24, 3: 8}
 
 
 class MultipleSemicoarsening(Hierarchy):
-    """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
+    """A `Hierarchy` and companions that coarsen other axes first.
 
-    Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong
-    axis differs from place to place no order of coarsening suits all of them. Each hierarchy deals
-    with the places that it suits, and each cycle starts from what the one before has left, so that
-    they share the finest level and need no residuals between them.
+    Cycles visit them one after another, forward and backward. Point sweeps smooth along strong
+    couplings only, so levels must coarsen there; where the strong axis differs from place to place
+    no order of coarsening suits all of them. Each hierarchy corrects the places that it suits, and
+    each cycle starts from the result of the one before, so that they share the finest level and
+    need no residuals between them.
 
     Args:
         strengths: of each companion.
@@ -71,7 +75,10 @@ class MultipleSemicoarsening(Hierarchy):
             companion.refresh()
 
     def rebuild_changed(self) -> None:
-        """Coarsen what the finest level's marked rows change; the last hierarchy clears the marks."""
+        """Coarsen what the finest level's marked rows change.
+
+        The last hierarchy clears the marks.
+        """
         wp.copy(self._marks, self.finest.changed)
         for part in (self, *self.companions):
             wp.copy(self.finest.changed, self._marks)
@@ -82,7 +89,10 @@ class MultipleSemicoarsening(Hierarchy):
         return self.companions[0]._last_leg()
 
     def _stages(self, *, projected: bool) -> Iterator[CycleStage]:
-        """Yield a cycle on each hierarchy, the first from x = 0; linear ones forth and back, which is symmetric."""
+        """Yield a cycle on each hierarchy, the first from x = 0.
+
+        Linear cycles go forward and backward, which is symmetric.
+        """
         parts = [*self.companions, self, *(() if projected else self.companions[::-1])]
         for place, part in enumerate(parts):
             yield from part.cycles[projected].stages(from_zero=place == 0)
@@ -99,11 +109,12 @@ def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarc
 
 
 def turns(stencil: PaddedStencil) -> list[Strength]:
-    """Return the ways in which cells are coupled that the mean weights do not tell; none where the strong axes are the same everywhere.
+    """Return the strengths of coupling that the mean weights do not show.
 
-    Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor
-    surfaces and cut cells, which are few in a block, from equal ones; where a block's ratios of
-    weights along the axes differ from the median block's by `TURN`, the direction turns.
+    Empty where the strong axes are the same everywhere. Blocks are sampled. The mean logarithm of
+    64 faces hardly depends on random coefficients, surfaces and cut cells, which are few in a
+    block; where a block's ratios of weights along the axes differ from the median block's by
+    `TURN`, the direction turns.
     """
     if stencil.weights is None or stencil.pattern is not None:
         return []
@@ -141,7 +152,10 @@ def _long(stencil: PaddedStencil) -> list[int]:
 
 
 def _sampled(stencil: PaddedStencil) -> np.ndarray:
-    """Return the mean logarithms of the weights along the long axes, a row a block that has open faces along all of them."""
+    """Return the mean logarithms of the weights along the long axes.
+
+    One row for each block that has open faces along all of them.
+    """
     cells, long, device = stencil.padding.counts, _long(stencil), stencil.device
     dimension = max(len(long), 2)
     edges = [min(n, EDGES[dimension]) for n in cells]

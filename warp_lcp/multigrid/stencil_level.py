@@ -80,10 +80,13 @@ class StencilLevel:
         self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)
 
     def renewing(self, *, keeps_weights: bool) -> BoundKernel:
-        """Return the pass that clears the fields outside the rows' new spans and marks rows whose span has changed.
+        """Return the kernel that clears fields outside the rows' new spans.
+
+        It also marks rows whose span has changed.
 
         Args:
-            keeps_weights: whether the weights are not the level's own to clear.
+            keeps_weights: whether the weights do not belong to the level, so that they are not
+                cleared.
         """
         s = self.stencil
         lower_x, lower_y, lower_z = (None if keeps_weights or s.pattern else s.weights) or (
@@ -120,7 +123,10 @@ class StencilLevel:
         )
 
     def coarsening(self, coarse: StencilLevel, stiffen: float, held: float) -> BoundKernel:
-        """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
+        """Return the kernel that updates rows of the coarser level.
+
+        They are those that depend on changed rows of this level.
+        """
         s, c = self.stencil, coarse.stencil
         shared = Coarsening(
             self.changed, coarse.changed, c.d, s.padding.counts[2], *s.periodic, stiffen, held
@@ -160,7 +166,10 @@ class StencilLevel:
         rows: Rows | None = None,
         x: wp.array[Any] | None = None,
     ) -> BoundKernel:
-        """Return the pass that adds `scale` times the coarse correction to x, or another field, clipped if projected."""
+        """Return the kernel that adds `scale` times the coarse correction.
+
+        It adds to x, or to another field; the result is clipped to the bounds if projected.
+        """
         there = rows or self._finer_rows(coarse)
         lower, upper = self._sides(projected)
         make = lambda: passes.CORRECT.bind(  # noqa: E731
@@ -217,7 +226,10 @@ class StencilLevel:
         from_zero: bool = False,
         ring: wp.array[Any] | None = None,
     ) -> tuple[BoundKernel, BoundKernel]:
-        """Return the same for one wave: what is between the sweeps lies in a ring of planes, of t unless told."""
+        """Return the same for one fused kernel.
+
+        Values between the sweeps lie in a ring of planes, by default of t.
+        """
         between = self.t if ring is None else ring
         into = self.sweeping(
             between,
@@ -257,7 +269,10 @@ class StencilLevel:
     def descend(
         self, coarse: StencilLevel, *, projected: bool, from_zero: bool
     ) -> tuple[CycleStage, ...]:
-        """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
+        """Return steps 1 and 2 of a cycle.
+
+        A pair of Chebyshev-Jacobi sweeps, and the residual restricted to the next level.
+        """
         make = lambda: tuple(self._descent(coarse, projected=projected, from_zero=from_zero))  # noqa: E731
         return self._once(("descend", coarse, projected, from_zero), make)
 
@@ -290,7 +305,10 @@ class StencilLevel:
         return (self._once(("bounds", coarse), make),)
 
     def ascend(self, coarse: StencilLevel, *, projected: bool) -> tuple[CycleStage, ...]:
-        """Return steps 5 and 6: the correction and the reverse pair, which keeps the cycle symmetric."""
+        """Return steps 5 and 6 of a cycle.
+
+        The correction, and the reverse pair of sweeps, which keeps the cycle symmetric.
+        """
         return self._once(
             ("ascend", coarse, projected), lambda: tuple(self._ascent(coarse, projected=projected))
         )
@@ -383,7 +401,11 @@ class StencilLevel:
         kind: StencilKernel = passes.SWEEP,
         rows: Rows | None = None,
     ) -> BoundKernel:
-        """Return the pass y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero.
+        """Return the kernel y = x + omega D^-1 (b - A x).
+
+        It is clipped to the bounds if projected; x is taken as 0 if from_zero.
+
+        `kind` may be one that goes into or out of a ring; `rows` are all by default.
 
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
