@@ -55,7 +55,7 @@ def patch_kernel(
     place: wp.array(dtype=int),
     image: wp.array(dtype=wp.uint8),
 ):
-    """Write a byte that changes from run to run to its place in the arguments."""
+    """Write a byte that changes from run to run to its position in the arguments."""
     t = wp.tid()
     image[place[t]] = cells[source[t]]
 
@@ -145,11 +145,11 @@ class DeviceGraph(CommandBuffer):
 
     def __init__(self, device: wp.Device) -> None:
         super().__init__(device)
-        # of `_add`, each with its command and its place
+        # Arguments of `_add`, each with its command and its place.
         self._pieces: list[tuple[int, Any, Any, tuple[int, ...], bytes, int, int]] = []
         self._patches: list[tuple[int, int, int]] = []
         self._bytes = 0
-        # memory of rows, and the launch dimensions that have been captured
+        # Memory of rows, and the launch dimensions that have been captured.
         self._extents: list[tuple[Any, tuple[int, ...]]] = []
         self._buffer: np.ndarray | None = None
         self._copied: Any = None  # event after which the buffer may be written
@@ -201,7 +201,7 @@ class DeviceGraph(CommandBuffer):
         )
 
     def record_pass(self, bound: Any) -> None:
-        """Record the launch of a pass."""
+        """Record the launch of a stencil kernel."""
         patches, layout = bound.patches(), bound.layout
         if not patches:
             if 0 not in threads(layout):
@@ -282,7 +282,7 @@ class DeviceGraph(CommandBuffer):
         self._commands.append(None)
 
     def finish(self) -> None:
-        """Lay out the image, and make the launches that read from it."""
+        """Allocate the image, and create the launches that read from it."""
         if not self._pieces:
             return
         host = np.zeros(self._bytes, dtype=np.uint8)
@@ -327,7 +327,7 @@ class DeviceGraph(CommandBuffer):
         self._commands[:0] = [DeviceCopy(cells, pinned), made]
 
     def fits(self) -> bool:
-        """Return whether all rows have no more threads now than were captured."""
+        """Return whether all rows need at most the captured threads."""
         return all(
             e <= r
             for memory, room in self._extents
@@ -336,11 +336,11 @@ class DeviceGraph(CommandBuffer):
 
     @property
     def commands(self) -> list[Any]:
-        """What a graph of the program holds, in order."""
+        """Commands of the program's graph, in order."""
         return self._commands
 
     def captured(self, commands: list[Any]) -> Any:
-        """Return the graph of some launches."""
+        """Capture some launches and return their graph."""
         return self._captured(commands)
 
     def run(self) -> None:
@@ -371,7 +371,7 @@ class DeviceGraph(CommandBuffer):
         self._note_copy()
 
     def note_launch(self) -> None:
-        """Take note that a joined graph has launched it."""
+        """Note that a joined graph has launched it."""
         self._runs += 1
         self._note_copy()
 
@@ -417,7 +417,7 @@ class Upload(DeviceGraph):
 
     @property
     def has_run(self) -> bool:
-        """True: there are no kernels to load."""
+        """Return True: there are no kernels to load."""
         return True
 
     def run(self) -> None:
@@ -433,10 +433,10 @@ class Upload(DeviceGraph):
 
 
 def noted(device: wp.Device, event: Any) -> Any:
-    """Record an event behind what has been launched, and return it."""
+    """Record an event behind all launches so far, and return it."""
     return wp.get_stream(device).record_event(event) if device.is_cuda else None
 
 
 def host_view(pinned: wp.array[Any]) -> np.ndarray:
-    """Return memory of the host as an array that can be written."""
+    """Return a view of host memory as a writable array."""
     return np.frombuffer((ctypes.c_uint8 * pinned.size).from_address(pinned.ptr), dtype=np.uint8)

@@ -19,10 +19,11 @@ import warp as wp
 from warp_lcp.kernels.log_filter import start_warp
 
 Array = Any  # a numpy array or a wp.array
-# elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
+# Elements of a flat field that a CPU thread takes: its operands stay in the L2 cache between fused
+# loops.
 CPU_CHUNK = 8192
 LARGE = 1 << 20  # elements from which a field of the CPU is looked through for what of it is in use
-# bytes that the system gives memory by, when something in them is first written
+# Page sizes in bytes: the system allocates a page when something in it is first written.
 HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12
 
 
@@ -30,7 +31,7 @@ def checked_device(device: Any) -> wp.Device:
     """Return a Warp device; the default one if None.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: there is no device of that name.
     """
     start_warp()
     try:
@@ -77,7 +78,10 @@ def zeros(
 
 
 def _release(host: np.ndarray, pointer: int, size: int) -> None:
-    """Do nothing: the array of the host goes with the deleter that has it."""
+    """Do nothing.
+
+    The deleter object holds the host's array, which is freed with it.
+    """
 
 
 @cache
@@ -87,7 +91,7 @@ def _width(dtype: Any) -> int:
 
 
 def nothing(dtype: Any, device: wp.Device) -> wp.array[Any]:
-    """Return the flat array of a type without elements, which all share."""
+    """Return the empty flat array of a type; it is shared."""
     return _nothing(dtype, device.alias)
 
 
@@ -156,7 +160,7 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
     """Check that values can be stored in a type.
 
     Raises:
-        ValueError: one is NaN or infinite, or becomes so.
+        ValueError: a value is NaN or infinite, or becomes so.
     """
     largest = max(-float(values.min(initial=0.0)), float(values.max(initial=0.0)))  # NaN if one is
     if not np.isfinite(largest):
@@ -169,10 +173,10 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
 
 
 def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
-    """Check that no value but 0 becomes 0 in a type.
+    """Check that no nonzero value becomes 0 in a type.
 
     Raises:
-        ValueError: one does.
+        ValueError: a value does.
     """
     lost = np.count_nonzero(values) - np.count_nonzero(values.astype(wp.dtype_to_numpy(dtype)))
     if lost:
@@ -221,7 +225,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Elements of a stored field."""
+        """Number of elements of a stored field."""
         return math.prod(self.stored_shape)
 
     def zeros(self, dtype: Any) -> wp.array[Any]:
@@ -298,11 +302,13 @@ class Layout:
 
 @dataclass(frozen=True)
 class Padding:
-    """Counts of cells (nz, ny, nx) and of stored cells, which include one ghost cell on every side.
+    """Counts of cells (nz, ny, nx), and of stored cells with a ghost layer.
+
+    Stored cells include one ghost cell on every side.
 
     Args:
         counts: of cells.
-        small_pages: of what fields are made, see `zeros`.
+        small_pages: of fields' memory, see `zeros`.
     """
 
     counts: tuple[int, int, int]
@@ -320,12 +326,12 @@ class Padding:
 
     @property
     def plane(self) -> int:
-        """Elements from plane to plane."""
+        """Stride from plane to plane, in elements."""
         return self.shape[1] * self.shape[2]
 
     @property
     def row(self) -> int:
-        """Elements from row to row."""
+        """Stride from row to row, in elements."""
         return self.shape[2]
 
     @property
@@ -348,11 +354,11 @@ class PaddedLayout(Layout):
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
         self.padding = Padding((nz, ny, nx))
         self.stored_shape = self.padding.shape
-        # whether so little is in use that zeros elsewhere are better not written
+        # Whether so little is in use that zeros elsewhere are better not written.
         self.sparse = False
 
     def find_use(self, used: np.ndarray) -> None:
-        """Choose how fields take their memory, from which rows are in use at first.
+        """Choose the pages of fields' memory, from the rows in use at first.
 
         Args:
             used: bool, shape (nz, ny).
@@ -361,7 +367,7 @@ class PaddedLayout(Layout):
         if self.chunks is None or not k.size:
             return
         self.sparse = 4 * int(np.count_nonzero(self.chunks.numpy()[:, 0, 1])) < 3 * len(self.chunks)
-        # bytes, of a field of four each
+        # Bytes, of a field of four bytes an element.
         begin = 4 * ((k + 1) * self.padding.plane + (j + 1) * self.padding.row)
 
         def taken(page: int) -> int:
@@ -392,7 +398,7 @@ class PaddedLayout(Layout):
             a[begin:end] = b[begin:end]
 
     def _runs(self) -> list[tuple[int, int]]:
-        """Return the elements that are in use, as few ranges."""
+        """Return the elements in use, as few index ranges."""
         assert self.chunks is not None
         edges = np.flatnonzero(
             np.diff(self.chunks.numpy()[:, 0, 1] > 0, prepend=False, append=False)

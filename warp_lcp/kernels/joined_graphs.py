@@ -1,13 +1,13 @@
-"""CUDA graphs of neighboring stretches of a step, joined into one graph.
+"""CUDA graphs of consecutive stretches of a step, joined into one graph.
 
-Within `joined` a recorded stretch is not launched at once. It waits, with the numbers that it reads
-in this run, until the host or Warp needs the device: for a readback, a launch or copy that is not
-recorded, the end of the step. All that wait are then launched as one graph, which is captured when
-their sequence comes for the second time. A stretch that finds the device idle, after a readback, is
-launched at once, so that the host prepares the next ones while the device works.
+Within `joined` a recorded stretch is not launched at once. It is queued, with the numbers that it
+reads in this run, until the host or Warp needs the device: for a readback, a launch or copy that is
+not recorded, the end of the step. All queued stretches are then launched as one graph, which is
+captured when their sequence comes for the second time. A stretch is launched at once if the device
+is idle, after a readback: then the host prepares the next ones while the device works.
 
 Nothing is reordered: the functions of Warp by which anything else reaches the device (`SETTLING`)
-launch first what waits. So a profile, which synchronizes at the end of each stage, still has the
+first launch the queue. So a profile, which synchronizes at the end of each stage, still has the
 time of each stage alone.
 """
 
@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from warp_lcp.kernels.device_graph import DeviceGraph
 
 MOST_SEQUENCES = 64  # that are remembered
-# after these the device is idle
+# The device is idle after these functions.
 WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
-# Functions of Warp that give work to a device or wait for it, and where callers look them up.
+# Functions of Warp that give work to a device or wait for it, and the modules where callers look
+# them up.
 SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
     (
         wp,
@@ -63,7 +64,7 @@ SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
 
 
 class _Waiting(threading.local):
-    """Stretches of this thread that wait to be launched, in order."""
+    """Queue of this thread's stretches, in the order of launching."""
 
     depth = 0  # of `joined`
     idle = True  # whether the device has done all that this thread has launched
@@ -73,7 +74,7 @@ class _Waiting(threading.local):
 
 
 WAITING = _Waiting()
-# weak references to the stretches, and their graph once there is one
+# Weak references to the stretches, and their graph once there is one.
 _sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}
 
 
@@ -108,7 +109,7 @@ def waits(program: DeviceGraph) -> bool:
 
 
 def settle(program: DeviceGraph | None = None) -> None:
-    """Launch what waits; with a `program`, only if that waits."""
+    """Launch the queue; with a `program`, only if that is queued."""
     programs = WAITING.programs
     if not programs or (program is not None and all(other is not program for other in programs)):
         return
@@ -147,13 +148,13 @@ def _graph_of(programs: list[DeviceGraph]) -> Any:
 
 
 def _forget(key: tuple[int, ...], reference: Any) -> None:
-    """Forget a sequence, one of whose stretches is gone."""
+    """Forget a sequence after one of its stretches was deleted."""
     _sequences.pop(key, None)
 
 
 @functools.cache
 def _settle_before_warp() -> None:
-    """Have functions of Warp launch first what waits."""
+    """Patch functions of Warp to launch the queue first."""
     for owner, names in SETTLING:
         for name in names:
             if hasattr(owner, name):

@@ -69,7 +69,7 @@ class KernelFile:
         return iter(self._kernels)
 
     def __getitem__(self, name: str) -> StencilKernel:
-        """Return a kernel that leaves nothing to choose."""
+        """Return a kernel that has no choices."""
         return self.kernel(name)
 
     def kernel(
@@ -84,7 +84,7 @@ class KernelFile:
 
         Args:
             name: in the header.
-            module: of the variant, in place of what stands before the last dot of the name.
+            module: of the variant; it replaces the part before the last dot of the name.
             compute: type of computations, where the kernel leaves the choice.
             constants: those of the variant, beside those of the file.
 
@@ -102,7 +102,7 @@ class KernelFile:
 
 
 class _Declaration:
-    """A kernel's declaration: parsed, but for types and constants that Python chooses."""
+    """Parsed declaration of a kernel, before types and constants are chosen."""
 
     def __init__(self, path: Path, section: HeaderSection) -> None:
         self.path, self.name, self.line, self.where = (
@@ -120,7 +120,7 @@ class _Declaration:
             self._roles(self._type("compute", word))
 
     def make(self, module: str, compute: Any, constants: Mapping[str, float]) -> StencilKernel:
-        """Return the kernel, of a module, a type of computations and values of constants."""
+        """Return the kernel of a module, a type of computations and constants."""
         choices = [self._type("compute", word) for word in self._compute]
         compute = choices[0] if compute is None and len(choices) == 1 else compute
         if compute not in choices:
@@ -148,7 +148,7 @@ class _Declaration:
         )
 
     def _roles(self, compute: Any) -> dict[str, Any]:
-        """Return the roles as `StencilKernel` takes them."""
+        """Return the roles in the form of `StencilKernel`'s arguments."""
         optional: list[str] = []
         roles: dict[str, Any] = {role: self._fields(role, compute, optional) for role in FIELDS}
         roles |= {role: tuple(self._words(role)) for role in NAMES} | {
@@ -225,7 +225,7 @@ def _lines_of_roles(path: Path, section: HeaderSection) -> dict[str, tuple[int, 
     """Return the line and the content of each role.
 
     Raises:
-        ValueError: a role is unknown, stands twice, or should have a content or none.
+        ValueError: a role is unknown or repeated, lacks its content, or must not have one.
     """
     roles: dict[str, tuple[int, str]] = {}
     role = ""

@@ -34,24 +34,24 @@ if TYPE_CHECKING:
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-# types of fields that quads keep in registers
+# Types of fields that quads keep in registers.
 LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)
 POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
 Quads = tuple[Alignment, Alignment]  # of fields of passes by quads, and of those of the other level
 QUADS = ANYWHERE, ANYWHERE
-# threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most
+# Threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most.
 BLOCKS_OF_QUADS = 256, 2
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
 SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
-# stencils: with a weight an axis, with arrays of them, with a product in place
+# Stencils: with one weight an axis, with arrays of weights, or with a product in their place.
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"
 
 
 def words_of(quads: Quads | None) -> list[str]:
-    """Return what tells forms by quads from those by cells, and from each other."""
+    """Return the key of variants by quads, to tell them apart."""
     if quads is None:
         return []
     return [
@@ -104,13 +104,13 @@ def make_kernels_of_module(
 
 
 class KernelVariant:
-    """A pass whose types and constants are known.
+    """A stencil kernel whose types and constants are known.
 
     Attributes:
-        words: what tells it from other forms.
-        joins: whether it is compiled with other passes.
+        words: the variant's key.
+        joins: whether it is compiled with other kernels.
         quads: alignments, where a thread takes four cells of a row at a time, on CUDA only; see
-            `headers/quad.h`. None: it does not.
+            `headers/quad.h`. None: a thread takes single cells.
         name: of its kernel.
         fields: struct of its arguments.
         native: that struct in C.
@@ -165,7 +165,7 @@ class KernelVariant:
         variant = ".".join(
             ["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)]
         )
-        # apart from other forms, which Warp would take for overloads
+        # A module name of its own: Warp would take other variants for overloads.
         run.__module__ = area if d.box else variant
         self.name = d.name.replace(".", "_") if self.joins else last
         run.__qualname__ = f"{self.name}_rows"
@@ -300,7 +300,7 @@ class KernelVariant:
             POINTERS,
             *each,
         ]
-        # there names may be those of the pass
+        # In a block of its own, local names may be those of the declaration.
         body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]
         closed = ["}"] * bool(d.listed)
         macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
@@ -360,7 +360,7 @@ class KernelVariant:
             *function,
             "}",
         ]
-        # cells fewer than four: their loops are not unrolled
+        # Groups of fewer than four cells: their loops are not unrolled.
         once = ["#undef VECTORS", '#define VECTORS(WIDTH) _Pragma("unroll 1")']
         after = [
             '#line 1 "end"',
@@ -373,7 +373,10 @@ class KernelVariant:
         return "\n".join(["", *before, *whole, *once, *rest, *after])
 
     def _halves(self) -> list[list[str]]:
-        """Return C++ that begins the row function for whole quads: once for each place of rows."""
+        """Return C++ that begins the row function for whole quads.
+
+        It is there once for each alignment of rows.
+        """
         finer = self.declared.finer
         either = self.quads[finer].either
         made = []
@@ -471,9 +474,9 @@ class KernelVariant:
 
     @functools.cached_property
     def run_in_turn(self) -> Any:
-        """`run` for launches of several passes: a pass reads what one before it has written.
+        """`run` for launches of several kernels, which read each other's results.
 
-        Loads by `__ldg` may have values from before the launch.
+        `__ldg` is not used: its loads may return values from before the launch.
         """
         if not self.quads:
             return self.run
@@ -489,7 +492,7 @@ class KernelVariant:
 
     @functools.cached_property
     def kernel(self) -> Any:
-        """The kernel of the pass alone."""
+        """The kernel of a launch by itself."""
         run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
         if self.quads:
 
@@ -520,16 +523,16 @@ class KernelVariant:
 
     @property
     def by_cells(self) -> "KernelVariant":
-        """The same of single cells."""
+        """The same variant by single cells."""
         return form_of(self.declared, *self._chosen)
 
     @property
     def by_quads(self) -> "KernelVariant | None":
-        """The same of quads, as CUDA launches it on grids; None where there is none."""
+        """The same variant by quads, as CUDA launches it on grids; None if impossible."""
         return self.with_quads(QUADS)
 
     def with_quads(self, quads: Quads) -> "KernelVariant | None":
-        """Return the same of quads at these alignments; None where there is none."""
+        """Return the same variant by quads at these alignments; None if impossible."""
         if not self.declared.quads or self.pattern is not None:
             return None
         return form_of(self.declared, *self._chosen, quads=quads)
@@ -542,7 +545,7 @@ class KernelVariant:
         return (math.prod(threads(layout)),) if self.quads else threads(layout)
 
     def entry(self, bound: "BoundKernel") -> TableEntry:
-        """Return the kernel as the team calls it."""
+        """Return the kernel in the form of the thread pool."""
         if self._entry is None:
             self._entry = TableEntry(
                 wp.launch(
@@ -564,7 +567,10 @@ return wp::vec3i(L.begin / (L.rows*L.chunks), L.begin / L.chunks % L.rows, L.beg
 #endif
 """)
 def first_task(L: RowLayout) -> wp.vec3i:
-    """Slab, row and chunk of a range's first task; 0 on CUDA, where a thread has one of its own."""
+    """Compute slab, row and chunk of a range's first task.
+
+    They are 0 on CUDA, where a thread has a task of its own.
+    """
 
 
 @wp.func_native("""
@@ -572,4 +578,4 @@ const unsigned t = (unsigned)thread, row = t / (unsigned)L.chunks, slab = row / 
 return wp::vec3i((int)slab, (int)(row - slab*L.rows), (int)(t - row*L.chunks));
 """)
 def task_of(L: RowLayout, thread: int) -> wp.vec3i:
-    """Slab, row and chunk of a thread of a launch with one dimension."""
+    """Compute slab, row and chunk of a thread in a launch with one dimension."""

@@ -35,7 +35,7 @@ from warp_lcp.kernels.thread_pool import (
 
 
 class _Recording(threading.local):
-    """The program that takes what a thread launches; None: it is launched."""
+    """The program that records this thread's launches; None if they are executed."""
 
     program: CommandBuffer | None = None
 
@@ -44,13 +44,13 @@ RECORDING = _Recording()
 
 
 def is_recording() -> bool:
-    """Return whether what this thread launches is recorded."""
+    """Return whether this thread's launches are recorded."""
     return RECORDING.program is not None
 
 
 @contextmanager
 def recording(program: CommandBuffer) -> Iterator[None]:
-    """Record what this thread launches by `warp_lcp.kernels`, in place of launching it."""
+    """Record this thread's launches by `warp_lcp.kernels` instead of executing them."""
     before, RECORDING.program = RECORDING.program, program
     try:
         yield
@@ -82,7 +82,10 @@ def device_program(launch: Any = None) -> Any:
 
 
 class Launch(Protocol):
-    """Launches a kernel now, as `wp.launch` does, or records it, as `CommandBuffer.launch` does."""
+    """Launch function: launches a kernel now, or records it.
+
+    `wp.launch` does the first, `CommandBuffer.launch` the second.
+    """
 
     def __call__(
         self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...
@@ -100,24 +103,28 @@ def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: An
 
 
 def launch_graph(graph: Any) -> None:
-    """Launch a captured graph by Warp; likewise."""
+    """Launch a captured graph by Warp.
+
+    As with `launch_now`, no default argument holds Warp's function.
+    """
     wp.capture_launch(graph)
 
 
 @dataclass(frozen=True)
 class Task:
-    """What the host does between launches: exchange with other processes, say.
+    """A task of the host between launches, such as a halo exchange.
 
     Args:
-        function: does it.
-        operation: makes what the team can do in its place, on the CPU; None: nothing can.
+        function: performs it.
+        operation: creates an operation of the thread pool that replaces it on the CPU; None: there
+            is no such operation.
     """
 
     function: Callable[[], object]
     operation: Callable[[], Operation] | None = None
 
     def launch(self, launch: Launch = launch_now) -> None:
-        """Do it now, or record it between the launches."""
+        """Perform the task now, or record it between the launches."""
         recorded = (
             is_recording() or isinstance(getattr(launch, "__self__", None), CommandBuffer)
         ) and team() is not None
@@ -135,19 +142,19 @@ class Conditional:
     program: CommandBuffer
 
     def launch(self) -> None:
-        """Launch it, or record that in the graph that is being captured."""
+        """Launch it, or record it in the graph that is being captured."""
         wp.capture_if(self.condition, self.program._launch)
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A program that is repeated on CUDA while a number on the device is not 0, within a graph."""
+    """A CUDA program repeated in a graph while a number on the device is not 0."""
 
     condition: wp.array[Any]
     program: CommandBuffer
 
     def launch(self) -> None:
-        """Repeat it now, or record that in the graph that is being captured."""
+        """Repeat it now, or record the loop in the graph that is being captured."""
         wp.capture_while(self.condition, self.program._launch)
 
 
@@ -199,14 +206,14 @@ def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
 
 
 def run_table(table: OperationTable) -> None:
-    """Have the team work through a table."""
+    """Execute a table in the thread pool."""
     at_work = team()
     assert at_work is not None, "a table is made for a team"
     at_work.run(table)
 
 
 def _run_while(condition: Any, table: OperationTable) -> None:
-    """Have the team repeat a table, unless its condition is 0 before."""
+    """Repeat a table in the thread pool, unless its condition is 0 at the start."""
     if condition[0]:
         run_table(table)
 
@@ -283,7 +290,7 @@ def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]
 
 
 def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
-    """Return the launch of a kernel on the CPU as an operation that is not cut."""
+    """Return a CPU kernel launch as an operation that is not cut."""
     entry, arguments, native = prepared(kernel, dim, [value_of(v) for v in inputs])
     return Operation(
         ALONE,
@@ -317,7 +324,7 @@ def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
 
 
 def clear(*arrays: wp.array[Any]) -> None:
-    """Set arrays whose elements lie side by side to 0, now or among recorded launches."""
+    """Set contiguous arrays to 0, now or among recorded launches."""
     program = RECORDING.program
     for array in arrays:
         if program is None:
@@ -330,7 +337,7 @@ def clear(*arrays: wp.array[Any]) -> None:
 
 @dataclass(frozen=True)
 class DeviceCopy:
-    """Copy of an array on CUDA, or zeros: a node of a graph."""
+    """Copy or clearing of an array on CUDA: a node of a graph."""
 
     to: wp.array[Any]
     source: wp.array[Any] | None
@@ -345,17 +352,17 @@ class DeviceCopy:
 
 @dataclass(frozen=True)
 class DeviceCall:
-    """What Warp launches by a function of its own on CUDA, a sort or a scan: nodes of a graph."""
+    """Launches by a function of Warp on CUDA, as a sort or a scan: graph nodes."""
 
     function: Callable[[], object]
 
     def launch(self) -> None:
-        """Do it now, or while a graph is captured."""
+        """Call the function now, or while a graph is captured."""
         self.function()
 
 
 def call(function: Callable[[], object]) -> None:
-    """Do on CUDA what Warp launches by a function of its own, now or among recorded launches."""
+    """Call a function of Warp that launches on CUDA, now or recorded."""
     program = RECORDING.program
     function() if program is None else program.record(DeviceCall(function))
 
@@ -368,9 +375,9 @@ class CommandBuffer:
     """A sequence of kernel launches with fixed arguments.
 
     Functions that launch take `launch: Launch = launch_now`; given `program.launch`, they record
-    instead. On the CPU the team works through a table of them, on CUDA a graph is captured once the
-    first run has loaded every kernel. Where the host has tasks between launches, see `perform`,
-    there is a table or a graph for each stretch without one.
+    instead. On the CPU the thread pool executes a table of them. On CUDA a graph is captured once
+    the first run has loaded every kernel. Where the host has tasks between launches, see `perform`,
+    there is a table or a graph for each stretch between them.
 
     Args:
         device: where the kernels run.
@@ -382,7 +389,7 @@ class CommandBuffer:
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
         self._runs = 0
         self._stretches: list[Callable[[], object]] | None = None
-        # what launches their graph, by the address of their condition
+        # Launch functions of loops' graphs, by the address of the condition.
         self._loops: dict[int, Callable[[], object]] = {}
         self._native: bool | None = None  # None: not known
 
@@ -418,19 +425,19 @@ class CommandBuffer:
         self._forget_prepared()
 
     def _forget_prepared(self) -> None:
-        """Prepare again what is run, since there are other commands."""
+        """Discard the prepared tables and graphs after new commands."""
         self._stretches = self._native = None
         self._loops.clear()
 
     @property
     def is_native(self) -> bool:
-        """Whether the team works through all of it."""
+        """Whether the thread pool executes all of it."""
         if self._native is None:
             self._native = all(isinstance(command, Operation) for command in self._commands)
         return self._native
 
     def fits(self) -> bool:
-        """Return whether its launches have room for the rows as they are now."""
+        """Return whether the launches have room for the present rows."""
         return True
 
     @property
@@ -448,7 +455,7 @@ class CommandBuffer:
         self._forget_prepared()
 
     def run(self) -> None:
-        """Launch everything once, or record that among the launches of another program."""
+        """Launch everything once, or record it among the launches of another program."""
         if RECORDING.program is not None:
             RECORDING.program.extend(self)
             return
@@ -462,12 +469,12 @@ class CommandBuffer:
         self._runs += 1
 
     def run_while(self, condition: wp.array[Any]) -> None:
-        """Launch everything again and again while the condition is not 0; the launches update it.
+        """Repeat all launches while the condition is not 0; the launches update it.
 
-        Where loops run on the device, they do not come back to the host: on CUDA, all but the first
-        call are one graph, and return before it has ended; on the CPU, the team looks after signals
-        and the deadline. Ranks must find the same condition; they repeat the launches without the
-        host unless they have a deadline, which they look at together.
+        Where loops run on the device, control does not return to the host: on CUDA, all but the
+        first call are one graph, and return before it has ended; on the CPU, the thread pool checks
+        for signals and the deadline. Ranks must find the same condition; they repeat the launches
+        without the host unless they have a deadline, which they check together.
 
         Args:
             condition: shape (1,), wp.int32.
@@ -484,13 +491,13 @@ class CommandBuffer:
             wp.capture_while(condition, self._run_in_time)
 
     def _loop(self, condition: wp.array[Any]) -> None:
-        """Launch everything while the condition is not 0, without the host."""
+        """Repeat all launches on the device while the condition is not 0."""
         if condition.ptr not in self._loops:
             self._loops[condition.ptr] = self._captured_loop(condition)
         self._loops[condition.ptr]()
 
     def _loops_here(self) -> bool:
-        """Return whether `run_while` can do without the host now."""
+        """Return whether `run_while` can run without the host now."""
         if not self.device.is_cuda and team() is not None:
             return self.is_native and not is_collective()
         if self._has_tasks or not loops_on_device(self.device):
@@ -517,7 +524,10 @@ class CommandBuffer:
         return any(isinstance(command, Task) for command in self._commands)
 
     def _prepared(self) -> list[Callable[[], object]]:
-        """Return a graph, a table or the launches of every stretch between tasks, and the tasks."""
+        """Return the stretches between host tasks, and the tasks.
+
+        A stretch is a graph, a table or its launches.
+        """
         made: list[Callable[[], object]] = []
         for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
             stretch = list(group)
@@ -532,7 +542,7 @@ class CommandBuffer:
         return made
 
     def _captured(self, commands: Sequence[Any]) -> Any:
-        """Return the graph of some launches."""
+        """Capture some launches and return their graph."""
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for command in commands:
                 command.launch()
@@ -578,7 +588,10 @@ MOST_RECORDED = 32  # sequences of a graph
 
 
 class NotRecordable(Exception):
-    """What a graph of CUDA cannot hold: a task of the host, a copy of a replaced array."""
+    """A command that a CUDA graph cannot hold.
+
+    It is a task of the host, or a copy of a replaced array.
+    """
 
 
 class LaunchGraph:
@@ -596,11 +609,11 @@ class LaunchGraph:
         at_once: whether to launch in each run instead.
     """
 
-    # whether CUDA graphs are captured: not yet run on a GPU
+    # Whether CUDA graphs are captured. They have not been run on a GPU yet.
     on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
-    # makes the recording of a device: `device_graph.DeviceGraph`, set by `warp_lcp.kernels`
+    # Creates the recording of a device: `device_graph.DeviceGraph`, set by `warp_lcp.kernels`.
     device_program: ClassVar[Any]
-    # whether each run records again and compares with the first recording, for tests
+    # For tests: each run records again and compares with the first recording.
     verify: ClassVar[bool] = False
 
     def __init__(
@@ -611,11 +624,11 @@ class LaunchGraph:
         self._threads = 0
 
     def run(self, *arguments: Any, variant: Hashable = None) -> None:
-        """Launch everything, or record that among the launches of a program that is being recorded.
+        """Launch everything, or record it in the program that is being recorded.
 
         Args:
-            arguments: of `record`. Other arrays or objects are recorded for themselves.
-            variant: by what else `record` decides which of several sequences it launches; each is
+            arguments: of `record`. Other arrays or objects get recordings of their own.
+            variant: key of further decisions of `record` about what it launches; each variant is
                 recorded once.
         """
         if (
@@ -646,7 +659,7 @@ class LaunchGraph:
         program.run()
 
     def forget(self) -> None:
-        """Record again in the next run, since arrays have been replaced."""
+        """Record again in the next run, because arrays have been replaced."""
         self._programs = {}
 
     def _recorded(self, arguments: tuple[Any, ...]) -> CommandBuffer | None:

@@ -1,8 +1,8 @@
-"""Where rows lie, and the structs that hand stencils and bounds to kernels.
+"""Row layout, and the structs that pass stencils and bounds to kernels.
 
 A Warp kernel with one thread a cell reaches 3 % of a CPU's memory bandwidth; one thread for a
 *grain* of contiguous elements with a native inner loop reaches nearly all of it. clang vectorizes
-such a loop only if it is told that the arrays do not alias and if conditionals are written as
+such a loop only if the arrays are declared not to alias and if conditionals are written as
 selections of values that are computed anyway.
 """
 
@@ -21,24 +21,24 @@ from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
 BY_QUADS = os.environ.get("WARP_LCP_QUADS") != "0"  # else a cell: to compare the two on a GPU
 CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
-# planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory
-# than the rest of a method
+# Planes that a thread sums over. On CUDA, partial sums of every cell would take more memory than
+# the rest of a method.
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
-# planes that a thread of a pass without sums takes on CUDA, where cells are more than enough for
-# all threads: .8 of the time on an H200
+# Planes that a thread of a kernel without sums takes on CUDA, where there are more than enough
+# cells for all threads: .8 of the time on an H200.
 UNSUMMED_PLANES, MANY_CELLS = 4, 1 << 21
-# fewer cells: threads that take quads sum over as few planes, or they are too few to hide
-# latencies; as computed
+# With fewer cells, threads that take quads sum over as few planes; otherwise they are too few to
+# hide latencies. The number is computed, not measured.
 SUMMED_CELLS = 1 << 24
 
 
-# cells of a grid from which quads are loaded in blocks of 16 bytes: smaller grids are held by
-# latencies, and kernels of their alignments would have to be compiled for them
+# Cells of a grid from which quads are loaded in blocks of 16 bytes. Smaller grids are limited by
+# latencies, and kernels for their alignments would have to be compiled.
 MANY_CELLS_OF_BLOCKS = 1 << 18
 
 
 class Alignment(NamedTuple):
-    """Where the rows of a grid's fields begin.
+    """Alignment of the rows of a grid's fields.
 
     Attributes:
         first: elements between a multiple of four and the first cell of a row; -1: any number.
@@ -50,7 +50,7 @@ class Alignment(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Name in kernels; empty where rows begin anywhere."""
+        """Part of a kernel's name; empty where rows begin anywhere."""
         return (
             ""
             if self.first < 0
@@ -83,21 +83,23 @@ class RowLayout:
     grain: int  # cells that a thread takes
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
-    # fields of three planes: planes before the first that they keep, too, that of ghosts, or none
+    # For fields of three planes: planes before the first that they keep as well, that of ghosts, or
+    # none.
     turn: int
     lift: int  # the plane at which they begin, counted from the first
-    # planes of a slab of such fields, each with three planes of its own but beside the next
+    # For such fields: planes of a slab. Each slab has three planes of its own, apart from the next
+    # slab's.
     cut: int
     slabs: int  # their number
     apart: int  # planes on either side of a cut that keep a place of their own
-    # first (even, for `pairs`) and one past the last cell of each row (k, j) with unknowns; null:
-    # all
+    # First cell (even, for `pairs`) and one past the last of each row (k, j) with unknowns; null:
+    # all.
     spans: wp.array2d(dtype=wp.vec2i)
-    # (plane, row) and (first, one past the last) cell of each piece of a box in part; null: all of
-    # it
+    # (plane, row) and (first, one past the last) cell of each row segment of a box in part; null:
+    # the whole box.
     pieces: wp.array2d(dtype=wp.vec2i)
-    # the other level of a transfer: element of its first cell, elements from plane to plane and
-    # from row to row
+    # Other level of a transfer: element of its first cell, elements from plane to plane and from
+    # row to row.
     o0: wp.int64
     o1: wp.int64
     o2: wp.int64
@@ -110,7 +112,7 @@ class RowLayout:
 
 @wp.struct
 class BoundFields:
-    """Bounds of x as `warp_lcp.problem.bounds.Bounds.operands` has them."""
+    """Bounds of x, with the operands of `warp_lcp.problem.bounds.Bounds.operands`."""
 
     lower: wp.array(dtype=wp.float64)
     upper: wp.array(dtype=wp.float64)
@@ -124,16 +126,16 @@ NO_ARRAY = bytes(wp.array(dtype=wp.uint8).__ctype__())
 
 
 def grain(n: int, device: wp.Device) -> int:
-    """Return how many cells of a row of n cells one thread takes."""
+    """Return the number of cells that a thread takes of a row of n cells."""
     return 1 if device.is_cuda else n
 
 
 def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> None:
-    """Check what kernels are to have the address of.
+    """Check an array before its address is passed to kernels.
 
     Raises:
         TypeError: it is no array of this type.
-        ValueError: it has another shape, or elements that do not lie side by side.
+        ValueError: it has another shape, or is not contiguous.
     """
     if not isinstance(array, wp.array) or array.dtype is not dtype:
         found = array.dtype if isinstance(array, wp.array) else type(array)
@@ -181,17 +183,17 @@ def copy_of(struct: Any) -> Any:
 
 
 def packed(arrays: Sequence[Any]) -> list[Any]:
-    """Return arrays as C has them, one that is None as a null array."""
+    """Return arrays as C structs; None becomes a null array."""
     return [NO_ARRAY if a is None else a.__ctype__() for a in arrays]
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Which neighbors the rows of a compact stencil have, and how their weights are had.
+    """Pattern of a compact stencil: its neighbors and the source of its weights.
 
     Attributes:
-        offsets: (x, y, z), each -1, 0 or 1, of the neighbors; of a `symmetric` one of those before
-            a cell, whose weights are those of the ones after it, too.
+        offsets: (x, y, z), each -1, 0 or 1, of the neighbors. A `symmetric` pattern has those
+            before a cell; the weights serve those after it, too.
         symmetric: whether a weight serves both its cells.
         kind: "numbers", one an offset; "arrays"; or "functions", Warp functions (k, j, i) of the
             cell.
@@ -216,7 +218,7 @@ class Pattern:
 
     @functools.cached_property
     def word(self) -> str:
-        """What tells its kernels from others."""
+        """Key of its kernels."""
         mask = sum(1 << (x + 1 + 3 * (y + 1) + 9 * (z + 1)) for x, y, z in self.offsets)
         return (
             f"compact_{'symmetric_' * self.symmetric}{self.kind}"
@@ -267,7 +269,7 @@ class Pattern:
 
 @functools.cache
 def _number_of(functions: tuple[Any, ...]) -> str:
-    """Return what tells functions from others, of the same names too."""
+    """Return a key of functions that also distinguishes those of equal names."""
     return f"_{_number_of.cache_info().misses}" if functions else ""
 
 
@@ -308,7 +310,9 @@ def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
 
 @dataclass(frozen=True)
 class PrecomputedProduct:
-    """What a pass takes in place of a stencil where the product has been computed: on matrices.
+    """A precomputed product A x + b, passed to a kernel in place of a stencil.
+
+    Matrices use it.
 
     Args:
         d: diagonal in units of `unit`, stored; 0 where there is no unknown.
@@ -323,7 +327,7 @@ class PrecomputedProduct:
 
     @functools.cached_property
     def struct(self) -> Any:
-        """What passes take of it."""
+        """Arguments of kernels."""
         check_memory("a known product", self.y, wp.float64, (self.d.size,))
         return put(
             copy_of(_blank_stencil(self.d.dtype)),
@@ -436,7 +440,7 @@ class Rows:
 
     @staticmethod
     def stored(padding: Padding, device: wp.Device) -> "Rows":
-        """Return all stored cells of a padded grid, ghosts too."""
+        """Return all stored cells of a padded grid, with ghost cells."""
         counts = tuple(n + 2 for n in padding.counts)
         made = Rows.strided(
             padding.size, device, (0, padding.plane, padding.row), counts, quads=True
@@ -444,11 +448,11 @@ class Rows:
         return made._changed(lift=1)
 
     def after_ghosts(self) -> "Rows":
-        """Return the same rows for passes whose fields of three planes begin with one of ghosts.
+        """Return the same rows for three-plane fields that begin with a ghost plane.
 
         Raises:
-            ValueError: there are fewer than two: with ghost cells, a field has no room for three
-                planes and what is below them.
+            ValueError: there are fewer than two planes: with ghost cells, a field has no room for
+                three planes and those below them.
         """
         if self.single.planes < 2:
             raise ValueError(
@@ -464,7 +468,10 @@ class Rows:
 
     @staticmethod
     def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":
-        """Return the first stored cells along axis 0, 1, 2 for x, y, z, those of its edges too."""
+        """Return the first stored cells along an axis, with the edges.
+
+        The axis is 0, 1, 2 for x, y, z.
+        """
         counts = [1 if 2 - axis == a else n + 2 for a, n in enumerate(padding.counts)]
         return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(counts))
 
@@ -521,12 +528,12 @@ class Rows:
 
     @staticmethod
     def in_part(pieces: wp.array[Any], cells: int, ends: tuple[int, int, int]) -> "Rows":
-        """Return pieces of the rows of a grid, a thread takes one.
+        """Return row segments of a grid; a thread takes one.
 
         Args:
             pieces: (k, j) and (first, one past the last i) of each, vec2i, shape (n, 2).
-            cells: how many there are in all.
-            ends: what they end before, (k, j, i).
+            cells: number of cells of all segments.
+            ends: bounds of the segments (k, j, i), exclusive.
         """
         check_memory("pieces", pieces, wp.vec2i, (len(pieces), 2))
         made = Rows.box((0, 0, 0), (1, 1, len(pieces)), pieces.device, cells=1)
@@ -553,7 +560,7 @@ class Rows:
     def listed(
         count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1
     ) -> "Rows":
-        """Return the same for a pass without a box: of arrays as a whole."""
+        """Return the same for a kernel without a box, over whole arrays."""
         return replace(
             Rows.strided(0, device, (0, 0, 0), (1, 1, count), cells=cells), weight=weight
         )
@@ -641,8 +648,8 @@ class Rows:
 
         Args:
             other: the rows of that level.
-            factors: cells of it along x, y, z that one of ours stands for; below 0: of ours that
-                one of its stands for.
+            factors: its cells along x, y, z for each cell of these rows; negative: cells of these
+                rows for each cell of that level.
         """
         made = self._pairs.get((id(other), factors))
         if made is None:
@@ -673,7 +680,7 @@ class Rows:
             else put(copy_of(self.quads), members)
         )
         summed = None if self.summed is L else put(copy_of(self.summed), members)
-        # a thread takes the cells of one of the other level's
+        # A thread takes the cells of one of the other level's threads.
         if not self.device.is_cpu and factors[0] < 0:
             members |= {"grain": -factors[0], "chunks": -(L.nx // factors[0])}
         single = put(copy_of(L), members)
@@ -683,18 +690,18 @@ class Rows:
 
     @functools.cached_property
     def count(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return int(self.single.planes * self.single.rows)
 
     @functools.cached_property
     def places(self) -> int:
-        """How many sums a pass makes of each kind, one a thread."""
+        """Number of partial sums of each kind, one a thread."""
         planes, rows, chunks = threads(self.summed)
         return planes * rows * chunks
 
 
 def _alignment(layout: Any) -> Alignment:
-    """Return where rows begin, as far as reading fields in blocks needs it."""
+    """Return the alignment of rows, for reading fields in blocks."""
     first, plane, row = layout.base % 4, layout.s1 % 4, layout.s2 % 4
     if layout.planes * layout.rows * layout.nx < MANY_CELLS_OF_BLOCKS:
         return ANYWHERE
@@ -714,5 +721,5 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
 
 
 def threads(layout: Any) -> tuple[int, int, int]:
-    """Return the threads of a launch."""
+    """Return the number of threads of a launch, by dimension."""
     return -(-layout.planes // layout.slab), layout.rows, layout.chunks

@@ -15,7 +15,7 @@ from typing import TextIO
 
 import warp as wp
 
-# whose modules of kernels are not worth a line each
+# Modules whose kernels are not reported one by one.
 OURS = ("warp_lcp", "fluids", "granular", "benchmarks", "warp")
 BANNER = re.compile(r"Warp \S+ initialized:")
 LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+ ms +\((\w+)\)")
@@ -40,7 +40,7 @@ class KernelMessages:
         self.debug, self.error = logger.debug, logger.error
 
     def info(self, message: str) -> None:
-        """Pass a message on, unless it is of the banner or a module of ours."""
+        """Pass a message on, unless it is the banner or is about a module of this library."""
         found = LOADED.match(message)
         hidden = (found is not None and found[1] in OURS) or BANNER.match(message)
         if not hidden or wp.config.log_level <= wp.LOG_DEBUG:
@@ -57,7 +57,7 @@ class KernelMessages:
     def warning(
         self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
     ) -> None:
-        """Pass a warning on, at its caller's place."""
+        """Pass a warning on, with its caller's place."""
         self._logger.warning(message, category, stacklevel=stacklevel + 1)
 
 
@@ -80,7 +80,7 @@ def start_warp() -> None:
 
 @contextmanager
 def _native_messages_dropped() -> Iterator[None]:
-    """Keep what native code writes to the error stream off it, where there is one."""
+    """Redirect the native error stream within a `with` block, if there is one."""
     try:
         kept = os.dup(2)
     except OSError:  # the stream is closed
@@ -97,7 +97,10 @@ def _native_messages_dropped() -> Iterator[None]:
 
 
 def install_log_filter() -> None:
-    """Put `KernelMessages` in the place of Warp's own logger; one that a program has set stays."""
+    """Install the log filter in place of Warp's own logger.
+
+    A logger that a program has set stays.
+    """
     logger = wp.get_logger()
     if type(logger).__module__.startswith("warp."):
         wp.set_logger(KernelMessages(logger))

@@ -1,8 +1,8 @@
-"""Memory that recorded launches read when they run: numbers, windows, lists, and where arrays lie.
+"""Memory that recorded launches read in each run.
 
-A launch that is recorded once holds its arguments as bytes. What changes from run to run stands in
-memory of its owner, and a patch of the launch, (offset in the arguments, address, bytes), has it
-copied into them each time.
+It holds numbers, windows, lists, and addresses of arrays. A launch that is recorded once holds its
+arguments as bytes. What changes from run to run stands in memory of its owner. A patch of the
+launch, (offset in the arguments, address, bytes), copies it into the arguments before each run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LAYOUT = type(_BLANK.__ctype__())
 LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
 _ARRAY: Any = type(wp.array(dtype=wp.uint8).__ctype__())
 ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), _ARRAY.shape.offset
-# members of a RowLayout from `nx` to `slab`; first (k, j, i)
+# Members of a RowLayout from `nx` to `slab`; first (k, j, i).
 BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")
 FORMATS: dict[Any, Any] = {
     wp.float32: ctypes.c_float,
@@ -37,8 +37,8 @@ FORMATS: dict[Any, Any] = {
 class Scalar:
     """A number that changes between the runs of recorded launches.
 
-    Pass it where a kernel takes a number: a launch that is recorded reads `value` each time it
-    runs, another takes it as it is.
+    Pass it where a kernel takes a number. A recorded launch reads `value` in each run; any other
+    launch uses the value at the time of the call.
     """
 
     __slots__ = ("_cells", "_scaled", "_value")
@@ -62,13 +62,13 @@ class Scalar:
             product.value = value * factor
 
     def scaled(self, factor: float) -> Scalar:
-        """Return the number times a factor, which goes along with it."""
+        """Return the number times a factor, updated with it."""
         if factor not in self._scaled:
             self._scaled[factor] = Scalar(self._value * factor)
         return self._scaled[factor]
 
     def address(self, kind: Any) -> tuple[int, int]:
-        """Return the address of the number in one of Warp's types, and its bytes."""
+        """Return the address and the bytes of the number in one of Warp's types."""
         kind = FORMATS[kind]
         if kind not in self._cells:
             self._cells[kind] = kind(self._value)
@@ -81,7 +81,7 @@ def scaled(number: float | Scalar, factor: float) -> Any:
 
 
 def value_of(number: Any) -> Any:
-    """Return a number, or what a `Scalar` holds now."""
+    """Return a number, or the present value of a `Scalar`."""
     return number.value if type(number) is Scalar else number
 
 
@@ -100,13 +100,13 @@ class Slot:
         self._held: Any = None  # the store that `point_to_first` has been given last
 
     def point_to(self, array: wp.array[Any]) -> None:
-        """Have recorded launches use this array from now on."""
+        """Make recorded launches use this array from now on."""
         self._held = None
         ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
         array.slot = self
 
     def point_to_first(self, count: int, store: wp.array[Any]) -> None:
-        """Have recorded launches use the first elements of an array of one axis from now on."""
+        """Make recorded launches use the first elements of a flat array from now on."""
         if self._held is not store:
             ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
             self._held = store
@@ -148,7 +148,7 @@ class RowsMemory:
     def take_box(
         self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]
     ) -> None:
-        """Take whole rows of a box over, see `RowLayout`."""
+        """Set the rows to whole rows of a box, see `RowLayout`."""
         ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
         BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
         PLACE.pack_into(self.place, 0, *place)
@@ -164,7 +164,7 @@ class RowsMemory:
         return chunks
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
-        """Take rows over.
+        """Set the rows.
 
         Args:
             layout: a RowLayout.
@@ -190,14 +190,17 @@ class DeviceRows(RowsMemory):
     __slots__ = ("extent", "places", "room", "spare")
 
     def __init__(self, spare: float = 1.0) -> None:
-        """Begin with one thread; where `room` must grow, it does so by the factor `spare` more."""
+        """Begin with one thread.
+
+        Where `room` must grow, it grows by the factor `spare` more.
+        """
         super().__init__()
         self.extent: tuple[int, ...] = (1, 1, 1)
         self.room: tuple[int, ...] = (1, 1, 1)
         self.places, self.spare = Scalar(), spare
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
-        """Take rows over."""
+        """Set the rows and their launch dimensions."""
         super().take(layout, place)
         self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
         self.room = larger(self.room, self.extent, self.spare)
@@ -205,10 +208,16 @@ class DeviceRows(RowsMemory):
 
 
 def rows_memory(device: wp.Device, spare: float = 1.0) -> RowsMemory:
-    """Return memory of rows for recorded launches of a device; `spare` as of `DeviceRows`."""
+    """Return memory of rows for recorded launches.
+
+    `spare` as of `DeviceRows`.
+    """
     return DeviceRows(spare) if device.is_cuda else RowsMemory()
 
 
 def larger(room: tuple[int, ...], extent: tuple[int, ...], spare: float = 1.0) -> tuple[int, ...]:
-    """Return launch dimensions that hold others, too: where they must grow, by a factor more."""
+    """Return launch dimensions that contain both arguments.
+
+    Those that must grow do so by the factor `spare` more.
+    """
     return tuple(r if r >= e else int(spare * e) for r, e in zip(room, extent, strict=True))

@@ -72,7 +72,7 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
                 f"{path}:{start + 1}: {name} is declared in line {found[name].line}, too"
             )
         begin = start + 1
-        # more of the description
+        # A continued description.
         while kind == "kernel" and begin < end and re.match("// [^ ]", lines[begin]):
             begin += 1
         while kind == "kernel" and begin < end and lines[begin].startswith("//   "):
@@ -86,7 +86,7 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
 
 
 def text(path: Path, name: str = "") -> str:
-    """Return a section of a header, or the whole of it, with what it includes.
+    """Return a section of a header, or the whole of it, with includes resolved.
 
     Raises:
         ValueError: there is no such section, or an included one is missing.
@@ -105,7 +105,10 @@ def text(path: Path, name: str = "") -> str:
 
 
 def _included(path: Path, number: int, line: str) -> str | None:
-    """Return what a line includes; None if it is none that includes, or one for the compiler."""
+    """Return the target of an include line.
+
+    Returns None for any other line, and for includes that the compiler resolves.
+    """
     found = _INCLUDE.fullmatch(line)
     if not found:
         return None
@@ -121,5 +124,5 @@ def _included(path: Path, number: int, line: str) -> str | None:
 
 @functools.cache
 def shared(name: str) -> str:
-    """Return a header of the layer's own."""
+    """Return a header of this package."""
     return text(HEADERS / name)

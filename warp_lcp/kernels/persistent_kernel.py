@@ -1,9 +1,10 @@
 # mypy: ignore-errors
-"""Passes one after another in one launch on CUDA; on the CPU, launches.
+"""Persistent kernels: several kernels in one launch on CUDA.
 
-A block of threads takes them, or a cluster of blocks. All threads meet at a barrier after each
-pass. A cluster (compute capability 9.0 on) is a few blocks on neighboring multiprocessors that have
-a barrier in hardware. It is taken where a pass has more tasks than a block has threads.
+On the CPU they are separate launches. A block of threads or a cluster of blocks executes them. All
+threads meet at a barrier after each kernel. A cluster (compute capability 9.0 on) is a few blocks
+on neighboring multiprocessors that have a barrier in hardware. It is used where a kernel has more
+tasks than a block has threads.
 """
 
 import functools
@@ -38,7 +39,7 @@ class EmptyArguments:
 
 @wp.func
 def nothing(L: RowLayout, F: EmptyArguments, slab: int, row: int, chunk: int, count: int):
-    """Stand for a form that a sequence does not have."""
+    """Do nothing, in place of an unused variant."""
 
 
 class PersistentKernel:
@@ -84,7 +85,7 @@ class PersistentKernel:
 
     @functools.cached_property
     def tables(self) -> Any:
-        """The passes, those of each form in a table, and the order in which they follow."""
+        """Tables of the kernels by variant, and the order of execution."""
         places = dict[int, tuple[int, int]]()
         kept: list[list[bytes]] = [[] for _ in self._forms]
         for bound in {id(stage): stage for stage in self._stages}.values():
@@ -98,13 +99,14 @@ class PersistentKernel:
         for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):
             stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
             typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
-            # a recorded launch keeps the tables alone, and they what they have the addresses of
+            # A recorded launch holds the tables alone, so the tables must hold the arrays whose
+            # addresses they have.
             typed.kept = stored, self._stages
             setattr(made, table, typed)
         return made
 
     def launch(self, launch: Launch = launch_now) -> None:
-        """Launch all passes, or record their launch."""
+        """Launch all kernels, or record their launch."""
         if self.device.is_cuda:
             inputs = [self.tables, 0, len(self._stages), self.threads]
             launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
@@ -145,7 +147,7 @@ __syncthreads();
 """
 )
 def meet_in_cluster():
-    """Wait for all threads of the cluster, and see what they have written."""
+    """Wait for all threads of the cluster, and make their writes visible."""
 
 
 def has_clusters(device: wp.Device) -> bool:
@@ -193,7 +195,10 @@ def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: boo
     Tables = make_struct(f"{name.replace('.', '_')}_{variant.replace('.', '_')}", members)
 
     def sequence(T: Tables, begin: int, end: int, threads: int):
-        """Every thread passes every barrier: the bounds of the loop are the same for all."""
+        """Execute the kernels from `begin` to `end`, with a barrier after each.
+
+        Every thread reaches every barrier: the bounds of the loop are the same for all.
+        """
         t = wp.tid()
         for s in range(begin, end):
             at = T.order[s]
@@ -212,6 +217,7 @@ def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: boo
     sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
     options = {"cluster_dim": BLOCKS} if clustered else {}
     module = f"warp_lcp.{name}.{variant}"
-    # without the least number of blocks, 1, ptxas keeps to 128 registers and spills
+    # The least number of blocks, 1, must be given: without it ptxas uses at most 128 registers and
+    # spills.
     kernel = forward_kernel(module=module, launch_bounds=(THREADS, 1), **options)(sequence)
     return kernel, Tables, structs

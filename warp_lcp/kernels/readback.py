@@ -21,12 +21,12 @@ LINE = 64  # bytes that no two readings share
 class DeviceScalar:
     """An array of a few numbers, written by kernels and read by the host.
 
-    Whoever has launched what writes to `array` says so by `changed`; `numpy` then waits for the
-    device, once for all readings of it.
+    Call `changed` after every launch that writes to `array`. `numpy` then waits for the device; one
+    copy serves all readings of it.
 
     Args:
-        device: where it is.
-        count: numbers.
+        device: of the array.
+        count: of numbers.
         dtype: of them.
     """
 
@@ -50,22 +50,22 @@ class DeviceScalar:
         weakref.finalize(self, self._board.give_back, place, size)
 
     def changed(self) -> None:
-        """Say that launches have written to it."""
+        """Mark the numbers as changed by launches."""
         if self._board is not None:
             self._change = self._board.note()
 
     def numpy(self) -> np.ndarray:
-        """Return the numbers as they are after all that has been launched, not to be written to."""
+        """Return the numbers after all launches so far; they are read-only."""
         if self._board is None:
             return self._view
         return self._board.fetched(self._change)[self._slice].view(self._kind)
 
 
 class ReadbackBuffer:
-    """Memory of a device for its readings.
+    """Device buffer of all small results, copied to the host as a whole.
 
     Args:
-        device: where it is.
+        device: of the buffer.
         size: of it, in bytes.
     """
 
@@ -75,7 +75,7 @@ class ReadbackBuffer:
         self._free: dict[int, list[int]] = {}  # places by their size
 
     def take(self, size: int) -> int | None:
-        """Return a place of so many bytes, None if there is none."""
+        """Allocate so many bytes and return their place; None if there is no room."""
         size = -(-size // LINE) * LINE
         if free := self._free.get(size):
             return free.pop()
@@ -86,7 +86,7 @@ class ReadbackBuffer:
         return self._end - size
 
     def give_back(self, place: int, size: int) -> None:
-        """Take a place back."""
+        """Free a place."""
         self._free.setdefault(-(-size // LINE) * LINE, []).append(place)
 
     def note(self) -> int:
@@ -105,7 +105,7 @@ _boards: dict[str, ReadbackBuffer] = {}  # the newest of each device
 
 
 def place_of(device: wp.Device, size: int) -> tuple[ReadbackBuffer, int]:
-    """Return a board of a device that has so many bytes free, and their place on it."""
+    """Return a buffer of a device with so many bytes free, and their place in it."""
     board = _boards.get(device.alias) or _boards.setdefault(device.alias, ReadbackBuffer(device))
     place = board.take(size)
     if place is None:

@@ -28,15 +28,15 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.native import shared
 
 VARIABLE = "WARP_LCP_THREADS"
-# where launchers of ranks tell how many are on this machine
+# Environment variables in which MPI launchers give the number of ranks on this machine.
 RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")
 MOST_THREADS = 1024
-# nanoseconds in native code after which the interpreter is asked whether there is a signal
+# Nanoseconds in native code after which the interpreter is asked for signals.
 PATIENCE = 50_000_000
-# of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+# Least cells of a usual kernel in a piece: a microsecond or more; to take a piece costs 0.1.
 CELLS = 4096
 PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
-# of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
+# Spins of an idle thread before it yields its core, 25 ns each: with a core of its own, without.
 SPINS = 10000, 2000
 COPIED = 1 << 18  # bytes that a thread copies at least
 ROOM = 4096  # bytes of the arguments of what can be cut
@@ -55,7 +55,7 @@ TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
 WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
 MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are kept
-# of `struct`
+# Formats of `struct`.
 FORMATS = {
     wp.float32: "f",
     wp.float64: "d",
@@ -80,16 +80,16 @@ SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
 def work_through(
     team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share: int, limit_: wp.int64
 ):
-    """Do what `mode` asks of thread `me`."""
+    """Perform the action `mode` of thread `me`."""
 
 
 @forward_kernel(module="warp_lcp.team")
 def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: int, limit: wp.int64):
-    """Do what `mode` asks of thread `me`; one thread."""
+    """Perform the action `mode` of thread `me`; one thread."""
     work_through(team, table, mode, me, share, limit)
 
 
-# a part of a kernel's arguments that is read from memory: offset in them, address, bytes
+# A part of a kernel's arguments that is read from memory: offset in them, address, bytes.
 Patch = tuple[int, int, int]
 
 
@@ -107,7 +107,7 @@ class Arguments(ctypes.Structure):
 
 
 class TableEntry:
-    """A kernel on the CPU: what C calls, and the bounds of a launch.
+    """A CPU kernel: the function for C, and the bounds of a launch.
 
     Args:
         launch: a recorded launch of it.
@@ -115,7 +115,7 @@ class TableEntry:
 
     def __init__(self, launch: Any) -> None:
         self.kernel, self.function = launch.kernel, launch.hooks.forward
-        # the module stays loaded; the launch would keep arrays
+        # The module stays loaded. The launch itself is not stored, as it would hold arrays.
         self._kept = launch.module_exec, launch.bounds
         self.call = ctypes.cast(self.function, ctypes.c_void_p).value
         self.bounds = ctypes.addressof(launch.bounds)
@@ -127,10 +127,10 @@ class OperationKind:
     Args:
         entry: the kernel.
         arguments: their bytes, which begin with the range of tasks if it can be cut.
-        kept: what must live as long.
+        kept: objects that must live as long.
         plane_tasks: tasks of a plane.
-        planes: how many there are.
-        lag: planes that it is behind the first stage of a wave.
+        planes: number of planes.
+        lag: planes that it is behind the first stage of a fused kernel.
         finer: planes of the finer level that one of its planes stands for.
         finer_planes: their number.
         patches: parts of the arguments that are read from memory in each run: offset, address,
@@ -192,20 +192,20 @@ class OperationKind:
 
 
 class Operation:
-    """Stages that are done together: a launch, or a wave of them.
+    """Stages that are executed together: a launch, or a fused kernel.
 
     Attributes:
-        check: raises what has failed in it, once the table is done; None: nothing can.
+        check: raises the error of the operation, once the table is done; None: it cannot fail.
         condition: address of an int32 number; the operation is skipped where it is 0. 0: it is
             never skipped.
 
     Args:
-        kind: ALONE for a launch as it is; TASKS, SLABS for what is cut; COPY for memory.
-        stages: what is launched.
-        chunks: into how many pieces it is cut.
+        kind: ALONE for a launch as it is; TASKS, SLABS for one that is cut; COPY for memory.
+        stages: the launches.
+        chunks: number of pieces into which it is cut.
         each: tasks, or planes, of a piece.
         everything: tasks, or planes, in all.
-        margin: planes that the last stage of a wave is behind the first.
+        margin: planes that the last stage of a fused kernel is behind the first.
         sized: address of the number of tasks, which may differ from run to run; 0: it is
             `everything`.
     """
@@ -240,7 +240,7 @@ class Operation:
         )
 
     def content(self) -> tuple[Any, ...]:
-        """Return what it does, but for what it reads from memory in each run."""
+        """Return the operation's content, without values read from memory in each run."""
         return (
             self.words[0],
             self.sized,
@@ -267,8 +267,8 @@ def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: in
     """Return a stage cut into ranges of its tasks.
 
     Args:
-        stage: what is launched.
-        cells: what a task costs, in cells of a usual pass.
+        stage: the launch.
+        cells: cost of a task, in cells of a usual kernel.
         ordered: whether tasks write what others read or write: then it is not cut.
         sized: address of the number of tasks in each run; 0: it is the stage's.
     """
@@ -284,7 +284,7 @@ def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: in
         )
     if threads > 1:
         count = max(min(PIECES * threads, stage.tasks * cells // CELLS), 1)
-        # as many for each thread: 5 equal pieces take two threads as long as 6
+        # Every thread gets as many pieces: 5 equal pieces take two threads as long as 6.
         count -= count % threads if count > threads else 0
         each = -(-stage.tasks // count)
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
@@ -297,7 +297,7 @@ def copied(to: int, source: int, size: int, kept: Any) -> Operation:
         to: address.
         source: address; 0: zeros.
         size: bytes.
-        kept: what must live as long.
+        kept: objects that must live as long.
     """
     stage = object.__new__(OperationKind)
     stage.kept, stage.tasks, stage.planes, stage.patches = kept, 1, 1, ()
@@ -307,10 +307,10 @@ def copied(to: int, source: int, size: int, kept: Any) -> Operation:
 
 
 class OperationTable:
-    """Operations one after another, as C works through them.
+    """Operations one after another, as a table for C.
 
     Attributes:
-        checks: raise what has failed, after all of it.
+        checks: raise the errors of the operations, after all of the table.
 
     Args:
         operations: in order.
@@ -322,7 +322,7 @@ class OperationTable:
         self._kept = tuple(operations)
         self.checks = {operation.check for operation in self._kept} - {None}
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
-        # what is left, and the cuts
+        # The remaining pieces, and the cuts.
         sizes = [
             LANE_WORDS * n + operation.chunks
             for n, operation in zip(lanes, self._kept, strict=True)
@@ -336,7 +336,7 @@ class OperationTable:
             places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
             made += [total, *operation.words, count, *places, operation.sized, operation.condition]
             at += size
-        # of the same length, so it stays where it is
+        # A slice of the same length, so the array stays at its address.
         self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = (
             len(self._kept),
@@ -349,7 +349,7 @@ class OperationTable:
 
 
 class ThreadPool:
-    """Threads that help the caller; the bits are those of one.
+    """Worker threads that help the caller; the bits are those of one thread.
 
     Args:
         size: threads, the caller among them.
@@ -376,7 +376,10 @@ class ThreadPool:
             worker.start()
 
     def run(self, table: OperationTable) -> None:
-        """Work through a table: with the others if nobody else uses them."""
+        """Execute a table.
+
+        The workers take part if no other thread uses them.
+        """
         if self.size == 1 and table.again is None:
             self._run_alone(table)
             return
@@ -409,7 +412,7 @@ class ThreadPool:
             check()
 
     def _run_alone(self, table: OperationTable) -> None:
-        """Work through a table with the caller's thread."""
+        """Execute a table on the caller's thread."""
         asked = table.asked
         if asked is None or asked.team != self.address:  # of another team, which is gone
             asked = table.asked = Arguments(
@@ -426,7 +429,10 @@ class ThreadPool:
             check()
 
     def stop(self) -> None:
-        """Send the others home; what is called later is done by the caller."""
+        """Stop the worker threads.
+
+        Later calls run on the caller's thread.
+        """
         self._do(Arguments(self.address, 0, QUIT))
         for worker in self._workers:
             worker.join()
@@ -459,7 +465,7 @@ def patience(table: OperationTable) -> int:
 
 
 def arguments_of(launch: Any) -> Any:
-    """Return the memory of a recorded launch's arguments, as C has them."""
+    """Return the memory of a recorded launch's arguments, in C's layout."""
     params = launch.params[1:]
     return _arguments(*map(type, params))(*params)
 
@@ -497,13 +503,16 @@ class Signature:
         self._structs = {kind: type(kind()) for kind in structs} if self._packing else {}
 
     def check(self, inputs: Sequence[Any], memory: Any) -> None:
-        """Leave all to Warp from now on if it has packed arguments in another way."""
+        """Leave all packing to Warp from now on if Warp packs arguments differently."""
         mine = self.pack(inputs)
         if mine is not None and mine[: ctypes.sizeof(memory)] != bytes(memory):
             self._packing = None
 
     def pack(self, inputs: Sequence[Any]) -> bytes | None:
-        """Return arguments as C has them; None where Warp should convert or refuse one."""
+        """Return arguments packed as in C.
+
+        Returns None where Warp should convert or reject one.
+        """
         if self._packing is None:
             return None
         values = []
@@ -544,7 +553,7 @@ def _format(kind: Any) -> str:
         return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
     if isinstance(getattr(kind, "ctype", None), type):  # a struct
         return f"0{ALIGNED[ctypes.alignment(kind.ctype)]}{ctypes.sizeof(kind.ctype)}s"
-    # a vector's or a matrix's numbers
+    # Elements of a vector or a matrix.
     of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None
     of = getattr(of, "_type_", "")
     return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
@@ -557,7 +566,7 @@ def signature_of(kernel: Any) -> Signature:
 
 
 def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, bytes, Any]:
-    """Return a Warp kernel on the CPU as C calls it, its arguments, and the struct of them."""
+    """Return the table entry of a CPU kernel, its arguments, and their struct."""
     signature = signature_of(kernel)
     if (known := signature.entries.get(dim)) is not None and (
         arguments := signature.pack(inputs)
@@ -573,7 +582,10 @@ def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, 
 
 
 def launched_alone(launch: Any, kept: Any = None) -> Operation:
-    """Return a recorded launch as an operation that is not cut; `kept` must live as long."""
+    """Return a recorded launch as an operation that is not cut.
+
+    `kept` must live as long.
+    """
     return Operation(
         ALONE, [OperationKind(TableEntry(launch), bytes(arguments_of(launch)), (launch, kept))]
     )
@@ -595,7 +607,7 @@ def _system() -> list[int]:
 
 @forward_kernel(module="warp_lcp.team")
 def trial_kernel(a: wp.array(dtype=wp.float32), first: int, value: float):
-    """a[first + i] = value + i."""
+    """Set a[first + i] = value + i."""
     i = wp.tid()
     a[first + i] = value + float(i)
 
@@ -626,7 +638,7 @@ def _entry() -> TableEntry | None:
 
 
 def available_threads() -> int:
-    """Return the cores that this process may use, shared among the ranks on this machine."""
+    """Return the cores that this process may use, shared among ranks of a machine."""
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -654,7 +666,7 @@ def _checked(value: Any, name: str) -> int:
 
 
 class State:
-    """How many threads there are to be, and the team once it is needed."""
+    """Number of threads to use, and the pool once it is needed."""
 
     def __init__(self) -> None:
         self.threads: int | None = None
@@ -668,7 +680,7 @@ STATE = State()
 def get_threads() -> int:
     """Return the number of threads on the CPU.
 
-    The number of `set_threads`, else WARP_LCP_THREADS, else the number of cores.
+    It is the number of `set_threads`, else WARP_LCP_THREADS, else the number of cores.
 
     Raises:
         ValueError: WARP_LCP_THREADS is no such number.
@@ -684,7 +696,7 @@ def set_threads(count: int | None) -> None:
     Results have the same bits for any number.
 
     Args:
-        count: from 1 to 1024; None: as many as at the start.
+        count: from 1 to 1024; None: the number at the start.
 
     Raises:
         ValueError: it is no such number.
@@ -698,7 +710,10 @@ def set_threads(count: int | None) -> None:
 
 
 def team() -> ThreadPool | None:
-    """Return the team, made at its first use; None where launches must go through Warp."""
+    """Return the thread pool, created at its first use.
+
+    Returns None where launches must go through Warp.
+    """
     if STATE.team is None:
         entry = _entry()
         if entry is None:
@@ -710,17 +725,17 @@ def team() -> ThreadPool | None:
 
 
 def shared_seconds() -> float:
-    """Return how long callers have worked together with the rest of the team, since it was made."""
+    """Return the time that callers have worked together with the pool's threads."""
     return 0.0 if STATE.team is None else STATE.team.shared_time
 
 
 def _forget() -> None:
-    """Have no team in a forked child: its threads are the parent's."""
+    """Drop the pool in a forked child: its threads belong to the parent."""
     STATE.team, STATE.lock = None, threading.Lock()
 
 
 def _leave() -> None:
-    """Send the threads home before the interpreter goes."""
+    """Stop the worker threads before the interpreter ends."""
     if STATE.team is not None:
         STATE.team.stop()
 

@@ -41,7 +41,7 @@ CONVERT = KERNELS["vectors.convert"]
 def add_up_span(
     partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int
 ) -> wp.float64:
-    """The sum of every stride-th of the partial sums from `offset` + `start` on."""
+    """Sum every stride-th partial sum, from `offset` + `start` on."""
 
 
 @no_type_check
@@ -88,7 +88,7 @@ def largest_kernel(
     out: wp.array(dtype=wp.float64),
     slot: int,
 ):
-    """The same for the largest of them."""
+    """Return the largest partial result, like the function for sums."""
     t = wp.tid()
     block = t // threads
     column = block // segments
@@ -120,10 +120,10 @@ class Communicator(Protocol):
         """Return the largest over all parts, entry by entry."""
 
     def any(self, condition: bool) -> bool:
-        """Return whether it holds in some part."""
+        """Return whether a condition holds in some part."""
 
     def join(self, key: bytes) -> bytes:
-        """Return a key that stands for the keys of all parts."""
+        """Return a common key made of the keys of all parts."""
 
 
 def segments_of(n: int) -> int:
@@ -184,15 +184,15 @@ def fold(
 
 
 class Reduction:
-    """Sums over flat fields of n elements; the same bits on every run.
+    """Sums over flat fields of n elements; the same bits in every run.
 
     Args:
         n: elements of a field.
-        device: where they live.
+        device: of the fields.
         scalars: device array that receives the sums, shape (slots,), float64.
-        columns: the most sums that one pass makes.
-        threads: threads of that pass; those of a flat kernel unless given.
-        across: who has the other parts of the fields; None: nobody.
+        columns: the most sums that one kernel makes.
+        threads: threads of that kernel; default: those of a flat kernel.
+        across: communicator of the other parts of the fields; None if serial.
     """
 
     def __init__(
@@ -243,19 +243,19 @@ class Reduction:
         rows: Rows | None = None,
         launch: Launch = launch_now,
     ) -> None:
-        """Write the inner product a.b, over some rows if told, to scalars[slot]."""
+        """Write the inner product a.b to scalars[slot], over some rows if passed."""
         DOT.bind(rows or rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
 
 
 class Sums(Reduction):
-    """Sums that passes over the same rows make, read back by the host.
+    """Sums of kernels over the same rows, read back by the host.
 
     Args:
-        rows: of the passes.
+        rows: of the kernels.
         columns: the most sums that one of them makes.
         slots: of `scalars`, if more than that.
-        across: who has the other parts of the fields; None: nobody.
+        across: communicator of the other parts of the fields; None if serial.
     """
 
     def __init__(
@@ -290,7 +290,7 @@ class Sums(Reduction):
         launch: Launch = launch_now,
         **given: Any,
     ) -> None:
-        """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
+        """Launch a kernel, or record it; `reading` then has its sums from a slot on."""
         self._launch(declared, structs, given, slot, launch)
 
     def _launch(
@@ -330,7 +330,7 @@ class Tally:
 
     @property
     def found(self) -> wp.array[Any] | None:
-        """What is found, a number a column, where it is on a GPU; None on the CPU."""
+        """The results on a GPU, a number a column; None on the CPU."""
         return None if self._reading is None else self._reading.array
 
     def take(
@@ -355,7 +355,7 @@ class Tally:
         stencil: Any = None,
         bounds: list[Any] | None = None,
     ) -> None:
-        """Do what `take` does, with arguments as of `StencilKernel.bind_arguments`."""
+        """Launch as `take` does, with arguments as of `StencilKernel.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if is_recording() and device.is_cuda:
             self._record(rows, structs, given, stencil, bounds)
@@ -400,7 +400,7 @@ class Tally:
         stencil: Any,
         bounds: Any,
     ) -> None:
-        """Record the pass on CUDA, for as many places as the rows have in a run."""
+        """Record the kernel on CUDA, for as many places as the rows have in a run."""
         assert self._reading is not None
         memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
         most = self._places if memory is None else math.prod(memory.room)
@@ -424,16 +424,16 @@ class Tally:
                 )
 
     def changed(self) -> None:
-        """Say that a recorded `take` has run."""
+        """Note that a recorded `take` has run."""
         if self._reading is not None:
             self._reading.changed()
 
     def read(self, arrange: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
-        """Return what was found, a number a column.
+        """Return the results, a number a column.
 
         Args:
-            arrange: gives what threads have found, shape (columns, threads), the shape in which the
-                host adds it up, columns first.
+            arrange: reshapes the threads' results, shape (columns, threads), to the order in which
+                the host adds them up, columns first.
         """
         if self._reading is not None:
             return self._reading.numpy()
@@ -455,12 +455,12 @@ def add_across(
     launch: Launch = launch_now,
     condition: wp.array[wp.int32] | None = None,
 ) -> None:
-    """Add what the others have summed, now or among the launches of a program.
+    """Add the sums of the other processes, now or among the launches of a program.
 
     Args:
-        across: the others.
+        across: communicator.
         scalars: sums of this process, which are replaced.
-        slots: of them, those that are added up.
+        slots: those that are added up.
         launch: of a program.
         condition: number, shape (1,), the same in all processes; where it is 0 nothing is done.
             None: always.
@@ -492,12 +492,15 @@ def _add_across(
 
 
 def rows_of(field: wp.array[Any]) -> Rows:
-    """Return the rows of passes over flat fields like this one."""
+    """Return the rows of kernels over flat fields like this one."""
     return Rows.flat(field.size, field.device)
 
 
 def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = launch_now) -> None:
-    """b = a, between float types; types that differ may be recorded by `launch`."""
+    """Convert b = a between float types.
+
+    Between different types it may be recorded by `launch`.
+    """
     if a.dtype is b.dtype:
         copy(b, a)
     else:
