@@ -50,7 +50,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass
 class Claim:
-    """What was tried: whether it holds, and what was found."""
+    """One check: whether it passed, and its details."""
 
     name: str
     holds: bool
@@ -58,12 +58,12 @@ class Claim:
 
 
 class GpuVerdict:
-    """All claims about a device, as they are tried.
+    """All checks of a device.
 
     Args:
         device: Warp device.
-        rehearsal: whether the device is the CPU in CUDA's form, and everything is small.
-        out: folder of what is left.
+        rehearsal: whether the device is the CPU in CUDA's form, and all problems are small.
+        out: folder of the report.
     """
 
     def __init__(self, device: str, *, rehearsal: bool, out: Path) -> None:
@@ -99,7 +99,7 @@ class GpuVerdict:
             self.write()  # whatever ends this process early leaves what has been found
 
     def all(self) -> None:
-        """Try everything."""
+        """Run all checks."""
         self.claim("answers equal the CPU's", self.agreement)
         self.claim("kernels agree with the CPU's, one by one", self.each_kernel)
         self.claim("residuals by NumPy", self.residuals)
@@ -159,7 +159,7 @@ class GpuVerdict:
         return said
 
     def residuals(self) -> str:
-        """Evaluate residuals of a splash by no code of the solvers."""
+        """Evaluate residuals of a splash in NumPy, without code of the solvers."""
         scene, n = splash(32 if self.rehearsal else 128), 32 if self.rehearsal else 128
         problem = scene.lcp("walls", device=self.device)
         result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-7))
@@ -174,7 +174,7 @@ class GpuVerdict:
         return f"{end / start:.1e} of the start's at {n}^3 in {result.iterations} iterations"
 
     def repeats(self) -> str:
-        """Solve and step twice."""
+        """Solve and step twice; compare the bits."""
         first, second = (gpu_cases.large(self.device, 32) for _ in range(2))
         other = [name for name, x in first.items() if not np.array_equal(x, second[name])]
         for name in ("dam-break", "column-collapse-2d"):
@@ -191,7 +191,7 @@ class GpuVerdict:
         return f"{len(first)} solves and {self.steps} steps of two scenes"
 
     def graphs(self) -> str:
-        """Solve with launches one by one."""
+        """Solve with single launches; compare the bits with those of graphs."""
         recorded = gpu_cases.large(self.device, 32)
         with (
             mock.patch.object(CommandBuffer, "_captured", lambda _, commands: list(commands)),
@@ -203,7 +203,7 @@ class GpuVerdict:
         return f"{len(alone)} solves, bit for bit"
 
     def step_graphs(self) -> str:
-        """Step scenes with `LaunchGraph.on_device`, and without."""
+        """Step scenes with `LaunchGraph.on_device` and without; compare the bits."""
         other, names = [], ("dam-break", "column-collapse-2d")
         for name in names:
             taken = []
@@ -218,7 +218,10 @@ class GpuVerdict:
         return f"{self.steps} steps of {' and '.join(names)}, bit for bit"
 
     def ahead(self) -> str | None:
-        """Solve, and step a liquid, with the host's judgment after each step."""
+        """Solve, and step a liquid, with convergence tests on the host; compare the bits.
+
+        By default the tests run on the device.
+        """
         if not loops_on_device(wp.get_device(self.device)):
             return None
 
@@ -234,7 +237,10 @@ class GpuVerdict:
         return f"{len(found) - 2} solves and {self.steps} steps of a liquid, bit for bit"
 
     def waiting(self) -> str | None:
-        """Count what the host reads in steps of a liquid whose particles are not moved apart."""
+        """Count the readbacks in steps of a liquid.
+
+        Steps with a density correction are left out.
+        """
         if not loops_on_device(wp.get_device(self.device)):
             return None
         simulation, counts = gpu_cases.simulation("dam-break", self.device), []
@@ -245,12 +251,12 @@ class GpuVerdict:
                 read.reset_mock()
                 row = simulation.step(min(simulation.stable_dt(), gpu_cases.DT))
                 counts += [] if row.get("density_status") else [read.call_count]
-        # the first steps load kernels
+        # The first steps load kernels.
         assert max(counts[2:]) <= 2, f"up to {max(counts[2:])} times"
         return f"{len(counts) - 2} steps"
 
     def empty(self) -> str:
-        """Give problems without an unknown."""
+        """Check that problems without unknowns are rejected."""
         for shape in ((3, 3), (4, 5, 6)):
             try:
                 wl.LCP(wl.GridPoisson(np.full(shape, wl.AIR), device=self.device), np.zeros(shape))
@@ -260,7 +266,7 @@ class GpuVerdict:
         return "2-D and 3-D"
 
     def memory(self) -> str | None:
-        """Step a liquid, and look at the memory in use after half of the steps and after all."""
+        """Step a liquid; compare the memory in use after half of the steps and after all."""
         if self.rehearsal:
             return None
         used = []
@@ -298,7 +304,7 @@ class GpuVerdict:
         return "memcheck"
 
     def times(self) -> str:
-        """Time cold solves and steps, and put them beside the model's tables."""
+        """Time cold solves and steps; compare them with the model's tables."""
         rows, steps = [], []
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
             problem, method = splash(n).lcp("walls", device=self.device), wl.ProjectedMultigrid()
@@ -373,7 +379,7 @@ class GpuVerdict:
         return (time.perf_counter() - start) / count
 
     def bandwidth(self) -> str:
-        """Measure the kernels on the finest grid against copying."""
+        """Measure the bandwidth of the kernels on the finest grid."""
         n = 16 if self.rehearsal else 256
         found = kernels.measure(
             Options(self.device, (n,), 1 if self.rehearsal else 5, lambda _: None), self.out
@@ -383,11 +389,11 @@ class GpuVerdict:
 
     @functools.cached_property
     def machine(self) -> BenchmarkRecord:
-        """The device and its machine."""
+        """Record of the device and its machine."""
         return machine(self.device, elements=1 << 20)
 
     def write(self) -> None:
-        """Leave the page, and the file to send in."""
+        """Write the report, and the file of results."""
         rows = [["PASS" if c.holds else "FAIL", c.name, c.found] for c in self.claims]
         tables = [RecordTable("Claims", ["", "claim", "found"], rows), *self.tables]
         record = self.machine
@@ -411,7 +417,10 @@ class GpuVerdict:
 
 
 def launched(graph: Any) -> None:
-    """Launch what a graph would hold; one that loops on the device stays a graph."""
+    """Launch the commands of a graph.
+
+    A graph that loops on the device stays a graph.
+    """
     if isinstance(graph, list):
         for command in graph:
             command.launch()
@@ -420,7 +429,7 @@ def launched(graph: Any) -> None:
 
 
 def main() -> int:
-    """Try everything; return 1 if a claim fails, 2 if there is no device."""
+    """Run all checks; return 1 if one fails, 2 if there is no device."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -117,7 +117,10 @@ def states(name: str, device: str, steps: int = STEPS) -> Iterator[Arrays]:
 
 
 def moments(device: str, steps: int = STEPS) -> Arrays:
-    """Return number, center, spread and mean speed of the particles of scenes after some steps."""
+    """Return number, center, spread and mean speed of scenes' particles.
+
+    They are those after some steps.
+    """
     found = {}
     for name in SCENES:
         *_, last = states(name, device, steps)
@@ -129,7 +132,7 @@ def moments(device: str, steps: int = STEPS) -> Arrays:
 
 
 def everything(device: str, steps: int = STEPS) -> Arrays:
-    """Return all that is compared."""
+    """Return the results of all cases."""
     return methods(device) | shapes(device) | large(device) | moments(device, steps)
 
 

@@ -49,7 +49,7 @@ GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
     "RTX 4090": (1008.0, 645.0),
     "RTX 4070 laptop": (256.0, 158.0),
 }
-# such instructions a byte of the passes that have many, see `benchmarks.two_floats`
+# Float64 instructions a byte of the kernels that have many, see `benchmarks.two_floats`.
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
 STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
 SIZES = (128, 256, 512, 1024)
@@ -57,17 +57,17 @@ SIZES = (128, 256, 512, 1024)
 
 @dataclass
 class Work:
-    """What was launched.
+    """Recorded launches.
 
     Attributes:
         bytes: of the fields that each launch declares.
-        graph: which launches were in a graph.
+        graph: whether each launch was in a graph.
         names: of the kernels.
-        keys: of passes, as `gpu_counts` names them.
+        keys: of stencil kernels, as `gpu_counts` names them.
         cells: that they visit.
-        bounds: a launch of each pass, by key.
-        stages: of small levels, each with a barrier.
-        readbacks: how often the host waited.
+        bounds: a launch of each stencil kernel, by key.
+        stages: of fused coarse levels, each with a barrier.
+        readbacks: number of waits of the host.
     """
 
     bytes: list[float] = field(default_factory=list)
@@ -119,7 +119,7 @@ class Work:
         return found
 
     def uncounted(self, counts: dict[str, gpu_counts.InstructionCount]) -> float:
-        """Return the share of the bytes that passes move which have not been counted."""
+        """Return the share of the bytes that belongs to uncounted kernels."""
         moved = [size for size, key in zip(self.bytes, self.keys, strict=True) if key not in counts]
         return sum(moved) / max(sum(self.bytes), 1.0)
 
@@ -144,7 +144,7 @@ class Work:
         )
 
     def passes(self, most: int = 12) -> str:
-        """Return a table of the kernels that move most."""
+        """Return a table of the kernels that move most bytes."""
         moved, launches = dict.fromkeys(self.names, 0.0), Counter[str](self.names)
         for name, size in zip(self.names, self.bytes, strict=True):
             moved[name] += size
@@ -375,7 +375,7 @@ def limits_table(
 def counted(
     counts: dict[str, gpu_counts.InstructionCount],
 ) -> Iterator[gpu_counts.InstructionCount]:
-    """Count passes, and note each by its key."""
+    """Count kernels, and yield each count by its key."""
     for one in gpu_counts.counts():
         counts[one.key] = one
         yield one

@@ -19,7 +19,7 @@ GUARD = re.compile(r"@(!?)(U?P\w+)\s+(.*)")
 
 
 def tool(name: str) -> Path | None:
-    """Return where a tool of the extra `ptxas` is; None if it is not installed."""
+    """Return the path of a tool of the extra `ptxas`; None if it is not installed."""
     spec = importlib.util.find_spec("nvidia")
     places = [Path(p) for p in (spec.submodule_search_locations or [])] if spec else []
     return next((found for place in places for found in place.glob(f"*/bin/{name}")), None)
@@ -97,7 +97,7 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
 
 
 def parsed(text: str) -> Instruction:
-    """Return an instruction from its text."""
+    """Parse the text of an instruction."""
     guard, rest = None, text
     if found := GUARD.match(text):
         guard, rest = (found[2], bool(found[1])), found[3]

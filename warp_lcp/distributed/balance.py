@@ -19,7 +19,7 @@ from warp_lcp.multigrid.halo_levels import GATHERED
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-# cells full of material whose work is that which a step takes however little there is of it
+# Fixed cost of a step, as the work of cells full of material.
 STEP = 1 << 13
 BLOCKS = 128  # of a rank, five along an axis
 ROUNDS = 4  # over the axes: each leaves the busiest rank no more to do than before
@@ -29,7 +29,7 @@ Parts = list[list[int]]  # cells of each box along x, y, z
 
 @dataclass(frozen=True)
 class Load:
-    """What there is to do in a step, by blocks of cells.
+    """Work of a step, by blocks of cells.
 
     Cuts lie between blocks, so that the levels of multigrid that ranks share end at them.
 
@@ -62,7 +62,7 @@ class Load:
         total, found = float(self.material.sum()), list[tuple[float, Parts]]()
 
         def least(p: Triple) -> float:
-            """Return what the busiest rank has to do if all have as much."""
+            """Return a lower bound of the busiest rank's work: an even share of all work."""
             return (
                 total
                 + OPEN
@@ -126,7 +126,7 @@ class Load:
             / n
             * (np.minimum(ends + self.layers, n)[None] - np.maximum(ends - self.layers, 0)[:, None])
         )
-        # of the busiest box from a block up to another
+        # Work of the busiest box from a block up to another.
         work = np.where(thick >= min(max(self.layers, self.edge), n), 0.0, np.inf)
         for box, cells in enumerate(beside.ravel()):
             np.maximum(work, through[None, :, box] - through[:, None, box] + cells * seen, out=work)
@@ -151,17 +151,17 @@ def _through(material: np.ndarray, axis: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Balance:
-    """When the boxes of ranks are cut anew.
+    """Rules for repartitioning.
 
-    Whether that is in a step depends on the step's number, on where particles are and on the boxes
-    alone, so that a run that goes on from a checkpoint does the same.
+    Whether a step repartitions depends on the step's number, the particles' positions and the boxes
+    alone, so that a run resumed from a checkpoint does the same.
 
     Args:
-        every: steps between two looks.
-        bound: how many times what it will be the time of a step must be: then a fifth of `every`
-            steps is gained until the next look. To cut anew takes the time of 2 to 3 steps, of 5 to
-            8 where it has to measure a mesh.
-        fixed: what a step takes besides, in cells full of material.
+        every: steps between two checks.
+        bound: least ratio of a step's time to its time after repartitioning. With it a fifth of
+            `every` steps is gained until the next check. Repartitioning takes the time of 2 to 3
+            steps, of 5 to 8 where it has to measure a mesh.
+        fixed: other cost of a step, in cells full of material.
     """
 
     every: int = 20
@@ -169,7 +169,7 @@ class Balance:
     fixed: float = STEP
 
     def should_rebalance(self, part: Subdomain, step: int) -> bool:
-        """Return whether a step looks for other cuts."""
+        """Return whether a step checks the balance."""
         return part.ranks.size > 1 and step % self.every == 0
 
     def rebalance(self, part: Subdomain, particles: Particles, a_cell: int) -> Decomposition | None:
@@ -191,13 +191,13 @@ class Balance:
                 strict=True,
             )
         ]
-        # the same on all ranks
+        # The condition is the same on all ranks.
         if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):
             return None
         edge = edge_of_blocks(now.counts, part.ranks.size)
         load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
-        # none end between blocks
+        # The present boxes stay if no boxes end between blocks.
         least, cut = min(
             (found for found in everyone if found is not None), default=(math.inf, now.parts)
         )
@@ -217,7 +217,7 @@ def edge_of_blocks(counts: Triple, ranks: int) -> int:
 
 
 def blocks(part: Subdomain, particles: Particles, edge: int) -> np.ndarray:
-    """Return how many of all ranks' particles each block of cells has; collective."""
+    """Return the number of all ranks' particles in each block; collective."""
     counts = part.decomposition.counts
     shape = [-(-n // edge) for n in counts]
     place = np.clip(

@@ -27,9 +27,9 @@ def joined(ranks: Ranks, nodes: int, edges: np.ndarray) -> np.ndarray:
     """Return the number of each node's component, shape (nodes,); collective.
 
     Args:
-        ranks: who have the parts.
-        nodes: how many.
-        edges: pairs of nodes that this rank knows to belong together, int32, shape (n, 2).
+        ranks: that have the parts.
+        nodes: number of nodes.
+        edges: pairs of nodes that are connected, as far as this rank knows, int32, shape (n, 2).
     """
     everyone = np.concatenate(ranks.collect(edges))
     graph = scipy.sparse.coo_matrix(

@@ -23,8 +23,8 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.settings import renamed_method
 
-# the largest part may exceed an even share by this factor, so that cuts lie at multiples of large
-# powers of two
+# The largest part may exceed an even share by this factor, so that cuts lie at multiples of large
+# powers of two.
 UNEVEN = 1.125
 
 
@@ -135,7 +135,7 @@ class Decomposition:
     def neighbor(self, axis: int, side: int) -> int | None:
         """Return the neighbor rank at the lower (0) or upper (1) side along an axis.
 
-        None at a side of the domain.
+        Returns None at a side of the domain.
         """
         place = list(self.place(self.ranks.rank))
         place[axis] += 2 * side - 1
@@ -149,7 +149,7 @@ class Decomposition:
     def coarser(self, factors: Triple) -> Decomposition | None:
         """Return the decomposition of aggregates of cells along x, y, z.
 
-        None if a box boundary would cut an aggregate, or a rank would have no cells.
+        Returns None if a box boundary would cut an aggregate, or a rank would have no cells.
         """
         new = []
         for part, factor in zip(self.parts, factors, strict=True):
@@ -167,12 +167,12 @@ class Decomposition:
 
     @property
     def ghosts(self) -> Halo | None:
-        """Halo exchange of operators; None: there is one rank."""
+        """Halo exchange of operators; None if there is one rank."""
         return self.halo if self.ranks.size > 1 else None
 
     @property
     def across(self) -> Ranks | None:
-        """The ranks, as sums take them; None: there is one."""
+        """The ranks as the communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
     def together(self) -> AbstractContextManager[Any]:
@@ -182,7 +182,7 @@ class Decomposition:
     def check_operator(
         self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
     ) -> None:
-        """Refuse a grid operator that does not fit the boxes; collective.
+        """Check that a grid operator fits the boxes; collective.
 
         Args:
             shape: of its cells.
@@ -292,7 +292,7 @@ def cuttings(counts: Triple, size: int) -> list[Triple]:
     return [p for p in triples if all(a <= n for a, n in zip(p, counts, strict=True))]
 
 
-# of the work that a cell full of material makes: what a cell without makes, ghost cells too
+# Work of a cell without material, ghost cells too, relative to a cell full of material.
 OPEN = 0.1
 
 Corners = tuple[np.ndarray, np.ndarray]  # low and high x, y, z of a box of material, in cells
@@ -324,13 +324,14 @@ def balanced_processes(
 
 
 def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> Corners:
-    """Return the box that some cells of material fill when they have come to rest.
+    """Return the box that material fills at rest.
 
     Args:
         counts: cells (nx, ny, nz).
         dimension: 2 or 3.
         volume: of the material, in cells.
-        gravity: [m/s^2]; the box lies at the side that it points to most; 0: it is the whole grid.
+        gravity: [m/s^2]; the box lies at the side along its largest component; 0: it is the whole
+            grid.
     """
     low, high = np.zeros(3), np.array(counts, dtype=float)
     axis = int(np.argmax(np.abs(gravity[:dimension])))
@@ -347,7 +348,7 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
 def _most_work(
     counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]
 ) -> float:
-    """Return what the busiest rank has to do, in cells full of material."""
+    """Return the work of the busiest rank, in cells full of material."""
     low, high = _ends(cuts)
     work = OPEN * seen_by(counts, cuts, layers)
     for corners in state:
@@ -361,7 +362,10 @@ def _most_work(
 
 
 def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.ndarray:
-    """Return how many cells each box has with its ghost layers, shape (boxes along x, y, z)."""
+    """Return the number of cells of each box with its ghost layers.
+
+    Shape (boxes along x, y, z).
+    """
     return _of_boxes(
         [
             np.minimum(h + layers, n) - np.maximum(l - layers, 0)
@@ -371,12 +375,12 @@ def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.nd
 
 
 def _ends(cuts: Sequence[Sequence[int]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return where boxes begin and end along x, y, z."""
+    """Return the first and end indices of boxes along x, y, z."""
     ends = [np.cumsum([0, *cut]) for cut in cuts]
     return [end[:-1] for end in ends], [end[1:] for end in ends]
 
 
 def _of_boxes(sides: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the volumes of all boxes from the lengths of their sides along x, y, z."""
+    """Return the volumes of all boxes from the lengths of their sides."""
     x, y, z = sides
     return np.multiply.outer(np.multiply.outer(x, y), z)

@@ -1,4 +1,4 @@
-"""How far material and velocities that are continued go beyond a rank's box."""
+"""Reach of particles and extrapolated velocities beyond a rank's box."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import warp as wp
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-# layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so
-# far
+# Layers of ghost cells that stay correct during velocity extrapolation: cut cells read faces at
+# this distance.
 LEAST_RIGHT = 2
 
 
@@ -59,7 +59,10 @@ class Refill:
         self._right: dict[int, int] = {}  # layers that are right, by the field's address
 
     def __call__(self, marks: wp.array, field: wp.array) -> None:
-        """Note a layer of a component; collective."""
+        """Count a layer of a component; collective.
+
+        If few layers are left correct, it exchanges halos.
+        """
         right = self._right.get(field.ptr, self._part.layers) - 1
         if right <= LEAST_RIGHT:
             self._part.fill(marks, field)

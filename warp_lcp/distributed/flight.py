@@ -22,15 +22,15 @@ Plane = tuple[tuple[slice, ...], np.ndarray]  # cells, and their nodes
 
 
 class TreesAtCuts:
-    """Join the trees of several ranks to bodies.
+    """Joins the trees of several ranks to bodies.
 
-    A rank grows the trees of its cells and of those beside them at cuts, where weights are right.
+    A rank grows the trees of its cells and of those beside them at cuts, where weights are correct.
     Its trees are nodes of a graph, whose edges are cells that two ranks know. Sums over the
-    particles of a body are whole numbers, so that those of all ranks, of bodies that several have
-    trees of, are one process's to the bit; a rank keeps all others to itself.
+    particles of a body are whole numbers, so that sums over several ranks have the bits of one
+    process. Only bodies with trees on several ranks are summed over ranks.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
     """
 
     def __init__(self, part: Subdomain) -> None:

@@ -88,20 +88,19 @@ class Halo:
     def join_components(
         self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]
     ) -> np.ndarray | None:
-        """Join components of this rank's cells with those of others; collective.
+        """Join components of this rank's cells with those of other ranks; collective.
 
-        Components of boxes that nothing holds are nodes of a graph, whose edges are open faces at
-        cuts; one more node is all that is held.
+        Free components of boxes are nodes of a graph, whose edges are open faces at cuts. One more
+        node stands for all held components.
 
         Args:
-            number: of the component of each stored cell, flat, from 0; -1: none, or something holds
-                it.
-            held: which stored cells belong to components that something holds, bool.
+            number: of the component of each stored cell, flat, from 0; -1: none, or it is held.
+            held: mask of the stored cells that belong to held components, bool.
             faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
 
         Returns:
-            The numbers of the joined components that nothing holds on any rank, int32, flat, from
-            0, -1 elsewhere; None: there are none.
+            The numbers of the joined components that are held on no rank, int32, flat, from 0, -1
+                elsewhere; None: there are none.
         """
         ranks = self.decomposition.ranks
         first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
@@ -120,7 +119,7 @@ class Halo:
         The face lies at a cut. Shape (n, 2).
         """
         found, grid = [], node.reshape(self.shape).copy()
-        # ghost cells at the domain's sides are not written
+        # Ghost cells at the domain's sides are not written.
         for axis in self.decomposition.cut_axes:
             for end in (0, -1):
                 grid[(*[slice(None)] * (2 - axis), end, ...)] = -1
@@ -140,7 +139,7 @@ class Halo:
 
     @cached_property
     def gathering(self) -> Gathering:
-        """Gathers the fields of all ranks on every rank."""
+        """Gathering of the fields of all ranks on every rank."""
         return Gathering(self.decomposition)
 
     def fill(self, field: wp.array[Any] | np.ndarray) -> None:
@@ -242,7 +241,7 @@ class Gathering:
         )
 
     def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = launch_now) -> None:
-        """Write this rank's part of the whole grid's field to its own, ghost cells too."""
+        """Write this rank's part of the whole grid's field to its own, with ghost cells."""
         given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
         launch(take_kernel, self._shape[:2], given, device=mine.device)
 
@@ -265,16 +264,16 @@ for _T in (wp.float32, wp.float64):
 class StarForest:
     """A star forest of PETSc that is freed with the last reference to it.
 
-    What Python frees as a part of a cycle petsc4py keeps for PETSc's own end, for which ranks wait
-    for ever unless all have kept equally much; but each looks for cycles at another time.
+    petsc4py keeps objects that Python's garbage collector frees until PETSc ends. Ranks then wait
+    for ever unless all have kept equally many, but each collects garbage at another time.
 
     Args:
-        made: the forest, of no use when this is gone.
+        made: the forest, invalid after this object is freed.
 
     Attributes:
         handle: PETSc's handle of it, which recorded exchanges read in each run.
-        pairs: units and addresses of roots and leaves that recorded exchanges read, by what they
-            hold.
+        pairs: units and addresses of roots and leaves that recorded exchanges read, by their
+            content.
     """
 
     def __init__(self, made: Any) -> None:
@@ -284,7 +283,7 @@ class StarForest:
         self.pairs: dict[tuple[int, ...], Any] = {}
 
     def replace(self, made: Any) -> None:
-        """Free the forest and use another one, in recorded exchanges too; collective."""
+        """Free the forest and use another one, also in recorded exchanges; collective."""
         self.free()
         self.made, self.free = made, weakref.finalize(self, made.destroy)
         self.handle[0] = made.handle
@@ -344,7 +343,7 @@ def star_forest(
 
 
 def _elements(box: CellBox, within: CellBox) -> np.ndarray:
-    """Return where a box's cells lie in a flat array of the cells of another box."""
+    """Return the indices of a box's cells in a flat array of another box's cells."""
     nx, ny, _ = within.counts
     x, y, z = (np.arange(l, h) - o for l, h, o in zip(box.low, box.high, within.low, strict=True))
     return ((z[:, None, None] * ny + y[:, None]) * nx + x).ravel()

@@ -1,4 +1,4 @@
-"""What this process waits in for other ranks, and how it waits."""
+"""Waits for other ranks that can be observed and interrupted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import time
 from typing import Any, Self
 
-# seconds that a wait spends asking: between two operations ranks rarely differ by more
+# Seconds that a wait polls: between two operations ranks rarely differ by more.
 AWAKE = 1e-3
 SHARE = 1 / 16  # of a wait's length so far, which a rank that has nothing to do sleeps at a time
 LONGEST = 5e-3  # seconds of such a sleep
@@ -36,12 +36,12 @@ class InterruptibleWait:
 
     @property
     def name(self) -> str:
-        """Of the operation, "" outside."""
+        """Name of the operation, "" outside."""
         return "an exchange among launches" if self.native[0] % 2 else self._name
 
     @property
     def count(self) -> int:
-        """Of entries and exits so far."""
+        """Number of entries and exits so far."""
         return self._count + int(self.native[0])
 
     def __call__(self, name: str) -> Self:

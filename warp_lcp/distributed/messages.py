@@ -25,10 +25,10 @@ COUNT, DATA = 7101, 7102  # tags of messages
 
 
 class Mailbox(Protocol):
-    """Carries messages from each rank to its neighbors."""
+    """Mailbox: carries messages from each rank to its neighbors."""
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """Return what the neighbors have sent, in the order of their ranks.
+        """Return the messages of the neighbors, in the order of their ranks.
 
         Args:
             outgoing: an array of one type for every neighbor, of any length.
@@ -36,7 +36,7 @@ class Mailbox(Protocol):
 
 
 class MpiMailbox:
-    """Messages of MPI.
+    """Mailbox by MPI messages.
 
     Args:
         comm: of mpi4py.
@@ -46,7 +46,7 @@ class MpiMailbox:
         self._comm = comm
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """Send lengths, then what is not empty."""
+        """Exchange messages: first their lengths, then those that are not empty."""
         from mpi4py import MPI
 
         neighbors, comm = sorted(outgoing), self._comm
@@ -163,15 +163,15 @@ def add_kernel(
     ranks: int,
     told: wp.uint64,
 ):
-    """Add to sums those of the other ranks; one thread, on the CPU."""
+    """Add the sums of the other ranks; one thread, on the CPU."""
     add_of_all(gather, unit, comm, sums, of_all, count, ranks, told)
 
 
 class _Library:
-    """Functions of PETSc and MPI, and MPI's constants, as C takes them.
+    """Functions of PETSc and MPI, and MPI's constants, for calls from C.
 
-    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog
-    either: PETSc is called directly.
+    PETSc is called directly, because petsc4py holds Python's interpreter lock while PETSc waits for
+    other ranks, and then no watchdog could run.
     """
 
     def __init__(self) -> None:
@@ -194,7 +194,10 @@ _library = cache(_Library)
 
 
 def handle(of: Any) -> Any:
-    """Return what C calls an object of mpi4py: Open MPI's are pointers, MPICH's numbers."""
+    """Return the C handle of an mpi4py object.
+
+    Open MPI's handles are pointers, MPICH's are numbers.
+    """
     from mpi4py import MPI
 
     kind = ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
@@ -230,12 +233,12 @@ def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarra
 
 
 def exchanging(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
-    """Return `exchange` as an operation of the team."""
+    """Return `exchange` as an operation of the thread pool."""
     return exchanging_all(forest, [(roots, leaves)])
 
 
 def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Operation:
-    """Return `exchange_all` as an operation of the team."""
+    """Return `exchange_all` as an operation of the thread pool."""
     library = _library()
     functions = (ctypes.cast(call, ctypes.c_void_p).value for call in (library.begin, library.end))
     listed = [
@@ -272,7 +275,7 @@ def adding(comm: Any, sums: np.ndarray) -> Operation:
 
 
 def _operation(kernel: Any, given: list[Any], kept: Any) -> Operation:
-    # handles of MPICH may be negative
+    # Handles of MPICH may be negative.
     words = [word & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]
     launch = wp.launch(kernel, 1, words, device="cpu", record_cmd=True)
     operation = launched_alone(launch, kept)

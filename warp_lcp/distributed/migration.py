@@ -1,4 +1,4 @@
-"""Pieces of a state that go from the ranks that have them to those whose boxes they are in."""
+"""Migration of a state's pieces to the ranks of new boxes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
 
 
 def _cut_out(values: np.ndarray, box: CellBox, other: CellBox) -> np.ndarray:
-    """Return the values of a box's cells that are in another one too, one after another."""
+    """Return the values of a box's cells that lie in another box, too, flat."""
     shared = box.common(other)
     return (
         values[..., *shared.moved(box.low, -1).slices].ravel()

@@ -1,4 +1,4 @@
-"""The start of particles on ranks: which rank has which box."""
+"""Initial boxes of ranks for a scene with particles."""
 
 from __future__ import annotations
 

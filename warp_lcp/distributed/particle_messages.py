@@ -1,4 +1,4 @@
-"""Messages of particles between ranks: packed, unpacked and put in their place in native code."""
+"""Messages of particles between ranks, packed and unpacked in native code."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (
 
 
 class Buffer:
-    """Memory of the host that grows, for recorded launches.
+    """Host memory that grows, for recorded launches.
 
     Args:
         dtype: of its elements, a Warp type.
 
     Attributes:
         array: the memory now.
-        host: the same as NumPy sees it.
+        host: the same as a NumPy array.
     """
 
     def __init__(self, dtype: Any) -> None:
@@ -46,14 +46,17 @@ class Buffer:
         self._allocate(1)
 
     def reserve(self, count: int, kept: int = 0) -> None:
-        """Make room for so many elements, and keep the first ones; the others hold anything."""
+        """Allocate room for so many elements, and keep the first ones.
+
+        The other elements are not initialized.
+        """
         if count > len(self.host):
             before = self.host
             self._allocate(2 * count)
             self.host[:kept] = before[:kept]
 
     def take(self, values: np.ndarray) -> None:
-        """Hold these values."""
+        """Store these values."""
         self.reserve(values.size)
         self.host[: values.size] = values.ravel()
 
@@ -64,10 +67,10 @@ class Buffer:
 
 
 class ParticleMessages:
-    """Particles that a rank's neighbors must know, and those that come from them.
+    """Exchange of particles between a rank and its neighbors.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         particles: this rank's.
         place: int64, of each particle in the order of all ranks' particles; grows with them.
         neighbors: ranks, ascending.
@@ -160,14 +163,14 @@ class ParticleMessages:
         return come
 
     def settle(self, come: int) -> tuple[int, int, np.ndarray]:
-        """Put ghosts behind this rank's particles, after `exchange` of all columns.
+        """Store ghosts behind this rank's particles, after `exchange` of all columns.
 
         Args:
-            come: what `exchange` has returned.
+            come: result of `exchange`.
 
         Returns:
-            How many are this rank's, how many there are with ghosts, and the numbers of those
-            before this rank's end that are others now.
+            The number of this rank's particles, the number with ghosts, and the indices before this
+                rank's end whose particles were replaced.
         """
         found = self._found.host
         most = int(found[0]) + come

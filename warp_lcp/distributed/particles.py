@@ -33,17 +33,17 @@ from warp_lcp.grid.particles import NEW, Particles, ParticleTotals
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-# of a box: in it and away from its cuts, within reach of them, beyond them
+# Position relative to a box: in it and away from its cuts, within reach of them, beyond them.
 INNER, BORDER, OUTSIDE = 0, 1, 2
 WHERE = KERNELS["warp_lcp.distributed.particles.where"]
 ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
 
 
 class ParticleMigration(ParticleExchange):
-    """The particles of a rank among those of all.
+    """The particles of a rank, as a part of the particles of all ranks.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         particles: this rank's, in its box or within its ghost layers.
     """
 
@@ -56,9 +56,12 @@ class ParticleMigration(ParticleExchange):
         self.move_to(part)
 
     def move_to(self, part: Subdomain) -> None:  # type: ignore[override]
-        """Belong to another box from now on; `assign` then brings what lies in it."""
+        """Move to another box.
+
+        `assign` then sets its particles.
+        """
         self.part, decomposition, around = part, part.decomposition, part.box.grown(REACH)
-        # which particles are this rank's, or how many of the first; None: all
+        # Indices of this rank's own particles, or how many of the first; None: all.
         self._own: np.ndarray | int | None = None
         self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
         self._neighbors = [
@@ -72,7 +75,7 @@ class ParticleMigration(ParticleExchange):
 
     @property
     def place(self) -> np.ndarray:
-        """Where each particle is in the order of all ranks' particles, int64, shape (count,)."""
+        """Place of each particle in the order of all ranks, int64, shape (count,)."""
         return self._places.host[: self._placed]
 
     @place.setter
@@ -82,7 +85,7 @@ class ParticleMigration(ParticleExchange):
 
     @property
     def counts(self) -> list[int]:
-        """Particles of each rank when the last totals found them."""
+        """Number of particles of each rank at the last totals."""
         return self._counts
 
     @property
@@ -94,7 +97,7 @@ class ParticleMigration(ParticleExchange):
         return self._expected
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return `place`."""
+        """Return `place`, the key of the order."""
         return {"place": self.place.copy()}
 
     def arrange(self, *, sort: bool) -> None:
@@ -138,7 +141,7 @@ class ParticleMigration(ParticleExchange):
         self.drop_ghosts()
 
     def _exchange(self) -> None:
-        """Hand over and take in, and put ghosts behind the others."""
+        """Migrate particles, and store ghosts behind the others."""
         first, come = self.particles.count, self._messages.exchange(positions_only=False)
         own, end, free = self._messages.settle(come)
         self.particles.resize(end)
@@ -147,7 +150,10 @@ class ParticleMigration(ParticleExchange):
             self._lying = self._lying.changed(free, first, own)
 
     def _find_runs(self) -> None:
-        """Find the order in which sums take the particles, of which the first are this rank's."""
+        """Compute the summation order of the particles.
+
+        The first particles are this rank's.
+        """
         assert isinstance(self._own, int), "ghosts lie behind the others"
         if self._lying is None:
             self._order_first(self._own)
@@ -170,18 +176,18 @@ class ParticleMigration(ParticleExchange):
         self.place = self.place[order]
 
     def _lie_in_order(self) -> None:
-        """Bring the particles into the order in which sums take them, ghosts among them."""
+        """Sort the particles, ghosts among them, into the summation order."""
         self._order_first(self.particles.count)
         if self._own is not None:
             self._own = self._where() != OUTSIDE
         self._lying = self.particles.runs = None
 
     def begin_sort(self) -> None:
-        """Bring the particles into the order of their places."""
+        """Sort the particles by place."""
         self._lie_in_order()
 
     def end_sort(self) -> None:
-        """Give the particles, which lie in the order of their cells, new places."""
+        """Renumber the places of the particles, which are sorted by cell."""
         if self._own is not None:
             self._own = self._where() != OUTSIDE
         self._messages.give_places()
@@ -202,22 +208,22 @@ class ParticleMigration(ParticleExchange):
         self._expected = sum(self._counts)
 
     def appended(self, count: int) -> None:
-        """Give particles behind the others places behind theirs."""
+        """Give new particles, stored behind the others, the next places."""
         self.add_places(max(NEW, 1 + int(self.place.max(initial=0))) + np.arange(count))
 
     def add_places(self, places: np.ndarray) -> None:
-        """Give particles behind the others their places."""
+        """Set the places of particles stored behind the others."""
         self.place, self._lying = np.append(self.place, places), None
         self._added += len(places)
 
     def removing(self, marks: wp.array) -> None:
-        """Forget the places of particles that are about to be removed."""
+        """Drop the places of particles that are about to be removed."""
         before = len(self.place)
         self.place, self._lying = self.place[marks.numpy()[: self.particles.count] == 0], None
         self._added += len(self.place) - before
 
     def drop_ghosts(self) -> None:
-        """Keep this rank's own particles alone; `key` then holds their cells."""
+        """Drop ghosts; `key` then holds the cells of this rank's own particles."""
         mine, self._own, self.particles.runs = self._own, None, None
         if isinstance(mine, int):
             self.particles.resize(mine)
@@ -228,7 +234,7 @@ class ParticleMigration(ParticleExchange):
             self._lying = PlaceOrder(self.place.copy())
 
     def joined_totals(self, own: ParticleTotals) -> ParticleTotals:
-        """Return sums over all ranks' particles; there are no ghosts now."""
+        """Return sums over all ranks' particles; there must be no ghosts."""
         assert self._own is None, "ghosts would be counted twice"
         n, ranks = own.count, self.part.ranks
         before, added, self._added = sum(self._counts), self._added, 0
@@ -265,7 +271,7 @@ class ParticleMigration(ParticleExchange):
         )
 
     def assign(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:
-        """Take other particles, in the order of their places; collective."""
+        """Replace the particles, in the order of their places; collective."""
         self._own = self._lying = None
         super().assign(arrays, place)
         self.place = np.sort(np.asarray(place, dtype=np.int64))

@@ -35,14 +35,14 @@ LEAVE = KERNELS["vector_copies.leave"]
 TRUE_RESIDUAL = frozenset(
     {"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"}
 )
-"""Methods of KSP that measure b - A x if asked to; others know other norms only."""
+"""Methods of KSP that can monitor b - A x; others compute other norms only."""
 
 
 class VectorCopies:
     """Copies between PETSc's vectors and the stored fields of a stencil's grid.
 
     Args:
-        stencil: of the rank's cells; its diagonal says which of them are unknowns. Read at every
+        stencil: of the rank's cells; cells with a nonzero diagonal are unknowns. Read at every
             copy.
         comm: PETSc's communicator of the vectors, each rank having its own cells.
 
@@ -99,7 +99,7 @@ class VectorCopies:
             values[:] = target.numpy()
 
     def _seen(self, values: np.ndarray, buffer: int) -> wp.array[Any]:
-        """Return a vector's memory as the device sees it: itself on the CPU, a copy on a GPU."""
+        """Return a vector's memory on the device: itself on the CPU, a copy on a GPU."""
         if not self._staging:
             return wp.array(
                 ptr=values.ctypes.data, dtype=wp.float64, shape=self._n, device=self.device
@@ -109,14 +109,14 @@ class VectorCopies:
 
 
 class StencilMatrix:
-    """The product with a stencil, as the context of a Mat of PETSc's type `python`.
+    """Product with a stencil, as the context of a Mat of PETSc's type `python`.
 
     B = A on the cells with a diagonal that is not 0, for x = 0 on the others; the identity on the
     others. A stencil whose diagonal a free set I has masked thus gives B = D_I A D_I + D_(not I),
     symmetric if A is, and on ranks the same matrix as on one.
 
     Args:
-        stencil: as it is at each product.
+        stencil: read at each product.
         copies: of its grid.
     """
 
@@ -127,7 +127,7 @@ class StencilMatrix:
         )
 
     def as_mat(self) -> PETSc.Mat:
-        """Return it as a Mat of PETSc."""
+        """Return the product as a Mat of PETSc."""
         matrix = petsc().Mat().createPython((self._copies.sizes,) * 2, self, comm=self._copies.comm)
         matrix.setOption(petsc().Mat.Option.SYMMETRIC, True)
         matrix.setUp()
@@ -174,10 +174,13 @@ class CyclePreconditioner:
         self._hierarchy, self._copies = hierarchy, copies
 
     def apply(self, preconditioner: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
-        """Z = one cycle on r; the identity on cells that are held."""
+        """Apply the preconditioner: Z = one cycle on r.
+
+        It is the identity on cells that are held.
+        """
         finest = self._hierarchy.finest
-        # corrections may be float32: r is brought to length 1. PETSc remembers the norms that its
-        # KSP has asked for
+        # Corrections may be float32: r is scaled to length 1. PETSc caches the norms that its KSP
+        # has requested.
         size = r.norm()
         if size == 0 or not math.isfinite(size):
             r.copy(z)
@@ -231,7 +234,8 @@ class PetscGrid:
         cycle: CycleSettings | None = None,
     ) -> None:
         self._A, comm = A, communicator(A)
-        # what ranks share ends when all have let go of it, and PETSc has time to look
+        # Objects that ranks share are destroyed when all ranks have released them and PETSc
+        # collects garbage.
         petsc().garbage_cleanup(comm)
         self._kept: list[Any] = []
         weakref.finalize(self, _let_go, self._kept).atexit = False
@@ -300,7 +304,7 @@ class PetscGrid:
 
 
 def _let_go(kept: list[Any]) -> None:
-    """Let PETSc end objects when nobody refers to them."""
+    """Make PETSc destroy objects that are no longer referenced."""
     for thing in kept:
         thing.decRef()
 

@@ -1,4 +1,4 @@
-"""In what order sums take particles of which most lie in it."""
+"""Deterministic summation order for nearly sorted particles."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ def _none() -> np.ndarray:
 
 @dataclass(frozen=True)
 class PlaceOrder:
-    """Which of a list's particles lie in the order of their places.
+    """Sorted and unsorted particles of a list, by place.
 
     Args:
-        places: of all particles when all lay in order.
-        loose: numbers of those that others have taken the place of, ascending.
+        places: of all particles when all were sorted.
+        loose: indices whose particles were replaced since, ascending.
     """
 
     places: np.ndarray
@@ -44,7 +44,7 @@ class PlaceOrder:
             np.append(self.loose, np.arange(count, len(place))),
         )
         others = others[np.argsort(place[others], kind="stable")]
-        # which of those in order they belong
+        # Sorted particle before which each of them belongs.
         before = np.searchsorted(self.places[:end], place[others], side="right")
         cuts = np.sort(np.concatenate([[0, end], before, gaps, gaps + 1]), kind="stable")
         held = cuts[1:] > cuts[:-1]

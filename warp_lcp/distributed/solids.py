@@ -1,4 +1,4 @@
-"""The solids of a rank's part of a grid, as the whole grid would have them."""
+"""Solids in a rank's part of a grid, equal to those of the whole grid."""
 
 from __future__ import annotations
 

@@ -36,20 +36,19 @@ from warp_lcp.material.particle_scene import ParticleScene
 
 DEFAULT_BALANCE = Balance()
 MOST_KEPT = 32  # exchanges of fields that are filled again and again
-# of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is
-# held
+# Ghost layers. Whether liquid is held can depend on a closed face up to 4.8 cells away.
 LAYERS = 5
 
 
 def ghost_layers(cfl: float, smoothing: int) -> int:
-    """Return how many layers of ghost cells a box needs.
+    """Return the number of ghost layers that a box needs.
 
-    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors
-    is then wrong in the outermost layer, what those take in the next, and so on. Fields are filled
-    again before that would reach the box. Nothing is filled while particles move: a stage of their
-    way looks at faces within 1.5 cells of a place, and three layers more than the Courant number
-    leave room for liquid that the step makes faster. Nor between the binomial passes over a level
-    set, a layer each, the slope beside walls, another, and the two layers of cells in solids.
+    Ghost layers are correct after a halo exchange. Each computation that reads neighbors then makes
+    one more layer wrong, beginning with the outermost. The next exchange comes before wrong values
+    reach the box. No exchange takes place during advection: each stage reads faces within 1.5 cells
+    of the particle, and three layers more than the Courant number allow for liquid that the step
+    makes faster. Neither does one take place during the smoothing of the level set: each binomial
+    pass takes a layer, the slope beside walls another, and cells in solids two.
 
     Args:
         cfl: the Courant number of the run.
@@ -72,12 +71,12 @@ for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
 
 
 def _stays(field: wp.array | np.ndarray) -> bool:
-    """Return whether a recorded launch may know a field by its address."""
+    """Return whether a recorded launch may identify a field by its address."""
     return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
 
 
 def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
-    """Copy cells of a field to another, now or among recorded launches; both may be views."""
+    """Copy cells of a field to another, now or recorded; both may be views."""
     if is_recording():
         launch(copy_kernel, to.shape[:2], [to, source], device=to.device)
     else:
@@ -85,7 +84,7 @@ def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
 
 
 def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
-    """Fill the ghost cells of fields that a star forest has as leaves."""
+    """Fill the ghost cells that a star forest has as leaves."""
     hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
     exchange_all(forest, [(host, host) for host in hosts])
     for field, host in zip(fields, hosts, strict=True):
@@ -94,7 +93,7 @@ def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
 
 
 def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
-    """Return `_fill` as an operation of the team."""
+    """Return `_fill` as an operation of the thread pool."""
     hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
     return exchanging_all(forest, [(host, host) for host in hosts])
 
@@ -188,7 +187,7 @@ class Subdomain(GridPart):
 
     @property
     def across(self) -> Communicator | None:
-        """The other processes, as reductions take them; None: there are none."""
+        """Communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
     @property
@@ -215,7 +214,7 @@ class Subdomain(GridPart):
 
     @property
     def first(self) -> tuple[int, int, int]:
-        """The first of them along x, y, z, counted from 0 in the whole domain."""
+        """First cell of the box along x, y, z, counted from 0 in the whole domain."""
         return self.box.low
 
     def faces(self, window: Window) -> Window:
@@ -223,11 +222,11 @@ class Subdomain(GridPart):
         return self.own_faces
 
     def whole(self, window: Window) -> Window:
-        """Return all cells: others may have material where this rank has none."""
+        """Return all cells: other ranks may have material where this rank has none."""
         return self.grid.everywhere
 
     def repartition(self, decomposition: Decomposition) -> Subdomain:
-        """Return the part that this rank works on with other boxes."""
+        """Return the part of this rank with other boxes."""
         return Subdomain(
             decomposition,
             spacing=self.grid.spacing,
@@ -239,7 +238,7 @@ class Subdomain(GridPart):
         )
 
     def should_rebalance(self, step: int) -> bool:
-        """Return whether the ranks look for better boxes in a step."""
+        """Return whether the ranks check for better boxes in a step."""
         return self.balance.should_rebalance(self, step)
 
     def rebalance(self, particles: Particles, a_cell: int) -> Subdomain | None:
@@ -281,7 +280,7 @@ class Subdomain(GridPart):
 
     @property
     def corners(self) -> tuple[Corner, Corner]:
-        """The first cell (x, y, z) of the box and the one behind its last."""
+        """First cell (x, y, z) of the box, and the one behind its last."""
         return self.box.low, self.box.high
 
     def where(self) -> dict[str, np.ndarray]:
@@ -315,7 +314,7 @@ class Subdomain(GridPart):
         return float(self.ranks.max(too_far(self, velocity, dt)))
 
     def notes(self) -> list[str]:
-        """Return how many ranks there are, and how large their boxes."""
+        """Return the number of ranks and the size of their boxes, as text."""
         boxes = self.decomposition.boxes
         largest = " x ".join(
             map(str, max(boxes, key=lambda box: box.cells).counts[: self.dimension])
@@ -408,7 +407,7 @@ class Subdomain(GridPart):
         )
 
     def _refined(self, box: CellBox, parts: int) -> CellBox:
-        """Return a box in cells that are cut into so many along each axis."""
+        """Return a box of cells refined by a factor along each axis."""
         each = [parts if axis < self.dimension else 1 for axis in range(3)]
         return CellBox.of(
             *([n * p for n, p in zip(corner, each, strict=True)] for corner in (box.low, box.high))
@@ -494,7 +493,7 @@ class Subdomain(GridPart):
                 field.assign(host)
 
     def take(self, whole: wp.array, field: wp.array) -> None:
-        """Write what a field of the whole grid has on this part to a field of the part."""
+        """Write this part's values of a whole-grid field to a field of the part."""
         wp.copy(field, whole[self._cells(self.box).grown(1).moved((1, 1, 1)).slices])
 
     def box_of(self, field: wp.array, ring: int = 0) -> Any:
@@ -516,7 +515,7 @@ class Subdomain(GridPart):
         return self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
 
     def known_of(self, field: np.ndarray) -> np.ndarray:
-        """Return the view of a host's field on what this rank alone knows."""
+        """Return the view of a host field on the cells that this rank owns."""
         return field[self.known.slices]
 
     def stored_box_of(self, field: wp.array) -> Any:
@@ -541,7 +540,7 @@ class Subdomain(GridPart):
         )
 
     def copy_to_box(self, field: wp.array, box: wp.array) -> None:
-        """Give a field of the box what one of the part holds, if it does not share its memory."""
+        """Copy the part's values to a field of the box, unless they share memory."""
         view = self.stored_box_of(field)
         if view.ptr != box.ptr:
             copy_cells(box, view)
@@ -560,7 +559,7 @@ class Subdomain(GridPart):
 
     @property
     def gathered_from(self) -> Corner:
-        """The first cell of what `gathered` returns: of the whole domain."""
+        """First cell of the result of `gathered`, in the whole domain."""
         return 0, 0, 0
 
     def gathered(self, values: np.ndarray) -> np.ndarray | None:
@@ -600,7 +599,7 @@ class Subdomain(GridPart):
         return boundary_of_part(scene, self, solids)
 
     def exchange_of(self, particles: Particles) -> ParticleMigration:
-        """Return what particles on this part have to do with those of other ranks."""
+        """Return the exchange of this part's particles with other ranks."""
         return ParticleMigration(self, particles)
 
     def nearest(self, cells: np.ndarray) -> np.ndarray:
@@ -633,13 +632,13 @@ class Subdomain(GridPart):
     def join_trees(
         self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array
     ) -> BodyNumbers:
-        """Join the trees of cells that reach over several ranks' boxes to bodies; collective."""
+        """Join the trees of cells that extend over several boxes; collective."""
         if self._trees is None:
             self._trees = TreesAtCuts(self)
         return self._trees.join(trees, seen, parent, number, held)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
-        """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""
+        """Return the rank of each cell (x, y, z) of the whole domain, shape (n, 3)."""
         place = [
             np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right")
             for axis, part in enumerate(self.decomposition.parts)

@@ -24,18 +24,19 @@ from warp_lcp.files.atomic import SUFFIX, open_in_place
 LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
 BEATS = 20  # of the thread within the limit; it looks at the clock no more often
 LONGEST_BEAT = 30.0  # seconds
-# beats, and seconds, after which a rank that has told nothing new cannot: stopped, or its machine
-# is gone
+# Beats, and seconds, after which a rank without a new heartbeat counts as dead: stopped, or its
+# machine has failed.
 SILENT, SILENCE = 4, 2.0
 POST = r"waits_\d{4,}"  # names of the files
-# ranks that look one beat after another, so that one of them speaks; later ones only if those
-# cannot
+# Ranks that check one beat after another, so that only one of them reports; later ranks check only
+# if those cannot.
 FIRST = 5
-# seconds that it may take to end all ranks before this one ends itself, which mpiexec notices
+# Seconds that it may take to end all ranks. After them this rank ends itself, which mpiexec
+# notices.
 GRACE = 5.0
 ROOM = 512  # bytes of a post: written over in place, which a full disk allows
 OWN = "warp_lcp."
-# wait for whom calls them
+# Modules that wait on behalf of their callers.
 PASSING = {
     "contextlib",
     *(f"{OWN}distributed.{name}" for name in ("waiting", "ranks", "collective", "halo")),
@@ -44,11 +45,11 @@ PASSING = {
 
 @dataclass(frozen=True)
 class HeartbeatMessages:
-    """What a rank's thread tells of its main thread.
+    """Heartbeat: state of a rank's main thread.
 
     Args:
         beat: a number that grows while the thread lives.
-        count: of entries into operations of all ranks, and exits.
+        count: of entries into collective operations, and exits.
         name: of the operation that the rank waits in, "" outside.
         seconds: since the count grew.
         place: in the program.
@@ -62,10 +63,10 @@ class HeartbeatMessages:
 
 
 class HeartbeatTable:
-    """Where ranks tell each other what they do while MPI cannot: a small file a rank.
+    """Heartbeat files, one a rank: communication while MPI is blocked.
 
     Args:
-        folder: that all of them see; those that do not are not heard of.
+        folder: shared by the ranks; a rank that does not see it is ignored.
         label: tells the ranks of different programs apart in it.
     """
 
@@ -77,20 +78,23 @@ class HeartbeatTable:
         return self._folder / f".{self._label}waits_{rank:04d}{SUFFIX}"
 
     def write(self, rank: int, post: HeartbeatMessages) -> None:
-        """Put up a post."""
+        """Write a heartbeat."""
         line = (json.dumps({**asdict(post), "place": post.place[: ROOM // 2]}) + "\n").encode()
         descriptor = open_in_place(self.path(rank), os.O_WRONLY | os.O_CREAT, 0o600)
         with open(descriptor, "wb") as file:  # closed each time: that is when other machines see it
             file.write(line.ljust(ROOM))
 
     def read(self, rank: int) -> HeartbeatMessages | None:
-        """Return the post of a rank; None if there is none, or a half-written one."""
+        """Read the heartbeat of a rank.
+
+        Returns None if there is none, or a half-written one.
+        """
         with suppress(OSError, ValueError, TypeError):
             return HeartbeatMessages(**json.loads(self.path(rank).read_bytes().split(b"\n")[0]))
         return None
 
     def clear(self, ranks: Sequence[int]) -> None:
-        """Take posts away."""
+        """Remove the heartbeat files."""
         for rank in ranks:
             with suppress(OSError):
                 self.path(rank).unlink()
@@ -133,7 +137,7 @@ class Watchdog:
         self._over = threading.Event()
         self._main = threading.main_thread().ident
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        # of ranks: since when they stay, the last post, its age in beats
+        # Of each rank: first heartbeat without progress, last one, its age in beats.
         self._seen: dict[int, tuple[HeartbeatMessages | None, HeartbeatMessages | None, int]] = {}
 
     def __enter__(self) -> Self:
@@ -153,12 +157,12 @@ class Watchdog:
         self._board.clear([self._ranks.rank])
 
     def post_in(self, folder: Path) -> None:
-        """Tell in a folder, which all ranks see, from now on."""
+        """Write heartbeats to a folder that all ranks see, from now on."""
         with self._posting:
             self._board.clear([self._ranks.rank])
             self._board = HeartbeatTable(folder)
             if self._thread.is_alive():
-                # while the disk has room
+                # Written at once, while the disk has room.
                 self._board.write(
                     self._ranks.rank, HeartbeatMessages(0, 0, "", 0.0, "its beginning")
                 )
@@ -167,7 +171,7 @@ class Watchdog:
         beat, count, idle, then = 0, self._watched.count, 0.0, time.monotonic()
         while not self._over.wait(self._beat):
             now = time.monotonic()
-            # longer if the process was stopped
+            # now - then is longer if the process was stopped; that time does not count.
             beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now
             if count != self._watched.count:
                 count, idle = self._watched.count, 0.0
@@ -181,7 +185,7 @@ class Watchdog:
             with self._posting:
                 if self._over.is_set():
                     return
-                # a disk that takes no file: the others will say that this rank tells nothing
+                # If the disk accepts no file, the other ranks report this one as silent.
                 with suppress(OSError):
                     self._board.write(self._ranks.rank, mine)
             if idle < self._limit + min(self._ranks.rank, FIRST) * self._beat:
@@ -198,7 +202,7 @@ class Watchdog:
         It is also "" until two different heartbeats of each rank, or none for long, show that it
         does not.
         """
-        # a rank that computes waits for nobody
+        # A rank that computes waits for no other rank.
         patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)
         posts: dict[int, HeartbeatMessages | None] = {self._ranks.rank: mine}
         certain = True
@@ -218,10 +222,10 @@ class Watchdog:
 
 
 def verdict(posts: Mapping[int, HeartbeatMessages | None]) -> str:
-    """Return which ranks keep the others waiting, in a line; "" if none does.
+    """Return a line about ranks that keep the others waiting; "" if there are none.
 
     Args:
-        posts: of all ranks, which have not gone on for long; None: it tells nothing.
+        posts: heartbeats of all ranks, without progress for long; None: no heartbeat.
     """
     inside = {rank: post for rank, post in sorted(posts.items()) if post and post.name}
     outside = {rank: post for rank, post in sorted(posts.items()) if post and not post.name}
@@ -250,7 +254,10 @@ def verdict(posts: Mapping[int, HeartbeatMessages | None]) -> str:
 
 
 def place_of(frame: FrameType | None) -> str:
-    """Return where a thread is: in which line of ours, and of the module that this has called."""
+    """Return the position of a thread: the line in this library.
+
+    Also the line of the module that it has called.
+    """
     found = list[str]()
     while frame is not None:
         name, line = str(frame.f_globals.get("__name__", "")), frame.f_lineno
@@ -267,7 +274,7 @@ def _named(ranks: Sequence[int]) -> str:
 
 
 def _grouped(texts: dict[int, str]) -> str:
-    """Return who waits in what."""
+    """Return text that groups ranks by the operation they wait in."""
     ranks: dict[str, list[int]] = {}
     for rank, text in texts.items():
         ranks.setdefault(text, []).append(rank)

@@ -35,7 +35,7 @@ from warp_lcp.kernels.native import sections
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 
 BLOCK_BYTES = 16  # that a thread loads at a time
-# Fields of one element a row that row functions set to 1, or leave as they are.
+# Fields of one element a row that row functions only set, or find set: several threads may do so.
 FLAGGED = ("changed", "away")
 # Names that this package uses itself.
 OWN = frozenset(

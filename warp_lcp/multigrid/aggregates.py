@@ -107,28 +107,29 @@ def settle_kernel(
                 first = change
 
 
-# of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2
-# cells, Newton's steps after 4 cycles
-# over-correction of plain aggregates' corrections, which are too small where x is smooth
+# Over-correction of plain aggregates' corrections, which are too small where x is smooth. It is the
+# best of 1, 1.4 and 1.8 with 2 and 3 coarse cycles, for obstacles under diffusion and convection on
+# 257^2 cells, by Newton's steps after 4 cycles.
 ALPHA = wp.float64(1.4)
 GAMMA = 3  # coarse cycles a level: aggregates of 5 to 9 unknowns leave room for them
-# unknowns of the coarsest level, and the largest share of unknowns that a level may keep
+# Unknowns of the coarsest level, and the largest share of unknowns that a level may keep.
 COARSEST, STALL = 64, 0.7
-# the most pairs of sweeps of the coarsest level, and the part of the first change at which they end
+# The most pairs of sweeps of the coarsest level, and the part of the first change at which they
+# end.
 SWEEPS, ENOUGH = 20, 1e-2
 STRENGTH = 1e-3  # entries below this share of sqrt(a_ii a_jj) do not aggregate
-# share of rows that must be diagonally dominant for multigrid to serve an unsymmetric matrix
+# Share of rows that must be diagonally dominant for multigrid to suit an unsymmetric matrix.
 DOMINANT = 0.9
 POSITIVE = 0.1  # share of the off-diagonal entries' magnitude that may be positive there
 
 
 @dataclass(frozen=True)
 class Aggregation:
-    """Which unknowns make up a coarse one, on the device.
+    """Aggregates of unknowns, on the device.
 
     Attributes:
         owner: the aggregate of each unknown, shape (n,), wp.int32; -1 for none.
-        first: where each aggregate's members begin, shape (m + 1,), wp.int32.
+        first: index of each aggregate's first member, shape (m + 1,), wp.int32.
         members: the unknowns, by aggregates, wp.int32.
     """
 
@@ -138,7 +139,10 @@ class Aggregation:
 
     @classmethod
     def of(cls, aggregates: scipy.sparse.csr_array, device: wp.Device) -> Aggregation:
-        """Take a matrix with a 1 in row i and column j where unknown i is in aggregate j."""
+        """Set the aggregates from a 0-1 matrix.
+
+        Row i has a 1 in column j where unknown i is in aggregate j.
+        """
         owner = np.full(aggregates.shape[0], -1)
         owner[np.diff(aggregates.indptr) > 0] = aggregates.indices
         turned = aggregates.T.tocsr()
@@ -205,11 +209,14 @@ class AggregateLevel:
         return self._legs["down"]
 
     def coarsen_bounds(self, coarse: AggregateLevel) -> tuple[()]:
-        """Return nothing: `descend` coarsens bounds in the kernel that restricts."""
+        """Return no stages: `descend` coarsens bounds in the kernel that restricts."""
         return ()
 
     def ascend(self, coarse: AggregateLevel, *, projected: bool) -> list[CycleStage]:
-        """Return steps 5 and 6: the sweep goes backward, so that the cycle is symmetric if A is."""
+        """Return steps 5 and 6 of a cycle.
+
+        The sweep goes backward, so that the cycle is symmetric if A is.
+        """
         assert self.aggregation is not None, "not the coarsest level"
         if "up" not in self._legs:
             inputs = [self.aggregation.owner, coarse.x, ALPHA, self.lower, self.upper, self.x]
@@ -315,7 +322,7 @@ class MonotoneAggregation:
 
 
 def _aggregates(host: scipy.sparse.csr_array) -> scipy.sparse.csr_array | None:
-    """Return which unknowns belong together, None where too few do."""
+    """Return the aggregation matrix; None where too few unknowns are aggregated."""
     found = aggregated(
         symmetric_strength_of_connection(symmetric_part(host), theta=STRENGTH), STALL
     )
@@ -339,7 +346,7 @@ def aggregated(strength: scipy.sparse.csr_matrix, stall: float) -> Any:
 
 
 def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
-    """Return whether a matrix is near enough to a diagonally dominant M-matrix."""
+    """Return whether a matrix is close to a diagonally dominant M-matrix."""
     d = host.diagonal()
     if not (d > 0).all():
         return False

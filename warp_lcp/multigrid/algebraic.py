@@ -47,7 +47,7 @@ Matrix = Any  # a scipy.sparse.csr_array
 
 
 class DeviceMatrix:
-    """A sparse matrix in compressed rows on the device, any shape."""
+    """A sparse matrix of any shape in compressed rows on the device."""
 
     def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
         self.shape, self.device = host.shape, device
@@ -66,12 +66,12 @@ class DeviceMatrix:
 def product_pass(
     left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]
 ) -> BoundKernel:
-    """Return what computes A B into a known pattern.
+    """Return the launch that computes A B into a known pattern.
 
     Args:
         left: A.
         right: B.
-        out: where the product goes; its pattern holds that of A B.
+        out: receives the product; its pattern holds that of A B.
         hosts: the patterns of A, B and A B.
     """
     A, B, C = hosts
@@ -96,17 +96,19 @@ def product_pass(
 
 
 class AlgebraicLevel:
-    """One level, see `CycleLevel`: its matrix, the smoother's scale, and the way to the next level.
+    """One level, see `CycleLevel`: matrix, smoother's scale and transfer.
+
+    The transfer leads to the next coarser level.
 
     Args:
         host: the matrix.
         real: type of the fields.
-        device: where they are.
+        device: of the fields.
         weights: relaxation factors of a pair of sweeps.
         visits: cycles on this level in each of the next finer one.
 
     Attributes:
-        x, b, t: iterate, right-hand side and what lies between two sweeps.
+        x, b, t: iterate, right-hand side and the value between two sweeps.
     """
 
     def __init__(
@@ -183,11 +185,11 @@ class AlgebraicLevel:
         return self._legs[key]
 
     def coarsen_bounds(self, coarse: AlgebraicLevel) -> tuple[()]:
-        """Return nothing: there are no bounds."""
+        """Return no stages: there are no bounds."""
         return ()
 
     def ascend(self, coarse: AlgebraicLevel, *, projected: bool) -> list[CycleStage]:
-        """Return steps 5 and 6: x + P x_c, and the pair in reverse order."""
+        """Return steps 5 and 6 of a cycle: x + P x_c, and the pair in reverse order."""
         key = "up", projected
         if key not in self._legs:
             assert self.P is not None, "not the coarsest level"
@@ -201,18 +203,18 @@ class AlgebraicLevel:
 class AlgebraicHierarchy:
     """Multigrid for M e = r, M = P A P + P D P, with a sparse A.
 
-    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value that the row's own
-    equation asks for, and are 0 off the free set: a coarse correction then leaves stiff unknowns
-    alone, whatever D's size. On an unsymmetric A the aggregates are those of its symmetric part,
-    smoothed where that part rules, and the coarse matrices are P' M P with M as it is.
+    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value from the row's own
+    equation, and are 0 off the free set: a coarse correction then hardly changes stiff unknowns,
+    whatever D's size. On an unsymmetric A the aggregates are those of its symmetric part, smoothed
+    where that part dominates, and the coarse matrices are P' M P with M as it is.
 
     Args:
         A: the matrix.
         real: type of the corrections.
-        settings: how it is built and cycled.
+        settings: of the hierarchy and its cycles.
 
     Attributes:
-        r: the right-hand side, field of A's shape; z: what a cycle makes of it.
+        r: the right-hand side, field of A's shape; z: the result of a cycle.
         weight: one over the diagonal of M, field like r; 1 where that is 0, 0 off the free set.
     """
 
@@ -261,16 +263,19 @@ class AlgebraicHierarchy:
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
-        """q = M p, on the finest level."""
+        """Compute q = M p on the finest level."""
         self.levels[0].A.multiplying(p, q).launch(launch)
 
     @cached_property
     def program(self) -> CommandBuffer:
-        """One cycle: z = an approximation of M^-1 r, symmetric positive (semi-)definite if M is."""
+        """Program of one cycle: z approximates M^-1 r.
+
+        The approximate inverse is symmetric positive (semi-)definite if M is.
+        """
         return recorded(self.device, Cycle(self.levels, self._solve).stages())
 
     def apply(self) -> None:
-        """Cycle once: run `program`."""
+        """Run one cycle: `program`."""
         self.program.run()
 
     @cached_property
@@ -377,8 +382,8 @@ def _coarsen(
             break
         T, candidates = fit_candidates(aggregates, candidates)
         block = candidates.shape[1]
-        # local weights are sums of magnitudes; spectral ones start from random vectors, so runs
-        # would differ
+        # Local weights are sums of magnitudes. Spectral weights start from random vectors, so runs
+        # would differ.
         P = T
         if _skewness(current, entries) <= settings.skew:
             P = jacobi_prolongation_smoother(
@@ -389,7 +394,7 @@ def _coarsen(
         R = P.T.tocsr()
         AP = _pattern_product(current, P)
         coarse = _pattern_product(R, AP)
-        # wide rows, which coarsening fills
+        # Coarsening fills wide rows.
         if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:
             break
         levels.append(AlgebraicLevel(coarse, real, device, *cycles))
@@ -420,7 +425,7 @@ def _skewness(A: Matrix, symmetric: Matrix) -> float:
 
 
 def _alike(A: Matrix, B: Matrix) -> bool:
-    """Return whether two matrices have one pattern."""
+    """Return whether two matrices have the same pattern."""
     return np.array_equal(A.indptr, B.indptr) and np.array_equal(A.indices, B.indices)
 
 
@@ -448,7 +453,7 @@ def _union(matrix: Matrix) -> Matrix:
 
 
 def _with_diagonal(matrix: Matrix) -> Matrix:
-    """Return the pattern of a matrix with a whole diagonal."""
+    """Return the pattern of a matrix with a full diagonal."""
     pattern = _ones(matrix)
     pattern = (pattern + scipy.sparse.eye_array(matrix.shape[0], dtype=np.float32)).tocsr()
     pattern.sort_indices()

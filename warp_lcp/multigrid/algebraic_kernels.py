@@ -41,7 +41,7 @@ def places_kernel(
 
 @forward_kernel(module="warp_lcp.algebraic")
 def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATRIX):
-    """A row a thread as a dense one."""
+    """Expand a sparse row to a dense one, one thread a row."""
     i = wp.tid()
     for j in range(out.shape[1]):
         out[i, j] = wp.float64(0.0)
@@ -51,10 +51,10 @@ def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATR
 
 @forward_kernel(module="warp_lcp.algebraic")
 def factor_kernel(matrix: MATRIX, rounding: wp.float64):
-    """L U in place without pivoting, by one thread.
+    """Factor L U in place without pivoting, by one thread.
 
-    A pivot whose magnitude is below `rounding` times its diagonal is what rounding left of a
-    singular component, or a row of zeros: its unknown is taken out, and its pivot is 0.
+    A pivot is zero, or rounding error of a singular component, if its magnitude is below `rounding`
+    times its diagonal. Its unknown is then eliminated, and its pivot set to 0.
     """
     n = matrix.shape[0]
     for c in range(n):
@@ -107,7 +107,7 @@ def invert_kernel(factors: MATRIX, inverse: MATRIX):
 
 @forward_kernel(module="warp_lcp.algebraic")
 def solve_kernel(inverse: MATRIX, b: wp.array(dtype=Any), x: wp.array(dtype=Any)):
-    """x = the inverse times b."""
+    """Multiply by the inverse: x = A^-1 b."""
     i = wp.tid()
     s = wp.float64(0.0)
     for j in range(inverse.shape[1]):

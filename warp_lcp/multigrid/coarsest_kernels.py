@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Kernels that assemble the coarsest level's matrix and factor or invert it.
 
-A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is
-pinned at 0. Positive semi-definite matrices need no other order of the pivots.
+A pivot below `rounding` times its diagonal is rounding error of a singular component: its unknown
+is fixed at 0. Positive semi-definite matrices need no pivoting.
 """
 
 import functools
@@ -16,14 +16,14 @@ from warp_lcp.kernels.layout import RowLayout, stencil_struct
 from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, meet
 
 square = wp.array2d(dtype=wp.float64)
-# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a
-# margin
+# Threshold relative to the coarsest level's diagonal: rounding error of a singular component's last
+# pivot, with a margin.
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
 
 
 @wp.func
 def none_changed(changed: wp.array2d(dtype=wp.uint8)):
-    """Whether no row has changed."""
+    """Return whether no row has changed."""
     found = int(0)
     for k in range(changed.shape[0]):
         for j in range(changed.shape[1]):
@@ -34,7 +34,7 @@ def none_changed(changed: wp.array2d(dtype=wp.uint8)):
 
 @wp.func
 def element(L: RowLayout, r: int):
-    """Element of a stored field that holds cell r."""
+    """Return the element of a stored field for cell r."""
     return (
         L.base
         + wp.int64(r // (L.rows * L.nx)) * L.s1
@@ -45,7 +45,10 @@ def element(L: RowLayout, r: int):
 
 @wp.func
 def beside(L: RowLayout, periodic: wp.vec3i, r: int, axis: int, way: int):
-    """Cell before (way = -1) or after (1) cell r along an axis; -1 where there is none."""
+    """Return the cell before (way = -1) or after (1) cell r along an axis.
+
+    -1 where there is none.
+    """
     step = int(1)
     n = L.nx
     if axis == 1:
@@ -74,7 +77,7 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def weight(S: Stencil, axis: int, at: wp.int64):
-        """Weight of a cell's lower face."""
+        """Return the weight of a cell's lower face."""
         w = S.cx
         if axis == 1:
             w = S.cy
@@ -91,7 +94,10 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def assemble(S: Stencil, L: RowLayout, periodic: wp.vec3i, r: int, matrix: square):
-        """Write row r; a periodic axis of two cells has two faces between them."""
+        """Assemble row r of the dense matrix.
+
+        A periodic axis of two cells has two faces between them.
+        """
         for c in range(matrix.shape[0]):
             matrix[r, c] = wp.float64(0.0)
         at = element(L, r)
@@ -118,7 +124,7 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         changed: wp.array2d(dtype=wp.uint8),
         matrix: square,
     ):
-        """Assemble and factor in place; nothing to do if none of the rows of cells has changed."""
+        """Assemble and factor the matrix in place, if any row of cells has changed."""
         if none_changed(changed):
             return
         m = matrix.shape[0]
@@ -178,7 +184,10 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         other: square,
         inverse: square,
     ):
-        """Assemble and invert; every thread of the block passes every barrier."""
+        """Assemble and invert the matrix.
+
+        Every thread of the block reaches every barrier.
+        """
         t = wp.tid()
         m = inverse.shape[0]
         for r in range(t, m, threads):

@@ -40,7 +40,10 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
 def weights_block(
     pattern: Pattern, padding: Padding, real: Any, device: wp.Device
 ) -> tuple[wp.array[Any], tuple[wp.array[Any], ...]]:
-    """Return memory for a pattern's weights, one field after another, and each of them."""
+    """Return memory for a pattern's weights, and its field for each weight.
+
+    The fields lie one after another.
+    """
     n, count = padding.size, len(pattern.offsets)
     block = zeros(count * n, real, device)
     return block, tuple(block[i * n : (i + 1) * n] for i in range(count))

@@ -33,9 +33,9 @@ CORRECT = KERNELS["cycle.correct"]
 COARSE_BOUNDS = KERNELS["cycle.bounds"]
 DESCEND = FusedKernel("cycle.descend", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 1), (RESTRICT, 2))
 ASCEND = FusedKernel("cycle.ascend", (CORRECT, 0), (SWEEP_INTO_RING, 1), (SWEEP_OUT_OF_RING, 2))
-# On a box of cells among those of other processes: the first sweep from zero is made in ghost
-# cells, too, where it needs only their right-hand side. So what follows waits for no exchange, but
-# for the residual beside others' cells, which is found again.
+# On a box of cells among those of other processes. The first sweep from zero is also made in ghost
+# cells, which need only their right-hand side. So the next stages wait for no exchange, except for
+# the residual beside others' cells, which is recomputed.
 DESCEND_FROM_GHOSTS = FusedKernel(
     "cycle.descend_from_ghosts", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2), (RESTRICT, 3)
 )
@@ -53,7 +53,7 @@ SIGN = LEVELS["renew.sign"]
 
 @dataclass(frozen=True, slots=True)
 class Coarsening:
-    """What the kernels that coarsen a matrix take, compact or not.
+    """Arguments of the kernels that coarsen a matrix, compact or not.
 
     Attributes:
         changed: rows of the finer level that have changed, uint8.

@@ -1,6 +1,6 @@
-"""All small levels of a hierarchy in one launch.
+"""Fused coarse levels: all small levels of a hierarchy in one launch.
 
-A block of threads, or a cluster of blocks, goes through a list of stages.
+A block of threads, or a cluster of blocks, executes a list of stages.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class FusedCoarseLevels:
-    """Coarsest solver: the last levels of a hierarchy, in one launch on a GPU.
+    """Coarsest solver: the last levels of a hierarchy in one GPU launch.
 
     The cycle's stages are unrolled into a table on the device. Results are those of one launch a
     stage, to rounding.
@@ -41,7 +41,7 @@ class FusedCoarseLevels:
 
     @functools.cached_property
     def coarsening(self) -> PersistentKernel:
-        """The making of all levels from the first one."""
+        """Stages that compute all levels from the first one."""
         stages: list[Any] = [
             s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)
         ]

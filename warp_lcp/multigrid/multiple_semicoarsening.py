@@ -20,14 +20,15 @@ from warp_lcp.operators.sparse import GATHER
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 
-# ratios of weights that differ by this factor between places, or from the mean weights', ask for a
-# hierarchy of their own
+# Ratios of weights that differ by this factor between places, or from the mean weights', need a
+# hierarchy of their own.
 TURN = 10.0
 SHARE = 0.01  # of the sampled blocks that must do so
 LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
-# cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
+# Cells of a block along each long axis: 64 faces an axis, whose mean noise does not look like a
+# change of direction.
 EDGES = {2: 8, 3: 4}
-# the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
+# The most blocks that are sampled along each axis: 2 ms in all, whatever the grid.
 SAMPLES = {2: 24, 3: 8}
 
 
@@ -48,14 +49,15 @@ class MultipleSemicoarsening(Hierarchy):
         self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any
     ) -> None:
         settings = options.pop("settings", None) or CycleSettings()
-        # a launch of all levels starts from x = 0: the finest one stays out of it
+        # A fused launch of all levels starts from x = 0, so the finest level must not be part of
+        # it.
         fewer = math.prod(stencil.padding.counts) - 1
         names = ("one_launch_cpu", "one_launch_cuda", "one_launch_cluster")
         settings = replace(
             settings, **{name: min(getattr(settings, name), fewer) for name in names}
         )
         super().__init__(stencil, real, **options, settings=settings)
-        # W-cycles save a step in ten and cost two to four times as much
+        # W-cycles save a step in ten and cost two to four times as much.
         options["settings"] = replace(settings, gamma=1)
         self.companions = [
             Hierarchy(stencil, real, **options, strength=strength, finest=self.finest)
@@ -65,11 +67,14 @@ class MultipleSemicoarsening(Hierarchy):
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the levels hold, the finest one once; shared weights not counted."""
+        """Memory of the levels [bytes].
+
+        The finest one counts once, shared weights not at all.
+        """
         return super().nbytes + sum(c.nbytes - self.finest.nbytes for c in self.companions)
 
     def refresh(self) -> None:
-        """Take the operator's rows and weights again."""
+        """Update the operator's rows and weights."""
         super().refresh()
         for companion in getattr(self, "companions", ()):
             companion.refresh()
@@ -142,7 +147,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
 
 
 def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return by how much the ratios of rows of weights differ from others, as a logarithm."""
+    """Return how much the ratios of rows of weights differ, as a logarithm."""
     return np.ptp(logs - other, axis=1)
 
 
@@ -163,7 +168,7 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     samples = [min(n, SAMPLES[dimension]) for n in blocks]
     shape, sides = stencil.padding.shape, (math.prod(samples), math.prod(edges))
     along = [
-        # samples are spread evenly over the blocks
+        # Samples are spread evenly over the blocks.
         (np.arange(m) * n // m * edge + 1)[:, None] + np.arange(edge)
         for m, n, edge in zip(samples, blocks, edges, strict=True)
     ]
@@ -173,7 +178,7 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     ).transpose(0, 2, 4, 1, 3, 5)
     order = wp.array(places.ravel(), dtype=wp.int32, device=device)
     assert stencil.weights is not None
-    # by block, axis, face
+    # Indices: block, axis, face.
     faces = np.stack([_gathered(w, order).reshape(sides) for w in stencil.weights], axis=1)
     least = LEAST * faces.max(axis=(1, 2), keepdims=True)
     totals = np.log(np.where(faces > 0, np.maximum(faces, least), 1.0)).sum(axis=2)
