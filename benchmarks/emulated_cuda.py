@@ -298,14 +298,14 @@ PIECES = ("moved",)  # sums that count pieces of rows; only zero or nonzero is c
 
 
 def checked_by_cells(invoke):
-    """Return a launcher that also runs quad passes by cells and records differences.
+    """Return a launcher that also runs quad kernels by cells and records differences.
 
     Both start from equal memory.
     """
     from warp_lcp.kernels import layout
     from warp_lcp.kernels.kernel_variant import KernelVariant
 
-    forms = {}  # form of each kernel; None if it is no pass by quads
+    forms = {}  # variant of each kernel; None for kernels without quads
 
     def form_of(kernel):
         if kernel not in forms:
@@ -331,7 +331,7 @@ def checked_by_cells(invoke):
         )
         arrays_of(kernel_args, kernel.adj.args[1].type, arrays)
         for address in {kernel_args.out.data} if columns else ():
-            arrays.pop(address, None)  # the two forms have different places of sums
+            arrays.pop(address, None)  # both variants store partial sums in different places
         native, cells = (
             twin.native.from_buffer_copy(bytes(kernel_args)),
             type(rows).from_buffer_copy(rows),

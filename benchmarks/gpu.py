@@ -12,7 +12,7 @@ import importlib
 import sys
 
 if "--rehearse" in sys.argv:
-    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+    importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
 
 # ruff: isort: split
 
@@ -42,8 +42,8 @@ from warp_lcp.benchmarks.problems import natural, splash
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, loops_on_device
 from warp_lcp.reduced.device_iteration import DeviceIteration
 
-CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
-WRONG = 3  # what `benchmarks.gpu_kernels` ends with where kernels differ
+CLOSE, ALIKE = 1e-5, 2e-2  # relative: for solutions to 1e-8, and for particles after many steps
+WRONG = 3  # exit status of `benchmarks.gpu_kernels` where kernels differ
 CAPTURE_LAUNCH = wp.capture_launch
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -83,7 +83,7 @@ class GpuVerdict:
             text, holds = found(), True
         except AssertionError as error:
             text, holds = str(error), False
-        except Exception as error:  # whatever a strange machine does is what this is to find
+        except Exception as error:  # any failure of an unknown machine is a result
             text, holds = (
                 f"{type(error).__name__}: {error} "
                 f"({traceback.extract_tb(error.__traceback__)[-1].name})",
@@ -96,7 +96,7 @@ class GpuVerdict:
                 "s)",
                 flush=True,
             )
-            self.write()  # whatever ends this process early leaves what has been found
+            self.write()  # the results survive if this process ends early
 
     def all(self) -> None:
         """Run all checks."""
@@ -309,7 +309,7 @@ class GpuVerdict:
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
             problem, method = splash(n).lcp("walls", device=self.device), wl.ProjectedMultigrid()
             workspace, taken = method.init(problem), []
-            for _ in range(4):  # the first loads kernels and captures graphs
+            for _ in range(4):  # the first one loads kernels and captures graphs
                 wp.synchronize()
                 start = time.perf_counter()
                 result = wl.solve(
@@ -370,7 +370,7 @@ class GpuVerdict:
         """
         with mock.patch.object(LaunchGraph, "on_device", on_device):
             simulation = gpu_cases.simulation("dam-break", self.device, n)
-            for count in (10, 20):  # until it moves, and what is timed
+            for count in (10, 20):  # steps until it moves, and timed steps
                 wp.synchronize()
                 start = time.perf_counter()
                 for _ in range(count):

@@ -59,7 +59,7 @@ def methods(device: str) -> Arrays:
     cells[0, 0], cells[2, 3] = wl.AIR, wl.SOLID
     field = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
     for name, cls in METHODS.items():
-        if cls is wl.QuadraticProgram and find_spec("piqp") is None:  # an extra
+        if cls is wl.QuadraticProgram and find_spec("piqp") is None:  # the extra is not installed
             continue
         n = min(getattr(cls, "most_unknowns", 30), 30)
         for family in ("dense", "sparse", "grid") if n == 30 else ("dense",):

@@ -8,7 +8,7 @@ wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of
 a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
 """
 
-from benchmarks import emulated_cuda  # before the package
+from benchmarks import emulated_cuda  # must precede the package
 
 # ruff: isort: split
 

@@ -11,7 +11,7 @@ import importlib
 import sys
 
 if "--rehearse" in sys.argv:
-    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+    importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
 
 # ruff: isort: split
 
@@ -36,9 +36,10 @@ from warp_lcp.kernels.launch_graph import CommandBuffer
 # writes something.
 SIZES, TRIES = 2, 16
 STEPS = 3  # of each scene
-ALLOWED = {"float32": 1e-5, "float64": 1e-12}  # of the largest number that is written, or was there
-ENDLESS = 1e20  # numbers from here on stand for infinity, and are compared each for itself
-ROOM, LINE = 4096, 64  # bytes around a copy, for what is read beyond arrays, and those of alignment
+# Relative to the largest number that is written, or was there before.
+ALLOWED = {"float32": 1e-5, "float64": 1e-12}
+ENDLESS = 1e20  # larger numbers represent infinity, and are compared one by one
+ROOM, LINE = 4096, 64  # bytes around a copy, for reads beyond arrays, and bytes of alignment
 TEMPLATES = (
     "cpu_module_header",
     "cpu_module_template_forward",
@@ -76,7 +77,7 @@ UNORDERED = {
     "warp_lcp.material.ballistic_fragments:unite": ("i", roots),
     "warp_lcp.material.ballistic_fragments:board_kernel": ("i", in_order),
     "warp_lcp.grid.node_distance:claim_groups": ("i", in_order),
-    "warp_lcp.grid.particles:total": ("f", totals),  # on CUDA a thread takes other particles
+    "warp_lcp.grid.particles:total": ("f", totals),  # on CUDA a thread sums other particles
 }
 # Kernels whose float64 numbers are computed from numbers rounded to float32.
 SINGLE = (
@@ -407,7 +408,7 @@ def templates():
 
 @contextlib.contextmanager
 def as_on_cpu(module):
-    """Use the CPU's own form of a module in a `with` block, not the emulated one.
+    """Use a module's own CPU code in a `with` block, not the emulated CUDA code.
 
     Kernels come from Warp's own cache.
     """
@@ -491,7 +492,7 @@ def main():
         ):
             try:
                 work(check.device.alias)
-            except Exception as error:  # what wrong kernels lead to
+            except Exception as error:  # wrong kernels can cause any error
                 broken.append(f"{type(error).__name__}: {error}")
             check.busy = False
     text, wrong = check.found()

@@ -16,7 +16,7 @@ cells: 1.2 us by its counts. Nothing that is newer than those solves has been me
 With --sass, the kernels' machine code is counted instead: see `benchmarks/gpu_counts.py`.
 """
 
-from benchmarks import emulated_cuda, gpu_counts  # before the package
+from benchmarks import emulated_cuda, gpu_counts  # must precede the package
 
 # ruff: isort: split
 
@@ -40,9 +40,9 @@ from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
-SHARE = 0.8  # of the bandwidth of data sheets that streaming kernels reach
+SHARE = 0.8  # share of the data sheets' bandwidth that streaming kernels reach
 RECORDED, LAUNCHED = 6.0, 12.0  # [us] a small launch in a graph, and one from Python
-BARRIER, READBACK = 1.2, 15.0  # [us] a stage of small levels with its barrier; in a cluster .5 more
+BARRIER, READBACK = 1.2, 15.0  # [us] a stage of fused levels with its barrier; in a cluster .5 more
 GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
     "H100 SXM": (3350.0, 16_700.0),
     "H200": (4800.0, 16_700.0),
@@ -51,7 +51,7 @@ GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
 }
 # Float64 instructions a byte of the kernels that have many, see `benchmarks.two_floats`.
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
-STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
+STEPS, HEARD = 10, 5  # steps of the dam break: until it moves, and recorded ones
 SIZES = (128, 256, 512, 1024)
 
 
@@ -239,7 +239,8 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         record_cmd: bool = False,
         **options: Any,
     ) -> Any:
-        arrays = [a for a in inputs if isinstance(a, wp.array)]  # of a kernel that is no pass
+        # Of a Warp kernel without a declaration.
+        arrays = [a for a in inputs if isinstance(a, wp.array)]
         moved = float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays))
         launched = (current[-1] if current else Launched(moved, 0))._replace(name=name_of(kernel))
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)

@@ -17,7 +17,7 @@ import importlib
 import sys
 
 if __name__ == "__main__" and "--rehearse" in sys.argv and "--worker" in sys.argv:
-    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+    importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
 
 # ruff: isort: split
 
@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-ANSWER = "ANSWER "  # begins the line of a worker that has one
+ANSWER = "ANSWER "  # begins a worker's line with an answer
 METHODS = (
     "ProjectedMultigrid",
     "MinimumMapNewton",
@@ -44,9 +44,9 @@ METHODS = (
     "ProjectedSOR",
 )
 SCENES = {"liquid": "dam-break", "sand": "column-collapse", "bodies": "floating-bodies"}
-MOST_ITERATIONS = 200  # of a method: some take thousands
-BEFORE, TIMED = 10, 10  # steps until the material moves, and those that are timed
-SOLVES = 3  # timed, of which the least counts
+MOST_ITERATIONS = 200  # of a method: some need thousands
+BEFORE, TIMED = 10, 10  # steps until the material moves, and timed steps
+SOLVES = 3  # timed solves, of which the fastest counts
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def worker(device: str, sizes: Sizes) -> None:
         kind, name, n = json.loads(line)
         try:
             found = step(name, n, device, sizes) if kind == "step" else solve(name, n, device)
-        except Exception as error:  # what fails is written down, and the next piece of work follows
+        except Exception as error:  # a failure is recorded, and the next piece of work follows
             found = {"error": f"{type(error).__name__}: {error}"[:300]}
         print(f"\n{ANSWER}{json.dumps(found)}", flush=True)
 

@@ -58,7 +58,7 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
     """Assemble PTX to a cubin and return its kernels."""
     ptxas, cuobjdump, nvdisasm = (tool(name) for name in ("ptxas", "cuobjdump", "nvdisasm"))
     assert ptxas and cuobjdump and nvdisasm, tools_missing()
-    text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
+    text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas rejects
     made = subprocess.run(
         [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin],
         input=text,

@@ -21,12 +21,12 @@ from benchmarks.machine_code import Instruction
 
 PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
-MOST = 200_000  # instructions of a lane
+MOST = 200_000  # most instructions of a lane
 PREDICATE = re.compile(r"U?P(\d|T)$")
 NO_VALUE = "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL"
 ATOMIC = "RED REDG ATOMG ATOM"
 IGNORED = frozenset(f"{NO_VALUE} {ATOMIC}".split())
-COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: true of NaN
+COMPARED: dict[str, Callable[[float, float], bool]] = {  # a second letter U: true for NaN
     "LT": lambda a, b: a < b,
     "EQ": lambda a, b: a == b,
     "LE": lambda a, b: a <= b,
@@ -124,11 +124,11 @@ class Lane:
     predicates: dict[str, bool] = field(
         default_factory=lambda: defaultdict(bool, PT=True, UPT=True)
     )
-    count: Counter[int] = field(default_factory=Counter)  # of instructions by address
+    count: Counter[int] = field(default_factory=Counter)  # executions by address of the instruction
     # Each access: instruction, how often it was executed before, address, bytes, whether it is a
     # load.
     accesses: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
-    local: dict[int, int] = field(default_factory=dict)  # memory of its own, by address
+    local: dict[int, int] = field(default_factory=dict)  # local memory, by address
     at: int = 0
 
     def run(self) -> None:
@@ -467,7 +467,7 @@ class Lane:
         a, b = self._int(o[2]), self._int(o[3])
         a, b = (a, b) if "U32" in m else (_signed(a), _signed(b))
         result = COMPARED[kind](a, b)
-        if "EX" in m:  # the upper halves of two numbers; the predicate is of the lower ones
+        if "EX" in m:  # the upper halves of two numbers; the predicate is that of the lower ones
             low = self._predicate(o[5])
             result = low if a == b and kind != "NE" else (result or low) if kind == "NE" else result
         self._set_both(m, o, result)

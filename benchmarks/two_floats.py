@@ -354,7 +354,7 @@ def count(module: str, kind: str, stored: str) -> list[int]:
 
 
 def instructions() -> None:
-    """Print instruction counts and times of the solver's passes and the evaluations."""
+    """Print instruction counts and times of the solver's kernels and the evaluations."""
     made = {
         name: next(m for m in user_modules if m.startswith(f"warp_lcp.projected_multigrid.{name}."))
         for name in BYTES

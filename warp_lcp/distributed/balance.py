@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # Fixed cost of a step, as the work of cells full of material.
 STEP = 1 << 13
-BLOCKS = 128  # of a rank, five along an axis
-ROUNDS = 4  # over the axes: each leaves the busiest rank no more to do than before
+BLOCKS = 128  # blocks of a rank, five along an axis
+ROUNDS = 4  # sweeps over the axes: none of them increases the work of the busiest rank
 
 Parts = list[list[int]]  # cells of each box along x, y, z
 

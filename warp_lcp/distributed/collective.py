@@ -90,7 +90,7 @@ class Collective:
         self.failed: list[int] = []
         self.watchdog: Watchdog | None = None
         self._depth = 0
-        self._told: BaseException | None = None  # what a block has raised on all ranks
+        self._told: BaseException | None = None  # exception that a block has raised on all ranks
 
     @classmethod
     def of_one(cls) -> Collective:
@@ -155,7 +155,7 @@ class Collective:
         self._told = error
         fresh = [(rank, other) for rank, other in failed if not other.told]
         if failure is not None and (failure.told or not fresh):
-            return  # the error goes on as it is
+            return  # the exception is raised unchanged
         if error is not None and failure is not None and not failure.planned:
             error.add_note(f"on rank {self.ranks.rank} of {self.ranks.size}")
             return

@@ -12,7 +12,7 @@ import scipy.sparse.csgraph
 
 from warp_lcp.distributed.ranks import Ranks
 
-GROUND = 0  # what holds a component, among the nodes of the graph
+GROUND = 0  # node of the graph that stands for all supports
 
 
 def nodes_of(ranks: Ranks, counts: np.ndarray) -> tuple[int, int]:

@@ -91,7 +91,7 @@ class Decomposition:
         other = Decomposition(
             self.counts, self.ranks, processes=(px, py, pz), cuts=cuts, periodic=self.periodic
         )
-        other.collective = self.collective  # a communicator of its own for each would use them up
+        other.collective = self.collective  # MPI would run out of communicators if each had its own
         return other
 
     cut_anew = renamed_method("cut_anew", repartition)

@@ -33,7 +33,8 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
         if not any(sides):
             continue
         host, others = field.numpy(), tuple(n for n in range(3) if n != 2 - axis)
-        if max(host.max(), -host.min()) * (dt / part.grid.spacing) <= most:  # usual, and cheap
+        # The usual case, and cheap.
+        if max(host.max(), -host.min()) * (dt / part.grid.spacing) <= most:
             continue
         way = np.maximum(host.max(axis=others), -host.min(axis=others)) * (dt / part.grid.spacing)
         face = np.arange(len(way))
@@ -56,7 +57,7 @@ class Refill:
 
     def __init__(self, part: Subdomain) -> None:
         self._part = part
-        self._right: dict[int, int] = {}  # layers that are right, by the field's address
+        self._right: dict[int, int] = {}  # number of correct layers, by the field's address
 
     def __call__(self, marks: wp.array, field: wp.array) -> None:
         """Count a layer of a component; collective.

@@ -17,7 +17,7 @@ from warp_lcp.grid.staggered import Window
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-ALONE = -1  # of a cell that belongs to nothing
+ALONE = -1  # a cell that belongs to no body
 Plane = tuple[tuple[slice, ...], np.ndarray]  # cells, and their nodes
 
 

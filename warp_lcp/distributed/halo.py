@@ -78,7 +78,7 @@ class Halo:
 
     def coarser(self, factors: tuple[int, int, int]) -> Halo | None:
         """Return the halo of aggregates of cells along x, y, z; None if one is cut."""
-        if factors not in self._coarser:  # solves on the same boxes share what it takes to exchange
+        if factors not in self._coarser:  # solves on the same boxes share the exchanges
             decomposition = self.decomposition.coarser(factors)
             self._coarser[factors] = (
                 None if decomposition is None else Halo(decomposition, self.width)

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 # Seconds that a wait polls: between two operations ranks rarely differ by more.
 AWAKE = 1e-3
-SHARE = 1 / 16  # of a wait's length so far, which a rank that has nothing to do sleeps at a time
-LONGEST = 5e-3  # seconds of such a sleep
+SHARE = 1 / 16  # length of a sleep of a waiting rank, relative to its wait so far
+LONGEST = 5e-3  # longest sleep [s]
 
 
 class InterruptibleWait:
@@ -59,7 +59,7 @@ class InterruptibleWait:
         self._count += 1
 
 
-waiting = InterruptibleWait()  # MPI's world is one a process, and its main thread alone is in it
+waiting = InterruptibleWait()  # MPI's world is one per process, and only its main thread uses MPI
 
 
 def finish(request: Any, seconds: float = math.inf) -> bool:

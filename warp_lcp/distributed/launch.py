@@ -30,8 +30,9 @@ OPEN_MPI = {
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
     "OMPI_MCA_hwloc_base_binding_policy": "none",
-    "OMPI_MCA_mpi_yield_when_idle": "1",  # a rank that waits gives its core to others
-    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",  # the same of Open MPI 5
+    "OMPI_MCA_mpi_yield_when_idle": "1",  # a waiting rank yields its core to others
+    # The option for oversubscription in Open MPI 5.
+    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
     "PRTE_MCA_hwloc_default_binding_policy": "none",
 }
 # A rank has one core, not all of the machine.

@@ -30,7 +30,7 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
     """
     mine, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
 
-    def gives(giver: int, taker: int) -> bool:  # particles move on to their rank when a step begins
+    def gives(giver: int, taker: int) -> bool:  # particles migrate when a step begins
         return now.decomposition.meet(old[giver].grown(before.layers), new[taker])
 
     others = [

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
 REACH = 1  # cells from a box within which particles touch its faces and cells
-ENDLESS = 1e30  # a coordinate beyond all
+ENDLESS = 1e30  # a coordinate beyond all others
 COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept")
-PLACE_WORDS, COLUMN_WORDS = 2, 3  # of 4 bytes, of a particle in a message
+PLACE_WORDS, COLUMN_WORDS = 2, 3  # words of 4 bytes, of a particle in a message
 KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (
     KERNELS[f"warp_lcp.distributed.particles.{name}"]
@@ -90,7 +90,8 @@ class ParticleMessages:
         self._end = beyond(part.decomposition.counts, part.grid.spacing)
         self._ends = self._take_boxes()
         self._copies: dict[str, wp.array[Any]] = {}
-        copied = particles.grid.device.is_cuda  # others in each run
+        # Columns of a GPU are copied to new arrays in each run.
+        copied = particles.grid.device.is_cuda
         launches = (
             self._launch_packing,
             self._launch_unpacking,

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 # Position relative to a box: in it and away from its cuts, within reach of them, beyond them.
 INNER, BORDER, OUTSIDE = 0, 1, 2
 WHERE = KERNELS["warp_lcp.distributed.particles.where"]
-ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
+ROOM = 1.25  # storage relative to the particles at the start: ghosts come before the first step
 
 
 class ParticleMigration(ParticleExchange):
@@ -52,7 +52,7 @@ class ParticleMigration(ParticleExchange):
         self._places, self._placed = Buffer(wp.int64), 0
         self._counts: list[int] = []
         self._expected = 0
-        self._added = 0  # by this rank since the last totals
+        self._added = 0  # particles added by this rank since the last totals
         self.move_to(part)
 
     def move_to(self, part: Subdomain) -> None:  # type: ignore[override]
@@ -63,7 +63,7 @@ class ParticleMigration(ParticleExchange):
         self.part, decomposition, around = part, part.decomposition, part.box.grown(REACH)
         # Indices of this rank's own particles, or how many of the first; None: all.
         self._own: np.ndarray | int | None = None
-        self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
+        self._lying: PlaceOrder | None = None  # order of this rank's particles; None: not known
         self._neighbors = [
             r
             for r, box in enumerate(decomposition.boxes)

@@ -53,11 +53,11 @@ class VectorCopies:
     def __init__(self, stencil: PaddedStencil, comm: Any) -> None:
         self.stencil, self.comm, self.device = stencil, comm, stencil.device
         self._n = math.prod(stencil.padding.counts)
-        self.sizes = self._n, None  # PETSc adds the ranks' up
+        self.sizes = self._n, None  # PETSc computes the sum over ranks
         counts = stencil.padding.counts
         dense = Rows.strided(self._n, self.device, (0, counts[1] * counts[2], counts[2]), counts)
         self._rows = Rows.of(stencil.padding, self.device).beside(dense, (1, 1, 1))
-        staged = self.device.is_cuda  # PETSc's vectors are the host's
+        staged = self.device.is_cuda  # PETSc's vectors are in host memory
         self._staging = (
             [wp.zeros(self._n, dtype=wp.float64, device=self.device) for _ in range(2)]
             if staged
@@ -77,7 +77,7 @@ class VectorCopies:
 
         Ghost cells keep their values.
         """
-        values = v.getArray(readonly=True)  # PETSc counts accesses: it ends with the array
+        values = v.getArray(readonly=True)  # PETSc counts accesses: this one ends with the array
         ENTER.bind(
             self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale
         ).launch()

@@ -35,7 +35,7 @@ from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
 
 DEFAULT_BALANCE = Balance()
-MOST_KEPT = 32  # exchanges of fields that are filled again and again
+MOST_KEPT = 32  # most cached exchanges
 # Ghost layers. Whether liquid is held can depend on a closed face up to 4.8 cells away.
 LAYERS = 5
 
@@ -150,7 +150,7 @@ class Subdomain(GridPart):
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         self._trees: TreesAtCuts | None = None
-        self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # by the layers around the box
+        self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # key: layers around the box
         for axis in decomposition.cut_axes:
             least, most = (
                 min(decomposition.parts[axis]),
@@ -550,7 +550,7 @@ class Subdomain(GridPart):
 
         Ghost cells get the values of the ranks that own them.
         """
-        if x.dtype is not wp.float64:  # of a method in single precision
+        if x.dtype is not wp.float64:  # result of a method in single precision
             convert(x.flatten(), spare.flatten())
             x = spare
         nx, ny, nz = self.box.counts

@@ -21,8 +21,8 @@ from warp_lcp.distributed.interruptible_wait import InterruptibleWait, waiting
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.atomic import SUFFIX, open_in_place
 
-LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
-BEATS = 20  # of the thread within the limit; it looks at the clock no more often
+LIMIT = 600.0  # seconds: compilation of kernels and the largest frames take less
+BEATS = 20  # heartbeats within the limit, which is checked as often
 LONGEST_BEAT = 30.0  # seconds
 # Beats, and seconds, after which a rank without a new heartbeat counts as dead: stopped, or its
 # machine has failed.
@@ -34,7 +34,7 @@ FIRST = 5
 # Seconds that it may take to end all ranks. After them this rank ends itself, which mpiexec
 # notices.
 GRACE = 5.0
-ROOM = 512  # bytes of a post: written over in place, which a full disk allows
+ROOM = 512  # bytes of a heartbeat: overwritten in place, which works on a full disk
 OWN = "warp_lcp."
 # Modules that wait on behalf of their callers.
 PASSING = {
@@ -81,7 +81,8 @@ class HeartbeatTable:
         """Write a heartbeat."""
         line = (json.dumps({**asdict(post), "place": post.place[: ROOM // 2]}) + "\n").encode()
         descriptor = open_in_place(self.path(rank), os.O_WRONLY | os.O_CREAT, 0o600)
-        with open(descriptor, "wb") as file:  # closed each time: that is when other machines see it
+        # The file is closed each time, so that other machines see the change.
+        with open(descriptor, "wb") as file:
             file.write(line.ljust(ROOM))
 
     def read(self, rank: int) -> HeartbeatMessages | None:
@@ -153,7 +154,7 @@ class Watchdog:
     ) -> None:
         self._over.set()
         if self._thread.is_alive():
-            self._thread.join(1.0)  # not longer: a file system may hang
+            self._thread.join(1.0)  # a limited wait: the file system may hang
         self._board.clear([self._ranks.rank])
 
     def post_in(self, folder: Path) -> None:
@@ -210,7 +211,7 @@ class Watchdog:
             post = self._board.read(rank)
             first, last, age = self._seen.get(rank, (post, post, 0))
             if post and first and post.count != first.count:
-                first = post  # it goes on
+                first = post  # the rank makes progress
             age = 0 if post and last and post.beat != last.beat else age + 1
             self._seen[rank] = first or post, post or last, age
             posts[rank] = None if age > patience else post or last
@@ -231,7 +232,7 @@ def verdict(posts: Mapping[int, HeartbeatMessages | None]) -> str:
     outside = {rank: post for rank, post in sorted(posts.items()) if post and not post.name}
     silent = sorted(rank for rank, post in posts.items() if post is None)
     if not inside and not silent:
-        return ""  # all compute
+        return ""  # all ranks compute
     waits = _grouped({rank: f"{post.name} ({post.place})" for rank, post in inside.items()})
     if not outside and not silent:
         return f"all ranks wait for each other in different operations: {waits}"

@@ -57,7 +57,7 @@ def project_module(name: str) -> Any:
     `wp.config.cpu_compiler_flags` as it is when a kernel of the module is declared.
     """
     flags = wp.config.cpu_compiler_flags
-    words = ["-march=native" if flags is None else flags, HEADER_FLAGS]  # what Warp takes for None
+    words = ["-march=native" if flags is None else flags, HEADER_FLAGS]  # Warp's default
     options: dict[str, Any] = {}
     if ".".join(wp.__version__.split(".")[:2]) in TRIED_VERSIONS:
         options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)

@@ -348,7 +348,7 @@ class DeviceGraph(CommandBuffer):
 
         The first run launches kernel by kernel, which loads the kernels.
         """
-        settle(self)  # whose buffer is still to be read
+        settle(self)  # in case its buffer is still queued
         if self._buffer is not None:
             self._refresh()
         if not waits(self):

@@ -22,7 +22,7 @@ Array = Any  # a numpy array or a wp.array
 # Elements of a flat field that a CPU thread takes: its operands stay in the L2 cache between fused
 # loops.
 CPU_CHUNK = 8192
-LARGE = 1 << 20  # elements from which a field of the CPU is looked through for what of it is in use
+LARGE = 1 << 20  # elements from which the part of a CPU field in use is searched for
 # Page sizes in bytes: the system allocates a page when something in it is first written.
 HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12
 
@@ -162,7 +162,8 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
     Raises:
         ValueError: a value is NaN or infinite, or becomes so.
     """
-    largest = max(-float(values.min(initial=0.0)), float(values.max(initial=0.0)))  # NaN if one is
+    # NaN if any value is.
+    largest = max(-float(values.min(initial=0.0)), float(values.max(initial=0.0)))
     if not np.isfinite(largest):
         raise ValueError(f"{name} holds a value that is not finite")
     if largest > float(np.finfo(wp.dtype_to_numpy(dtype)).max):
@@ -193,7 +194,7 @@ def relative_rounding(values: np.ndarray, dtype: Any) -> float:
     """
     if dtype is wp.float64 or values.dtype == wp.dtype_to_numpy(dtype):
         return 0.0
-    with np.errstate(invalid="ignore"):  # 0 / 0, which fmax passes over
+    with np.errstate(invalid="ignore"):  # 0 / 0 is NaN, which fmax ignores
         ratio = np.asarray(
             np.divide(values.astype(wp.dtype_to_numpy(dtype)), values, dtype=np.float64)
         )

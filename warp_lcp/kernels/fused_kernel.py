@@ -8,7 +8,7 @@ from warp_lcp.kernels.layout import copy_of, put
 from warp_lcp.kernels.stencil_kernel import BoundKernel, StencilKernel
 from warp_lcp.kernels.thread_pool import CELLS, SLABS, Operation, get_threads, team
 
-LARGEST = 4  # passes of a wave
+LARGEST = 4  # most stages
 # Least size of fused kernels' slabs: adjacent slabs finish shared planes together.
 SLAB_PIECES, SLAB_PLANES = 4, 8
 

@@ -27,7 +27,7 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 if TYPE_CHECKING:
     from warp_lcp.kernels.device_graph import DeviceGraph
 
-MOST_SEQUENCES = 64  # that are remembered
+MOST_SEQUENCES = 64  # sequences that are remembered
 # The device is idle after these functions.
 WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
 # Functions of Warp that give work to a device or wait for it, and the modules where callers look
@@ -66,8 +66,8 @@ SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
 class _Waiting(threading.local):
     """Queue of this thread's stretches, in the order of launching."""
 
-    depth = 0  # of `joined`
-    idle = True  # whether the device has done all that this thread has launched
+    depth = 0  # nesting of `joined`
+    idle = True  # whether the device has finished all launches of this thread
 
     def __init__(self) -> None:
         self.programs: list[DeviceGraph] = []

@@ -116,7 +116,7 @@ class _Declaration:
         if not self._compute[0]:
             raise self._wrong("compute", "needs a type")
         self.constants = dict(self._constant(word) for word in self._words("constants"))
-        for word in self._compute:  # so that a wrong role is found, whichever type is chosen
+        for word in self._compute:  # a wrong role is reported for every choice of the type
             self._roles(self._type("compute", word))
 
     def make(self, module: str, compute: Any, constants: Mapping[str, float]) -> StencilKernel:

@@ -37,15 +37,17 @@ C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 # Types of fields that quads keep in registers.
 LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)
 POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
-Quads = tuple[Alignment, Alignment]  # of fields of passes by quads, and of those of the other level
+# Alignments of the fields of quad kernels, and of those of the other level.
+Quads = tuple[Alignment, Alignment]
 QUADS = ANYWHERE, ANYWHERE
 # Threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most.
 BLOCKS_OF_QUADS = 256, 2
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
-PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
+PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as formats of `struct`
 SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
-NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
+# Bounds that are the same everywhere, infinite ones too; else "coded", "fields".
+NUMBERS = "numbers"
 # Stencils: with one weight an axis, with arrays of weights, or with a product in their place.
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"
 
@@ -79,7 +81,7 @@ def form_of(
 
 TOGETHER: dict[
     str, list["StencilKernel"]
-] = {}  # passes by the Warp module in which they are compiled
+] = {}  # declarations by the Warp module in which they are compiled
 
 
 def make_kernels_of_module(
@@ -136,7 +138,7 @@ class KernelVariant:
         )
         self._chosen = tuple(sorted(letters.items())), tuple(constants.items()), shape, bounds
         self.pattern = pattern = shape if isinstance(shape, Pattern) else None
-        self.joins = bool(d.module) and pattern is None  # the module of other passes
+        self.joins = bool(d.module) and pattern is None  # shares a module with other kernels
         shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         self.words = d.words(letters, constants, shape, bounds) + words_of(quads)
@@ -517,7 +519,8 @@ class KernelVariant:
         alone.__name__ = alone.__qualname__ = self.name
         if self.quads:
             return forward_kernel(module=run.module.name, launch_bounds=BLOCKS_OF_QUADS)(alone)
-        if touch is not None:  # the caller's function may need what the project's flags leave out
+        # The caller's function may need features that the project's flags leave out.
+        if touch is not None:
             return wp.kernel(enable_backward=False, module=run.module.name)(alone)
         return forward_kernel(module=run.module.name)(alone)
 

@@ -391,7 +391,7 @@ class CommandBuffer:
         self._stretches: list[Callable[[], object]] | None = None
         # Launch functions of loops' graphs, by the address of the condition.
         self._loops: dict[int, Callable[[], object]] = {}
-        self._native: bool | None = None  # None: not known
+        self._native: bool | None = None  # None: not determined yet
 
     def __len__(self) -> int:
         """Return the number of launches."""
@@ -484,7 +484,7 @@ class CommandBuffer:
         elif self._loops_here():
             self._loop(condition)
         elif self.device.is_cuda and loops_on_device(self.device) and not self._has_tasks:
-            wp.capture_if(condition, self._run_in_time)  # launch by launch, which loads the kernels
+            wp.capture_if(condition, self._run_in_time)  # single launches, which load the kernels
             if self._runs:
                 self._loop(condition)
         else:
@@ -584,7 +584,7 @@ def _identity(argument: Any) -> Hashable:
     return getattr(argument, "identity", argument)
 
 
-MOST_RECORDED = 32  # sequences of a graph
+MOST_RECORDED = 32  # recordings of a graph
 
 
 class NotRecordable(Exception):
@@ -646,7 +646,7 @@ class LaunchGraph:
             if len(self._programs) >= MOST_RECORDED:
                 self._programs.clear()
             program = self._recorded(arguments)
-            if program is None:  # on CUDA
+            if program is None:  # a CUDA graph cannot hold it
                 self.at_once = True
                 self._record(*arguments)
                 return

@@ -19,8 +19,9 @@ import warp as wp
 from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
-BY_QUADS = os.environ.get("WARP_LCP_QUADS") != "0"  # else a cell: to compare the two on a GPU
-CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
+# Otherwise single cells, to compare both on a GPU.
+BY_QUADS = os.environ.get("WARP_LCP_QUADS") != "0"
+CUDA_THREADS = 1 << 16  # threads of a flat reduction, several times those of a large GPU
 # Planes that a thread sums over. On CUDA, partial sums of every cell would take more memory than
 # the rest of a method.
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
@@ -78,7 +79,7 @@ class RowLayout:
     s1: wp.int64  # elements from plane to plane
     s2: wp.int64  # elements from row to row
     nx: int  # cells of a row
-    rows: int  # of a plane
+    rows: int  # rows of a plane
     planes: int
     grain: int  # cells that a thread takes
     chunks: int  # threads of a row
@@ -86,11 +87,11 @@ class RowLayout:
     # For fields of three planes: planes before the first that they keep as well, that of ghosts, or
     # none.
     turn: int
-    lift: int  # the plane at which they begin, counted from the first
+    lift: int  # first of those planes, counted from the first plane
     # For such fields: planes of a slab. Each slab has three planes of its own, apart from the next
     # slab's.
     cut: int
-    slabs: int  # their number
+    slabs: int  # number of slabs
     apart: int  # planes on either side of a cut that keep a place of their own
     # First cell (even, for `pairs`) and one past the last of each row (k, j) with unknowns; null:
     # all.
@@ -103,9 +104,9 @@ class RowLayout:
     o0: wp.int64
     o1: wp.int64
     o2: wp.int64
-    n1: int  # its planes, its rows
+    n1: int  # planes and rows of the other level
     n2: int
-    fx: int  # cells of it that one of ours stands for; below 0: of ours that one of its stands for
+    fx: int  # its cells for each cell of ours; negative: our cells for each of its cells
     fy: int
     fz: int
 
@@ -167,7 +168,7 @@ def put(struct: Any, members: Mapping[str, Any]) -> Any:
                 if hasattr(value, "__ctype__")
                 else getattr(value, "value", value),
             )
-    struct.__dict__.update(members)  # keeps the memory
+    struct.__dict__.update(members)  # keeps the arrays alive
     return struct
 
 

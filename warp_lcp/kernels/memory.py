@@ -44,7 +44,7 @@ class Scalar:
     __slots__ = ("_cells", "_scaled", "_value")
 
     def __init__(self, value: float = 0) -> None:
-        self._cells: dict[Any, Any] = {}  # the number in each type that kernels take it in
+        self._cells: dict[Any, Any] = {}  # the number in each type that kernels use
         self._scaled: dict[float, Scalar] = {}
         self._value = value
 
@@ -97,7 +97,7 @@ class Slot:
         self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
         self.address = ctypes.addressof(self._memory)
         self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
-        self._held: Any = None  # the store that `point_to_first` has been given last
+        self._held: Any = None  # the last store passed to `point_to_first`
 
     def point_to(self, array: wp.array[Any]) -> None:
         """Make recorded launches use this array from now on."""

@@ -20,11 +20,11 @@ from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
 from warp_lcp.kernels.layout import RowLayout, make_struct, threads
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 
-CUDA_THREADS = 512  # of a block that inverts a matrix
-THREADS = 256  # of a block that works through passes: with 512 they spill registers
-BLOCKS = 8  # of a cluster: as many as every GPU with clusters has
-CLUSTERED = 90  # the least architecture that has them
-MOST = 5  # forms
+CUDA_THREADS = 512  # threads of a block that inverts a matrix
+THREADS = 256  # threads of a block that executes kernels: with 512 they spill registers
+BLOCKS = 8  # blocks of a cluster: every GPU with clusters has as many
+CLUSTERED = 90  # least architecture with clusters
+MOST = 5  # most variants
 
 
 @wp.struct
@@ -111,7 +111,7 @@ class PersistentKernel:
             inputs = [self.tables, 0, len(self._stages), self.threads]
             launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
             return
-        made: dict[int, Any] = {}  # what the team does of a pass that comes again
+        made: dict[int, Any] = {}  # operations of the thread pool for repeated kernels
         for stage in self._stages:
             key = id(stage)
             if key not in made:

@@ -14,8 +14,8 @@ import warp as wp
 
 from warp_lcp.kernels.fields import zeros
 
-BYTES = 1 << 15  # of a board: as long under way as eight
-LINE = 64  # bytes that no two readings share
+BYTES = 1 << 15  # of a buffer: its transfer takes as long as that of eight bytes
+LINE = 64  # bytes of a cache line, which no two readings share
 
 
 class DeviceScalar:
@@ -31,7 +31,7 @@ class DeviceScalar:
     """
 
     _board: ReadbackBuffer | None
-    _view: np.ndarray  # of an array that the host reads as it is
+    _view: np.ndarray  # view of an array in host memory
 
     def __init__(self, device: wp.Device, count: int = 1, dtype: Any = wp.float64) -> None:
         self.array: wp.array[Any]
@@ -72,7 +72,7 @@ class ReadbackBuffer:
     def __init__(self, device: wp.Device, size: int = BYTES) -> None:
         self.memory = wp.zeros(-(-size // LINE) * LINE, dtype=wp.uint8, device=device)
         self._host, self._end, self._changes, self._known = np.zeros(0, dtype=np.uint8), 0, 0, 0
-        self._free: dict[int, list[int]] = {}  # places by their size
+        self._free: dict[int, list[int]] = {}  # free places by their size
 
     def take(self, size: int) -> int | None:
         """Allocate so many bytes and return their place; None if there is no room."""
@@ -82,7 +82,7 @@ class ReadbackBuffer:
         if self._end + size > self.memory.size:
             return None
         self._end += size
-        self._known = -1  # what has been fetched is too short
+        self._known = -1  # the fetched copy is too short
         return self._end - size
 
     def give_back(self, place: int, size: int) -> None:
@@ -101,7 +101,7 @@ class ReadbackBuffer:
         return self._host
 
 
-_boards: dict[str, ReadbackBuffer] = {}  # the newest of each device
+_boards: dict[str, ReadbackBuffer] = {}  # the newest buffer of each device
 
 
 def place_of(device: wp.Device, size: int) -> tuple[ReadbackBuffer, int]:
@@ -109,9 +109,9 @@ def place_of(device: wp.Device, size: int) -> tuple[ReadbackBuffer, int]:
     board = _boards.get(device.alias) or _boards.setdefault(device.alias, ReadbackBuffer(device))
     place = board.take(size)
     if place is None:
-        gc.collect()  # readings that only a circle of references still holds
+        gc.collect()  # frees readings that only reference cycles hold
         place = board.take(size)
-    if place is None:  # the old one stays as long as its readings do
+    if place is None:  # the old buffer lives as long as its readings
         board = _boards[device.alias] = ReadbackBuffer(device, max(size, BYTES))
         place = board.take(size)
         assert place is not None

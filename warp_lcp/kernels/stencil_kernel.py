@@ -34,7 +34,7 @@ from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar
 from warp_lcp.kernels.native import sections
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 
-BLOCK_BYTES = 16  # that a thread loads at a time
+BLOCK_BYTES = 16  # bytes that a thread loads at a time
 # Fields of one element a row that row functions only set, or find set: several threads may do so.
 FLAGGED = ("changed", "away")
 # Names that this package uses itself.
@@ -512,7 +512,7 @@ class StencilKernel:
                 f"{self.label}: fields have the shapes {', '.join(map(str, sorted(shapes)))}"
             )
         for shape in shapes:
-            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
+            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # a list has one dimension
             if not self.listed and (rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i):
                 raise ValueError(
                     f"{self.label}: fields have the shape {shape}, the box ends at {rows.ends}"

@@ -35,12 +35,13 @@ MOST_THREADS = 1024
 PATIENCE = 50_000_000
 # Least cells of a usual kernel in a piece: a microsecond or more; to take a piece costs 0.1.
 CELLS = 4096
-PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
+# Pieces of a thread's share of a kernel: more of them shorten the wait for the last thread.
+PIECES = 12
 # Spins of an idle thread before it yields its core, 25 ns each: with a core of its own, without.
 SPINS = 10000, 2000
-COPIED = 1 << 18  # bytes that a thread copies at least
-ROOM = 4096  # bytes of the arguments of what can be cut
-RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
+COPIED = 1 << 18  # least bytes that a thread copies
+ROOM = 4096  # most bytes of the arguments of a kernel that is cut
+RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like the constants below
 ALONE, TASKS, SLABS, COPY = range(4)
 DONE_ALONE, SHARED, RESUMED = 0, 1, 2
 TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
@@ -53,8 +54,8 @@ TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
     8,
 )
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
-WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
-MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are kept
+WITHIN, BETWEEN = 1, 2  # state of an unfinished table: within a run, between two
+MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are cached
 # Formats of `struct`.
 FORMATS = {
     wp.float32: "f",
@@ -66,7 +67,8 @@ FORMATS = {
     wp.bool: "?",
     bool: "?",
 }
-MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
+# Words of the objects that these functions initialize.
+MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}
 LOCKS = (
     "pthread_mutex_lock",
     "pthread_mutex_unlock",
@@ -345,7 +347,7 @@ class OperationTable:
         )
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
-        self.asked: Arguments | None = None  # of the last team of one thread
+        self.asked: Arguments | None = None  # arguments of the last pool of one thread
 
 
 class ThreadPool:
@@ -368,7 +370,7 @@ class ThreadPool:
         self.words[IDLE_SPINS] = SPINS[size > available_threads()]
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
-        self.shared_time = 0.0  # seconds that callers have spent in what the team shared
+        self.shared_time = 0.0  # seconds of calls that the worker threads took part in
         self._workers = [
             threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)
         ]
@@ -392,10 +394,10 @@ class ThreadPool:
         asked = Arguments(self.address, table.address, RUN, 0, share, patience(table))
         try:
             self._do(asked)
-            while unfinished := table.words[UNFINISHED]:  # the interpreter has looked after signals
+            while unfinished := table.words[UNFINISHED]:  # the interpreter has handled signals
                 if table.again is not None:
                     check_time()
-                    for check in table.checks:  # what has failed may keep the loop from ending
+                    for check in table.checks:  # a failure may keep the loop from ending
                         check()
                 asked.share = share + (RESUMED if unfinished == WITHIN else 0)
                 asked.limit = patience(table)
@@ -414,13 +416,13 @@ class ThreadPool:
     def _run_alone(self, table: OperationTable) -> None:
         """Execute a table on the caller's thread."""
         asked = table.asked
-        if asked is None or asked.team != self.address:  # of another team, which is gone
+        if asked is None or asked.team != self.address:  # of another pool, which was freed
             asked = table.asked = Arguments(
                 self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE
             )
         try:
             self._do(asked)
-            while table.words[UNFINISHED]:  # the interpreter has looked after signals
+            while table.words[UNFINISHED]:  # the interpreter has handled signals
                 self._do(Arguments(self.address, table.address, RUN, 0, RESUMED, PATIENCE))
         except BaseException:
             self._do(Arguments(self.address, table.address, CANCEL))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 CUDA_BLOCK = 256  # threads that add up partial sums
-CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
+CUDA_SEGMENTS = 256  # blocks of the first stage of a sum of very many numbers
 KERNELS = KernelFile(Path(__file__).parent / "headers/vectors.h")
 DOT = KERNELS["vectors.dot"]
 ADD = KERNELS["vectors.add"]
@@ -215,7 +215,7 @@ class Reduction:
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = launch_now) -> None:
         """Sum the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         device = self.partials.device
-        if device.is_cpu:  # Warp's tiles are not for several threads at a time
+        if device.is_cpu:  # Warp's tiles do not support several CPU threads
             rows = Rows.flat(columns, device)
             ADD_UP.bind(
                 rows, partials=self.partials, count=self.threads, scalars=self.scalars, slot=slot

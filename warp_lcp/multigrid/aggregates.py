@@ -111,7 +111,7 @@ def settle_kernel(
 # best of 1, 1.4 and 1.8 with 2 and 3 coarse cycles, for obstacles under diffusion and convection on
 # 257^2 cells, by Newton's steps after 4 cycles.
 ALPHA = wp.float64(1.4)
-GAMMA = 3  # coarse cycles a level: aggregates of 5 to 9 unknowns leave room for them
+GAMMA = 3  # coarse cycles a level: they are cheap, as aggregates have 5 to 9 unknowns
 # Unknowns of the coarsest level, and the largest share of unknowns that a level may keep.
 COARSEST, STALL = 64, 0.7
 # The most pairs of sweeps of the coarsest level, and the part of the first change at which they
@@ -359,7 +359,7 @@ def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
 
 
 STRONG = 0.25  # entries from this share of a row's largest on are strong: PyAMG's own choice
-LEAST = 4  # fine unknowns a coarse one: two splits of a five-point stencil leave an eighth
+LEAST = 4  # fine unknowns for a coarse one: two splits of a five-point stencil leave an eighth
 SPLIT_KEEPS = 0.9  # the largest share of the unknowns that a split may keep
 
 

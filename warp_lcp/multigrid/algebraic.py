@@ -42,7 +42,7 @@ MULTIPLY = KERNELS["algebraic.multiply"]
 INVERSE = KERNELS["algebraic.inverse"]
 SMOOTH = KERNELS["algebraic.smooth"]
 REMAINDER = KERNELS["algebraic.remainder"]
-WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
+WIDEST = np.iinfo(np.uint16).max  # most entries of a row whose positions are stored
 Matrix = Any  # a scipy.sparse.csr_array
 
 
@@ -318,7 +318,7 @@ class AlgebraicHierarchy:
         They multiply by the inverse, or sweep where the level is too large for that.
         """
         last, weights = self.levels[-1], self.settings.weights
-        if not self.inverts:  # forth and back, so that the whole is symmetric
+        if not self.inverts:  # forward and backward, so that the solver is symmetric
             pairs = range(self.settings.last_sweeps)
             return [
                 s

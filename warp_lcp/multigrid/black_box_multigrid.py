@@ -42,7 +42,7 @@ RESIDUAL = KERNELS["lines.residual"]
 DOWN = KERNELS["lines.down"]
 UP = KERNELS["lines.up"]
 ZERO = KERNELS["lines.zero"]
-SHORT = 3  # cells of an axis that is not coarsened any more
+SHORT = 3  # cells of an axis that is not coarsened further
 # Columns that one thread of a CPU solves together: their cells of a row are vectors, and the rows
 # stay in its cache.
 COLUMNS = 256

@@ -103,7 +103,7 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         at = element(L, r)
         if S.d[at] != d_type(0):
             matrix[r, r] = S.unit * wp.float64(S.d[at])
-            axes = int(3)  # no constant, for which Warp would write the loop out
+            axes = int(3)  # no constant: Warp would unroll the loop
             for axis in range(axes):
                 below = beside(L, periodic, r, axis, -1)
                 if below >= 0:
@@ -191,7 +191,7 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         t = wp.tid()
         m = inverse.shape[0]
         for r in range(t, m, threads):
-            if m % 2 == 0:  # after m steps to and fro the result is to lie in `inverse`
+            if m % 2 == 0:  # after m steps back and forth the result must be in `inverse`
                 assemble(S, L, periodic, r, inverse)
             else:
                 assemble(S, L, periodic, r, other)

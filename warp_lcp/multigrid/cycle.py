@@ -104,9 +104,9 @@ class Cycle:
                 coarse, projected=self.projected, from_zero=from_zero and visit == 0
             )
             if self.projected:
-                yield from fine.coarsen_bounds(coarse)  # 3
-            yield from self.stages(depth + 1, visits=coarse.visits)  # 4
-            yield from fine.ascend(coarse, projected=self.projected)  # 5, 6
+                yield from fine.coarsen_bounds(coarse)  # step 3
+            yield from self.stages(depth + 1, visits=coarse.visits)  # step 4
+            yield from fine.ascend(coarse, projected=self.projected)  # steps 5, 6
 
 
 def recorded(device: wp.Device, stages: Iterable[CycleStage]) -> CommandBuffer:

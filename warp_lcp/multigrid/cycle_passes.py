@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_lcp.kernels import FusedKernel, KernelFile
 
-UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections are of order one
+UNBOUNDED = 1e30  # represents an infinite bound of a correction; corrections are of order one
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/cycle.h")
 LEVELS = KernelFile(Path(__file__).parent / "headers/coarsen.h")

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from warp_lcp.multigrid.stencil_level import StencilLevel
 
 Corner = list[int]  # k, j, i
-GATHERED = 32_768  # cells at which a level is gathered: exchanges would take as long as its cells
+# Cells at which a level is gathered: exchanges would take as long as its computations.
+GATHERED = 32_768
 # Distance from a cut within which cells are corrected ahead: two cells are swept, the third is next
 # to them, and the fourth is the other one of its aggregate.
 BESIDE = 4
@@ -155,9 +156,9 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
     """
     s, near, scale = level.stencil, level.near, level.settings.over_correction
     assert s.ghosts is not None
-    if not coarse.gathered:  # then its ghost cells have been taken with its part
+    if not coarse.gathered:  # a gathered level's ghost cells are set with its part
         yield from coarse.stencil.fillings(coarse.x)
-    for axis, end in s.ghosts.cuts:  # those of x are filled since the restriction
+    for axis, end in s.ghosts.cuts:  # those of x have been filled since the restriction
         ours, theirs = (
             Rows.beyond(v.stencil.padding, s.device, axis, end) for v in (level, coarse)
         )

@@ -23,8 +23,8 @@ Strength = list[float]  # mean weights along x, y and z, in units of the largest
 # Ratios of weights that differ by this factor between places, or from the mean weights', need a
 # hierarchy of their own.
 TURN = 10.0
-SHARE = 0.01  # of the sampled blocks that must do so
-LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
+SHARE = 0.01  # least share of the sampled blocks with such ratios
+LEAST = 1e-6  # least weight that counts, relative to a block's largest
 # Cells of a block along each long axis: 64 faces an axis, whose mean noise does not look like a
 # change of direction.
 EDGES = {2: 8, 3: 4}
@@ -183,7 +183,8 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     least = LEAST * faces.max(axis=(1, 2), keepdims=True)
     totals = np.log(np.where(faces > 0, np.maximum(faces, least), 1.0)).sum(axis=2)
     counts = np.count_nonzero(faces, axis=2)
-    counted = (2 * counts >= sides[1])[:, long].all(axis=1)  # few open faces tell nothing
+    # Blocks with few open faces are not representative.
+    counted = (2 * counts >= sides[1])[:, long].all(axis=1)
     return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
 
 

@@ -75,7 +75,7 @@ class StencilLevel:
         # visited more often.
         self.visits, self.shrunk = 1, 1.0
         rows = stencil.padding.counts[:2]
-        self.changed = zeros(rows, wp.uint8, stencil.device)  # rows, since the last rebuild
+        self.changed = zeros(rows, wp.uint8, stencil.device)  # rows changed since the last rebuild
         self.changed.fill_(1)
         # Spans that the fields' contents have.
         self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)
@@ -183,7 +183,8 @@ class StencilLevel:
             lower=lower,
             upper=upper,
         )
-        return self._once((coarse, projected, id(rows)), make)  # which keeps the rows
+        # The kernel keeps the rows alive, so that their id stays unique.
+        return self._once((coarse, projected, id(rows)), make)
 
     def filling(self, name: str) -> list[BoundKernel | Task]:
         """Return the exchange that fills the ghost cells of x or t."""
