@@ -104,7 +104,11 @@ class Load:
     def _along(self, axis: int, cut: Parts) -> tuple[float, list[int]] | None:
         """Return the optimal cuts along an axis, and the work of the busiest rank.
 
-        The cuts along the other axes are fixed. Returns None if the boxes do not fit.
+        The cuts along the other axes are fixed. Returns None if the boxes do not fit. The method is
+        dynamic programming. w(a, e) is the work of the busiest box between the block boundaries a
+        and e. The least work of the busiest box, with k boxes along the axis up to e, is
+
+            W_1(e) = w(0, e),   W_k(e) = min over a of max(W_(k-1)(a), w(a, e))
         """
         n, ranks, others = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
         ends = np.append(np.arange(0, n, self.edge), n)

@@ -40,9 +40,15 @@ def restrict_kernel(
     high: f64,
     e: f64,
 ):
-    """Restrict y to an aggregate: its sum, the correction's bounds and start.
+    """Restrict the residual and the bounds to an aggregate j.
 
-    The bounds are the narrowest of the members' gaps over `factor`; the correction begins at 0.
+    With the members i of the aggregate and the over-correction `factor`:
+
+        b_j = sum of y_i
+        low_j = max of (lower_i - x_i) / factor,   high_j = min of (upper_i - x_i) / factor
+        e_j = 0
+
+    Rounding must not move low_j above 0 or high_j below it.
     """
     j = wp.tid()
     total, least, most = wp.float64(0.0), wp.float64(-wp.inf), wp.float64(wp.inf)
@@ -60,9 +66,9 @@ def restrict_kernel(
 @no_type_check
 @forward_kernel(module="warp_lcp.aggregates")
 def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f64, x: f64):
-    """Add `factor` times its aggregate's correction to each unknown, projected.
+    """Correct each unknown: x_i <- clip(x_i + factor e_j, lower_i, upper_i).
 
-    Unknowns of no aggregate keep their values.
+    j is the aggregate of i. Unknowns of no aggregate keep their values.
     """
     i = wp.tid()
     j = owner[i]
@@ -84,9 +90,13 @@ def settle_kernel(
     enough: wp.float64,
     x: f64,
 ):
-    """Sweep a small level forward and backward with one thread, until it converges.
+    """Solve a small problem with bounds by projected Gauss-Seidel, with one thread.
 
-    It stops when the largest change is small beside the first one.
+    Sweeps go forward and backward over the unknowns:
+
+        x_i <- clip(x_i - (A x + b)_i / a_ii, lower_i, upper_i)
+
+    They stop when the largest change of a pair is at most `enough` times that of the first pair.
     """
     n = x.shape[0]
     first, change = wp.float64(0.0), wp.float64(1.0)

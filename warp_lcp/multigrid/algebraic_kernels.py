@@ -53,8 +53,13 @@ def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATR
 def factor_kernel(matrix: MATRIX, rounding: wp.float64):
     """Factor L U in place without pivoting, by one thread.
 
-    A pivot is zero, or rounding error of a singular component, if its magnitude is below `rounding`
-    times its diagonal. Its unknown is then eliminated, and its pivot set to 0.
+    Step c computes row c of U and column c of L, which has a unit diagonal. With s < c:
+
+        u_cr = a_cr - sum_s l_cs u_sr
+        l_rc = (a_rc - sum_s l_rs u_sc) / u_cc
+
+    A pivot is zero, or rounding error of a singular component, if its magnitude is at most
+    `rounding` times its diagonal. Its unknown is then eliminated, and its pivot set to 0.
     """
     n = matrix.shape[0]
     for c in range(n):
@@ -83,7 +88,8 @@ def factor_kernel(matrix: MATRIX, rounding: wp.float64):
 def invert_kernel(factors: MATRIX, inverse: MATRIX):
     """Compute column c of the inverse from the factors, one thread a column.
 
-    Rows and columns of eliminated unknowns are 0.
+    Forward substitution solves L v = e_c, back substitution U x = v. Rows and columns of eliminated
+    unknowns are 0.
     """
     c = wp.tid()
     n = factors.shape[0]

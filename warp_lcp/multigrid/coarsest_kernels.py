@@ -94,9 +94,10 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def assemble(S: Stencil, L: RowLayout, periodic: wp.vec3i, r: int, matrix: square):
-        """Assemble row r of the dense matrix.
+        """Assemble row r of the dense matrix: a_rr = unit d_r, a_rq = -w for each face.
 
-        A periodic axis of two cells has two faces between them.
+        w is the weight of the face between the unknowns r and q. A periodic axis of two cells has
+        two faces between them, whose weights add up.
         """
         for c in range(matrix.shape[0]):
             matrix[r, c] = wp.float64(0.0)
@@ -124,7 +125,15 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         changed: wp.array2d(dtype=wp.uint8),
         matrix: square,
     ):
-        """Assemble and factor the matrix in place, if any row of cells has changed."""
+        """Assemble and factor the matrix in place, if any row of cells has changed.
+
+        Column by column, in the lower triangle, with s < c:
+
+            d_c = a_cc - sum_s l_cs^2 d_s
+            l_rc = (a_rc - sum_s l_rs l_cs d_s) / d_c
+
+        The diagonal holds D.
+        """
         if none_changed(changed):
             return
         m = matrix.shape[0]
@@ -148,9 +157,14 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def eliminate(least: wp.float64, c: int, t: int, threads: int, old: square, new: square):
-        """Make one step of Gauss-Jordan elimination from `old` to `new`.
+        """Make step c of Gauss-Jordan elimination from `old` to `new`.
 
-        With two arrays no thread reads what another has written since the last barrier.
+        With the pivot p = a_cc:
+
+            a_cc <- 1 / p,   a_cj <- a_cj / p,   a_ic <- -a_ic / p,   a_ij <- a_ij - a_ic a_cj / p
+
+        After all steps the matrix is the inverse. Row and column of a pinned unknown become 0. With
+        two arrays no thread reads what another has written since the last barrier.
         """
         m = old.shape[0]
         pivot = old[c, c]
