@@ -17,10 +17,11 @@ LEAST_RIGHT = 2
 
 
 def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
-    """Return how many cells particles may leave the ghost layers by; 0: none does.
+    """Return the largest displacement [cells] that may leave the ghost layers.
 
-    A particle reads faces up to three quarters of its path from its start, so faces deep in the box
-    may be faster. Values that are not finite are not counted: the particles report them.
+    Returns 0 if no particle can leave them. A particle reads faces up to three quarters of its path
+    from its start, so faces deep in the box may be faster. Values that are not finite are not
+    counted: the particles report them.
 
     Args:
         part: the subdomain of this rank.

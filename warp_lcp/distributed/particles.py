@@ -208,7 +208,7 @@ class ParticleMigration(ParticleExchange):
         self._expected = sum(self._counts)
 
     def appended(self, count: int) -> None:
-        """Give new particles, stored behind the others, the next places."""
+        """Assign the next places to new particles, which are stored behind the others."""
         self.add_places(max(NEW, 1 + int(self.place.max(initial=0))) + np.arange(count))
 
     def add_places(self, places: np.ndarray) -> None:

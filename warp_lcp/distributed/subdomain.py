@@ -307,9 +307,9 @@ class Subdomain(GridPart):
         return Refill(self)
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
-        """Return how many cells velocities move particles out of the ghost layers.
+        """Return the largest displacement in a step that may leave the ghost layers.
 
-        The number is the largest of all ranks for a time step; 0: no particle leaves them.
+        It is the largest of all ranks, in cells; 0: no particle leaves them.
         """
         return float(self.ranks.max(too_far(self, velocity, dt)))
 

@@ -137,7 +137,7 @@ def _made_from_memory(kernel: Any, sized: int) -> Any:
 
 
 class DeviceGraph(CommandBuffer):
-    """Launches recorded once for a CUDA device, whose arguments are patched in each run.
+    """Recorded launches on a CUDA device, whose arguments are patched in each run.
 
     Args:
         device: the device.
@@ -191,7 +191,10 @@ class DeviceGraph(CommandBuffer):
         sized: int,
         extent: Any,
     ) -> None:
-        """Record a launch of a kernel with ranges of tasks; arguments as of `launch_ranges`."""
+        """Record a kernel launch with ranges of tasks.
+
+        Arguments as of `launch_ranges`.
+        """
         if extent is None or not sized:
             self._record_kernel(kernel, dim, inputs, (), 0, sized=0)
             return

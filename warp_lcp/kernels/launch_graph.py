@@ -400,7 +400,10 @@ class CommandBuffer:
     def launch(
         self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
     ) -> None:
-        """Record a launch, and keep its arguments alive; numbers may be `Scalar` on the CPU."""
+        """Record a launch, and keep its arguments alive.
+
+        Numbers may be `Scalar` on the CPU.
+        """
         self._arguments.append(inputs)
         if self.device.is_cuda or team() is None:
             listed = [value_of(v) for v in inputs]
