@@ -22,7 +22,7 @@ class InterruptibleWait:
         native: entries and exits of operations in native code, and the error of the first one that
             has failed, 0 while none has.
 
-    >>> waiting = Waiting()
+    >>> waiting = InterruptibleWait()
     >>> with waiting("a sum"):
     ...     waiting.name, waiting.count
     ('a sum', 1)
