@@ -198,6 +198,7 @@ class Balance:
         # The condition is the same on all ranks.
         if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):
             return None
+        # Each rank searches its share of the box counts; the best result of all ranks counts.
         edge = edge_of_blocks(now.counts, part.ranks.size)
         load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))

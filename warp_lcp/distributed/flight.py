@@ -68,11 +68,13 @@ class TreesAtCuts:
         """
         part, ranks = self._part, self._part.ranks
         planes = self._nodes_at_cuts(seen, *found) if trees else []
+        # Without trees at the cuts of any rank, every body belongs to one rank.
         near = any(bool((nodes > GROUND).any()) for pair in planes for _, nodes in pair)
         everyone = ranks.gather(np.array([trees, near]))
         if not everyone[:, 1].any():
             return BodyNumbers(trees)
         planes = planes or self._nodes_at_cuts(seen, *found)
+        # The nodes of this rank's planes are exchanged; a cell that two ranks know is an edge.
         first, count = nodes_of(ranks, everyone[:, 0])
         grid = np.full(part.grid.shape, ALONE, dtype=np.int32)
         for pair in planes:
@@ -86,6 +88,7 @@ class TreesAtCuts:
             both = np.stack([nodes.ravel(), grid[cells].ravel()], axis=1)
             edges.append(both[(both > ALONE).all(axis=1)])
         component = joined(ranks, count, np.unique(np.concatenate(edges), axis=0))
+        # Bodies of several trees are numbered first, then those that are this rank's alone.
         several = np.bincount(component) > 1
         several[component[GROUND]] = False
         mine, shared = component[first : first + trees], int(several.sum())

@@ -100,15 +100,17 @@ class Halo:
 
         Returns:
             The numbers of the joined components that are held on no rank, int32, flat, from 0, -1
-                elsewhere; None: there are none.
+            elsewhere; None: there are none.
         """
         ranks = self.decomposition.ranks
+        # Nodes of the graph: GROUND for all held components, then the free ones, rank by rank.
         first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
         node = np.where(number >= 0, number + first, np.where(held, GROUND, -1)).astype(np.int32)
         component = joined(ranks, nodes, self._edges(node, faces))
         floating = component != component[GROUND]
         if not floating.any():
             return None
+        # The joined components that are not connected with GROUND are numbered from 0.
         names = np.full(nodes, -1, dtype=np.int32)
         names[floating] = np.unique(component[floating], return_inverse=True)[1]
         return np.where(number >= 0, names[np.maximum(node, 0)], -1).astype(np.int32)
@@ -124,6 +126,7 @@ class Halo:
             for end in (0, -1):
                 grid[(*[slice(None)] * (2 - axis), end, ...)] = -1
         self.fill(grid)
+        # An edge connects a ghost cell below a cut with the first cell of the box above it.
         for axis in self.decomposition.cut_axes:
             lower = [slice(1, -1)] * 3
             lower[2 - axis] = slice(0, 1)

@@ -171,7 +171,7 @@ class ParticleMessages:
 
         Returns:
             The number of this rank's particles, the number with ghosts, and the indices before this
-                rank's end whose particles were replaced.
+            rank's end whose particles were replaced.
         """
         found = self._found.host
         most = int(found[0]) + come

@@ -38,7 +38,7 @@ def take_pieces(
 
     Returns:
         By name: the particles with their `place`, the cells of this rank's box, shape (..., nz, ny,
-            nx), and the numbers that are the same in all pieces.
+        nx), and the numbers that are the same in all pieces.
 
     Raises:
         ValueError: the pieces do not belong to this scene, or do not cover the domain; on all

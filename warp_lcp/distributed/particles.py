@@ -241,6 +241,7 @@ class ParticleMigration(ParticleExchange):
         if ranks.size == 1:
             self._counts, self._expected = [n], before + added
             return own
+        # One message: count, bad values, 7 means times the count, additions; then 7 maxima.
         mine = np.full(18, -np.inf)
         mine[:3], mine[10] = (n, own.bad_positions, own.bad_velocities), added
         mine[3:10] = own.mean_square_speed, *own.center.tolist(), *own.velocity.tolist()

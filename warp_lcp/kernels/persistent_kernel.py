@@ -178,6 +178,7 @@ def _shared(form: KernelVariant | None) -> Any:
 
 @functools.cache
 def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: bool) -> Any:
+    # Warp needs a branch for each variant; unused ones have empty arguments and do nothing.
     (One, first), (Two, second), (Three, third), (Four, fourth), (Five, fifth) = (
         _shared(form) for form in (*forms, *(None,) * (MOST - len(forms)))
     )

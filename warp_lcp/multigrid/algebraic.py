@@ -285,6 +285,8 @@ class AlgebraicHierarchy:
         for depth, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
             P = fine.P
             assert P is not None
+            # The finest P has the rows s_i p_i with s_i = a_ii / (a_ii + D_i), 0 off the free set;
+            # R = P' has the same entries in another order.
             if depth == 0:
                 SCALE_ROWS.bind(
                     P.rows, ptr=P.indptr, a=fine.plain, scale=self.scale, scaled=P.values
@@ -293,11 +295,14 @@ class AlgebraicHierarchy:
                 GATHER.bind(turned, source=P.values, order=fine.turn, taken=fine.R.values).launch(
                     launch
                 )
+            # Galerkin product: first A P, then P' (A P).
             for product in fine.products:
                 product.launch(launch)
+            # Scale of the coarse smoother.
             INVERSE.bind(
                 coarse.A.rows, ptr=coarse.A.indptr, a=coarse.A.values, inverse=coarse.inverse
             ).launch(launch)
+        # The coarsest matrix is expanded, factored and inverted.
         if self.inverts:
             last = self.levels[-1]
             launch(

@@ -124,6 +124,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
     if stencil.weights is None or stencil.pattern is not None:
         return []
     logs = _sampled(stencil)
+    # Ratios of weights along the axes, as differences of logarithms.
     centered = logs - logs.mean(axis=1, keepdims=True)
     if (
         len(logs) == 0
@@ -132,12 +133,14 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
         return []
     long = _long(stencil)
     relative = logs - logs.max(axis=1, keepdims=True)
+    # Blocks are grouped by their strong axes: those within TURN of the strongest one.
     ways, way_of = np.unique(relative > -math.log(TURN), axis=0, return_inverse=True)
     mean, found = np.log(np.maximum(np.array(stencil.mean_weights)[long], 1e-300)), []
     for way in range(len(ways)):
         members = relative[way_of == way]
         if len(members) < SHARE * len(relative):
             continue
+        # A group needs a hierarchy of its own if its ratios differ from those of the mean weights.
         typical = np.median(members, axis=0)
         if _mismatch(typical[None], mean)[0] > math.log(TURN):
             strength = np.full(3, LEAST)
