@@ -7,12 +7,13 @@ barriers. Threads and blocks run in an unusual order (ORDER = forward, reversed,
 `.numpy()` returns a copy, so that writes to it are lost, as on CUDA. Recorded programs launch what
 a graph would hold.
 
-With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels
-whose results depend on it and that are not in `ORDER_MATTERS`. With CELLS=1 every pass by quads of
-cells (`warp_lcp/kernels/headers/quad.h`), which are loaded in blocks where rows allow it, also runs by
-cells, from equal memory: `launched_by_cells` counts such launches, `otherwise` those whose fields
-differ in a bit, or whose sums differ by more than rounding. `meter` counts launches, readbacks and
-allocations, and calls: of Python, to launch, copy or clear, one for a whole graph.
+With COMPARE=1 every launch runs in all three orders from equal memory. `differs` counts the kernels
+whose results depend on the order and that are not in `ORDER_MATTERS`. Kernels by quads of cells
+(`warp_lcp/kernels/headers/quad.h`) load blocks of four cells where rows are aligned. With CELLS=1
+each of them also runs by cells, from equal memory: `launched_by_cells` counts such launches,
+`otherwise` those whose fields differ in a bit, or whose sums differ by more than rounding. `meter`
+counts launches, readbacks and allocations, and calls: of Python, to launch, copy or clear, one for
+a whole graph.
 
 Not emulated: torn interleavings and the memory model (threads run one after another), rules of
 graphs, the order of streams.
@@ -46,8 +47,8 @@ ADDRESS = 0x6F0000000000  # address at which compiled kernels read the order of 
 ORDER_MATTERS = {
     "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
     "warp_lcp.material.ballistic_fragments:unite": "trees differ, their roots do not",
-    "warp_lcp.material.ballistic_fragments:board_kernel": "a list in the order in which threads come; sums over "
-    "it are rounded in that order",
+    "warp_lcp.material.ballistic_fragments:board_kernel": "a list in the order in which threads "
+    "come; sums over it are rounded in that order",
     "warp_lcp.grid.node_distance:claim_groups": "lists of nodes in the order in which threads "
     "come; each node is measured for itself",
     "warp_lcp.grid.transfer_*.scatter.*:scatter": "sums of atomic additions are rounded in their "
@@ -297,14 +298,14 @@ PIECES = ("moved",)  # sums that count pieces of rows; only zero or nonzero is c
 
 
 def checked_by_cells(invoke):
-    """Return a launcher that also runs quad passes by cells and records differences.
+    """Return a launcher that also runs quad kernels by cells and records differences.
 
     Both start from equal memory.
     """
     from warp_lcp.kernels import layout
     from warp_lcp.kernels.kernel_variant import KernelVariant
 
-    forms = {}  # form of each kernel; None if it is no pass by quads
+    forms = {}  # variant of each kernel; None for kernels without quads
 
     def form_of(kernel):
         if kernel not in forms:
@@ -330,7 +331,7 @@ def checked_by_cells(invoke):
         )
         arrays_of(kernel_args, kernel.adj.args[1].type, arrays)
         for address in {kernel_args.out.data} if columns else ():
-            arrays.pop(address, None)  # the two forms have different places of sums
+            arrays.pop(address, None)  # both variants store partial sums in different places
         native, cells = (
             twin.native.from_buffer_copy(bytes(kernel_args)),
             type(rows).from_buffer_copy(rows),
@@ -406,7 +407,10 @@ if COMPARE:
 
 
 def replayed():
-    """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
+    """Replace CUDA graphs by lists of launches that are repeated.
+
+    Call it once the package can be imported. Loops of graphs read their conditions in place.
+    """
     from warp_lcp.kernels import device_graph, host_kernel, layout
     from warp_lcp.kernels import joined_graphs as joined
     from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, Loop

@@ -1,9 +1,10 @@
-"""A verdict on a GPU from one command, in the source tree: `python -m benchmarks.gpu`; one page is left in out/gpu.
+"""Check the library on a GPU and write a report: `python -m benchmarks.gpu`.
 
-What holds on the CPU must hold on the device: equal answers, of each kernel too, the same bits in
-every run, graphs as launches, odd grids, hundreds of steps, memory that stays. Then times, beside
-what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels reach. A claim
-that fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's
+Run it in the source tree; the report is one page in out/gpu. It checks on the device what holds on
+the CPU: equal answers, also of each kernel; the same bits in every run; graphs against single
+launches; odd grids; hundreds of steps; constant memory use. Then it measures times, compares them
+with the estimates of `benchmarks/gpu_model.py`, and reports the share of the memory bandwidth that
+kernels reach. Failed checks are reported as well. `--rehearse` does all of it on the CPU in CUDA's
 form (`benchmarks/emulated_cuda.py`).
 """
 
@@ -11,7 +12,7 @@ import importlib
 import sys
 
 if "--rehearse" in sys.argv:
-    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+    importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
 
 # ruff: isort: split
 
@@ -41,15 +42,15 @@ from warp_lcp.benchmarks.problems import natural, splash
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, loops_on_device
 from warp_lcp.reduced.device_iteration import DeviceIteration
 
-CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
-WRONG = 3  # what `benchmarks.gpu_kernels` ends with where kernels differ
+CLOSE, ALIKE = 1e-5, 2e-2  # relative: for solutions to 1e-8, and for particles after many steps
+WRONG = 3  # exit status of `benchmarks.gpu_kernels` where kernels differ
 CAPTURE_LAUNCH = wp.capture_launch
 ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass
 class Claim:
-    """What was tried: whether it holds, and what was found."""
+    """One check: whether it passed, and its details."""
 
     name: str
     holds: bool
@@ -57,12 +58,12 @@ class Claim:
 
 
 class GpuVerdict:
-    """All claims about a device, as they are tried.
+    """All checks of a device.
 
     Args:
         device: Warp device.
-        rehearsal: whether the device is the CPU in CUDA's form, and everything is small.
-        out: folder of what is left.
+        rehearsal: whether the device is the CPU in CUDA's form, and all problems are small.
+        out: folder of the report.
     """
 
     def __init__(self, device: str, *, rehearsal: bool, out: Path) -> None:
@@ -72,13 +73,17 @@ class GpuVerdict:
         self.steps = 10 if rehearsal else gpu_cases.STEPS
 
     def claim(self, name: str, found: Callable[[], str | None]) -> None:
-        """Try a claim: `found` returns what it saw, or raises AssertionError with what is wrong; None where it cannot be tried."""
+        """Run one check and record its outcome.
+
+        `found` returns the text to report. It raises AssertionError if the check fails, and returns
+        None if the check cannot be made.
+        """
         start = time.perf_counter()
         try:
             text, holds = found(), True
         except AssertionError as error:
             text, holds = str(error), False
-        except Exception as error:  # whatever a strange machine does is what this is to find
+        except Exception as error:  # any failure of an unknown machine is a result
             text, holds = (
                 f"{type(error).__name__}: {error} "
                 f"({traceback.extract_tb(error.__traceback__)[-1].name})",
@@ -91,10 +96,10 @@ class GpuVerdict:
                 "s)",
                 flush=True,
             )
-            self.write()  # whatever ends this process early leaves what has been found
+            self.write()  # the results survive if this process ends early
 
     def all(self) -> None:
-        """Try everything."""
+        """Run all checks."""
         self.claim("answers equal the CPU's", self.agreement)
         self.claim("kernels agree with the CPU's, one by one", self.each_kernel)
         self.claim("residuals by NumPy", self.residuals)
@@ -131,7 +136,10 @@ class GpuVerdict:
         return f"{len(found)} cases, at most {worst:.1g} of what is allowed"
 
     def each_kernel(self) -> str:
-        """Launch each kernel here and there on equal arrays, in a process of its own: what crashes there leaves this page."""
+        """Compare each kernel's results on the device with those on the CPU.
+
+        The comparison runs in a process of its own, so that a crash there does not end the report.
+        """
         command = [
             sys.executable,
             "-m",
@@ -151,7 +159,7 @@ class GpuVerdict:
         return said
 
     def residuals(self) -> str:
-        """Evaluate residuals of a splash by no code of the solvers."""
+        """Evaluate residuals of a splash in NumPy, without code of the solvers."""
         scene, n = splash(32 if self.rehearsal else 128), 32 if self.rehearsal else 128
         problem = scene.lcp("walls", device=self.device)
         result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-7))
@@ -166,7 +174,7 @@ class GpuVerdict:
         return f"{end / start:.1e} of the start's at {n}^3 in {result.iterations} iterations"
 
     def repeats(self) -> str:
-        """Solve and step twice."""
+        """Solve and step twice; compare the bits."""
         first, second = (gpu_cases.large(self.device, 32) for _ in range(2))
         other = [name for name, x in first.items() if not np.array_equal(x, second[name])]
         for name in ("dam-break", "column-collapse-2d"):
@@ -183,7 +191,7 @@ class GpuVerdict:
         return f"{len(first)} solves and {self.steps} steps of two scenes"
 
     def graphs(self) -> str:
-        """Solve with launches one by one."""
+        """Solve with single launches; compare the bits with those of graphs."""
         recorded = gpu_cases.large(self.device, 32)
         with (
             mock.patch.object(CommandBuffer, "_captured", lambda _, commands: list(commands)),
@@ -195,7 +203,7 @@ class GpuVerdict:
         return f"{len(alone)} solves, bit for bit"
 
     def step_graphs(self) -> str:
-        """Step scenes with `LaunchGraph.on_device`, and without."""
+        """Step scenes with `LaunchGraph.on_device` and without; compare the bits."""
         other, names = [], ("dam-break", "column-collapse-2d")
         for name in names:
             taken = []
@@ -210,7 +218,10 @@ class GpuVerdict:
         return f"{self.steps} steps of {' and '.join(names)}, bit for bit"
 
     def ahead(self) -> str | None:
-        """Solve, and step a liquid, with the host's judgment after each step."""
+        """Solve, and step a liquid, with convergence tests on the host; compare the bits.
+
+        By default the tests run on the device.
+        """
         if not loops_on_device(wp.get_device(self.device)):
             return None
 
@@ -226,7 +237,10 @@ class GpuVerdict:
         return f"{len(found) - 2} solves and {self.steps} steps of a liquid, bit for bit"
 
     def waiting(self) -> str | None:
-        """Count what the host reads in steps of a liquid whose particles are not moved apart."""
+        """Count the readbacks in steps of a liquid.
+
+        Steps with a density correction are left out.
+        """
         if not loops_on_device(wp.get_device(self.device)):
             return None
         simulation, counts = gpu_cases.simulation("dam-break", self.device), []
@@ -237,12 +251,12 @@ class GpuVerdict:
                 read.reset_mock()
                 row = simulation.step(min(simulation.stable_dt(), gpu_cases.DT))
                 counts += [] if row.get("density_status") else [read.call_count]
-        # the first steps load kernels
+        # The first steps load kernels.
         assert max(counts[2:]) <= 2, f"up to {max(counts[2:])} times"
         return f"{len(counts) - 2} steps"
 
     def empty(self) -> str:
-        """Give problems without an unknown."""
+        """Check that problems without unknowns are rejected."""
         for shape in ((3, 3), (4, 5, 6)):
             try:
                 wl.LCP(wl.GridPoisson(np.full(shape, wl.AIR), device=self.device), np.zeros(shape))
@@ -252,7 +266,7 @@ class GpuVerdict:
         return "2-D and 3-D"
 
     def memory(self) -> str | None:
-        """Step a liquid, and look at the memory in use after half of the steps and after all."""
+        """Step a liquid; compare the memory in use after half of the steps and after all."""
         if self.rehearsal:
             return None
         used = []
@@ -290,12 +304,12 @@ class GpuVerdict:
         return "memcheck"
 
     def times(self) -> str:
-        """Time cold solves and steps, and put them beside the model's tables."""
+        """Time cold solves and steps; compare them with the model's tables."""
         rows, steps = [], []
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
             problem, method = splash(n).lcp("walls", device=self.device), wl.ProjectedMultigrid()
             workspace, taken = method.init(problem), []
-            for _ in range(4):  # the first loads kernels and captures graphs
+            for _ in range(4):  # the first one loads kernels and captures graphs
                 wp.synchronize()
                 start = time.perf_counter()
                 result = wl.solve(
@@ -350,10 +364,13 @@ class GpuVerdict:
         )
 
     def _step_time(self, n: int, *, on_device: bool) -> float:
-        """Return the time of a step of the dam break [s], with `LaunchGraph.on_device` or without."""
+        """Return the time of a dam break step [s], by CUDA graphs or single launches.
+
+        `LaunchGraph.on_device` selects graphs.
+        """
         with mock.patch.object(LaunchGraph, "on_device", on_device):
             simulation = gpu_cases.simulation("dam-break", self.device, n)
-            for count in (10, 20):  # until it moves, and what is timed
+            for count in (10, 20):  # steps until it moves, and timed steps
                 wp.synchronize()
                 start = time.perf_counter()
                 for _ in range(count):
@@ -362,7 +379,7 @@ class GpuVerdict:
         return (time.perf_counter() - start) / count
 
     def bandwidth(self) -> str:
-        """Measure the kernels on the finest grid against copying."""
+        """Measure the bandwidth of the kernels on the finest grid."""
         n = 16 if self.rehearsal else 256
         found = kernels.measure(
             Options(self.device, (n,), 1 if self.rehearsal else 5, lambda _: None), self.out
@@ -372,11 +389,11 @@ class GpuVerdict:
 
     @functools.cached_property
     def machine(self) -> BenchmarkRecord:
-        """The device and its machine."""
+        """Record of the device and its machine."""
         return machine(self.device, elements=1 << 20)
 
     def write(self) -> None:
-        """Leave the page, and the file to send in."""
+        """Write the report, and the file of results."""
         rows = [["PASS" if c.holds else "FAIL", c.name, c.found] for c in self.claims]
         tables = [RecordTable("Claims", ["", "claim", "found"], rows), *self.tables]
         record = self.machine
@@ -400,7 +417,10 @@ class GpuVerdict:
 
 
 def launched(graph: Any) -> None:
-    """Launch what a graph would hold; one that loops on the device stays a graph."""
+    """Launch the commands of a graph.
+
+    A graph that loops on the device stays a graph.
+    """
     if isinstance(graph, list):
         for command in graph:
             command.launch()
@@ -409,7 +429,7 @@ def launched(graph: Any) -> None:
 
 
 def main() -> int:
-    """Try everything; return 1 if a claim fails, 2 if there is no device."""
+    """Run all checks; return 1 if one fails, 2 if there is no device."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

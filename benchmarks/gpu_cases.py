@@ -1,4 +1,7 @@
-"""What must come out alike on every device: `python -m benchmarks.gpu_cases FILE [DEVICE]` writes it down."""
+"""Results that must be equal on every device, written to a file.
+
+Run `python -m benchmarks.gpu_cases FILE [DEVICE]`.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,10 @@ Arrays = dict[str, np.ndarray]
 
 
 def obstacle(shape: tuple[int, ...], device: str, *, periodic: bool = False) -> wl.LCP:
-    """Return a problem with AIR, SOLID and bounds on a grid of any shape, the same on every device."""
+    """Return a problem with AIR, SOLID and bounds on a grid of any shape.
+
+    It is the same on every device.
+    """
     rng = np.random.default_rng(sum(shape))
     cells = rng.choice([wl.FLUID, wl.FLUID, wl.FLUID, wl.AIR, wl.SOLID], shape)
     cells.flat[0] = wl.FLUID
@@ -53,7 +59,7 @@ def methods(device: str) -> Arrays:
     cells[0, 0], cells[2, 3] = wl.AIR, wl.SOLID
     field = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
     for name, cls in METHODS.items():
-        if cls is wl.QuadraticProgram and find_spec("piqp") is None:  # an extra
+        if cls is wl.QuadraticProgram and find_spec("piqp") is None:  # the extra is not installed
             continue
         n = min(getattr(cls, "most_unknowns", 30), 30)
         for family in ("dense", "sparse", "grid") if n == 30 else ("dense",):
@@ -111,7 +117,10 @@ def states(name: str, device: str, steps: int = STEPS) -> Iterator[Arrays]:
 
 
 def moments(device: str, steps: int = STEPS) -> Arrays:
-    """Return number, center, spread and mean speed of the particles of scenes after some steps."""
+    """Return number, center, spread and mean speed of scenes' particles.
+
+    They are those after some steps.
+    """
     found = {}
     for name in SCENES:
         *_, last = states(name, device, steps)
@@ -123,7 +132,7 @@ def moments(device: str, steps: int = STEPS) -> Arrays:
 
 
 def everything(device: str, steps: int = STEPS) -> Arrays:
-    """Return all that is compared."""
+    """Return the results of all cases."""
     return methods(device) | shapes(device) | large(device) | moments(device, steps)
 
 

@@ -1,14 +1,14 @@
-"""What the passes of a solve cost a GPU, counted on the host: instructions, registers, and the limit that holds each of them.
+"""Instruction counts of a solve's kernels on a GPU, and the limit of each kernel.
 
-The passes over the finest grid are heard in CUDA's form (`benchmarks/emulated_cuda.py`), compiled
-for sm_90, and one warp of each is executed on the memory that the solve has left
-(`benchmarks/machine_counts.py`). A pass takes as long as the slowest of: its instructions at one a
-clock and scheduler; those in float64 at their rate; wavefronts of the L1 cache at one a clock; the
-bytes of its fields at `SHARE` of the bandwidth; and a latency of memory for each plane of a thread,
-as often as the multiprocessors are filled.
+The counts are made on the host. The kernels over the finest grid are recorded in CUDA's form
+(`benchmarks/emulated_cuda.py`) and compiled for sm_90, and one warp of each is executed on the
+memory that the solve has left (`benchmarks/machine_counts.py`). A kernel takes as long as the
+slowest of: its instructions at one a clock and scheduler; those in float64 at their rate;
+wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of the bandwidth; and
+a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
 """
 
-from benchmarks import emulated_cuda  # before the package
+from benchmarks import emulated_cuda  # must precede the package
 
 # ruff: isort: split
 
@@ -37,7 +37,7 @@ assert emulated_cuda
 
 SHAPE = (36, 12, 128)  # planes, rows, cells of a row: a warp's quads fill one
 BLOCK, SCHEDULERS, WARP = 256, 4, 32
-# of the bandwidth that streaming kernels reach; clocks of a load from memory
+# Share of the bandwidth that streaming kernels reach; clocks of a load from memory.
 SHARE, LATENCY = 0.8, 800
 AREAS = (
     "cycle.",
@@ -52,7 +52,11 @@ AREAS = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU: multiprocessors, clock [GHz], bandwidth [GB/s], float64 instructions of a warp a clock, warps, of each multiprocessor."""
+    """Rates and sizes of a GPU.
+
+    Multiprocessors, clock [GHz], bandwidth [GB/s]; of each multiprocessor: float64 instructions of
+    a warp a clock, and warps.
+    """
 
     processors: int
     clock: float
@@ -66,13 +70,13 @@ GPUS = {"H200": Gpu(132, 1.98, 4800.0, 2.0, 64), "RTX 4090": Gpu(128, 2.52, 1008
 
 @dataclass(frozen=True)
 class InstructionCount:
-    """What a warp of a pass issues, and what the pass needs.
+    """Instructions that a warp of a kernel issues, and the kernel's resources.
 
     Attributes:
-        name: of the pass, with types.
+        name: of the kernel, with types.
         issued: of a warp.
-        cells: that a thread takes, of the finer level of a transfer.
-        planes: one after another, of these.
+        cells: of a thread, of the finer level of a transfer.
+        planes: consecutive planes of these cells.
         registers: of a thread.
         bytes: of a cell, of the fields that are read and of those that are written.
         spilled: bytes of registers that a thread keeps in memory.
@@ -93,17 +97,17 @@ class InstructionCount:
 
     @property
     def key(self) -> str:
-        """Name without how threads take cells."""
+        """Name without the way in which threads share the cells."""
         return key(self.name)
 
     def resident(self, gpu: Gpu) -> int:
-        """Return the warps that a multiprocessor holds."""
+        """Return the number of warps that a multiprocessor holds."""
         taken = max(-(-self.registers // 8) * 8, 16) * BLOCK
         return min(65536 // taken * BLOCK // WARP, gpu.warps // (BLOCK // WARP) * (BLOCK // WARP))
 
     def limits(self, gpu: Gpu, cells: int) -> dict[str, float]:
-        """Return the least time [ms] of a pass over so many cells by each limit."""
-        # of all multiprocessors in 1 ms
+        """Return the least time [ms] of a kernel over some cells, by each limit."""
+        # Warps, and clocks of all multiprocessors in 1 ms.
         warps, clocks = cells / WARP / self.cells, gpu.processors * gpu.clock * 1e6
         turns = math.ceil(warps / (gpu.processors * self.resident(gpu)))
         return {
@@ -116,19 +120,28 @@ class InstructionCount:
 
 
 def key(name: str) -> str:
-    """Return the name of a pass without how threads take cells: the same on small grids and large."""
+    """Return the name of a kernel, the same for small and large grids.
+
+    How threads share the cells is left out of it.
+    """
     return " ".join(
         word for word in name.split() if not re.fullmatch(r"quads|(at|of)\d(or\d)?", word)
     )
 
 
 def kinds(given: dict[str, Any]) -> str:
-    """Return what of a pass's arguments decides how much it does, as an end of its name."""
+    """Return the suffix of a kernel's name for its arguments.
+
+    It tells apart arguments that change the amount of work.
+    """
     return "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
 
 
 def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
-    """Return the passes over the finest grid that solves of a full basin bind, as CUDA launches them on large grids, by name."""
+    """Return the kernels over the finest grid in solves of a full basin, by name.
+
+    They are bound as CUDA launches them on large grids.
+    """
     cells = np.full(SHAPE, wl.FLUID, dtype=np.int8)
     cells[-1] = wl.AIR
     wall = np.zeros(SHAPE, dtype=bool)
@@ -168,7 +181,7 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
     with many, mock.patch.object(StencilKernel, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
         lower = np.where(wall, 0.0, -np.inf)
-        # fields of weights, as coarser levels have
+        # Fields of weights, as coarser levels have.
         faces = np.full((*SHAPE[:2], SHAPE[2] + 1), 0.5)
         multigrid, newton = wl.ProjectedMultigrid(), wl.MinimumMapNewton()
         for method, least, face_x in (
@@ -195,17 +208,22 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
 
 
 def cells_of(bound: BoundKernel) -> int:
-    """Return how many cells, or entries of a list, a pass visits; with ghosts those of the larger grid of a transfer."""
+    """Return the number of cells, or list entries, that a kernel visits.
+
+    Ghost cells count; of a transfer, those of the finer grid.
+    """
     rows, L = bound.rows, bound.layout
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
 def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> InstructionCount:
-    """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
+    """Compile a kernel for CUDA, execute one warp, and return its counts.
+
+    The warp is in the middle of the grid.
 
     Raises:
         NotImplementedError: it has an instruction that `benchmarks.machine_thread` does not know.
-        KeyError: it reads what is not among its fields.
+        KeyError: it reads memory outside its fields.
     """
     form, rows = one.bound.form, one.bound.layout
     kernel = _compiled(form, folder)
@@ -213,7 +231,7 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Instruc
     dim = (slabs * lines * chunks,) if form.quads else (slabs, lines, chunks)
     bounds = struct.pack(f"<{len(dim)}I4xQQ", *dim, math.prod(dim), 1)
     parameters = bounds + bytes(rows.__ctype__()) + one.bound.arguments
-    # of the threads of a row within the second slab
+    # Threads of a row within the second slab.
     first = (min(1, slabs - 1) * lines + lines // 2) * chunks
     taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[
         : min(WARP, chunks)
@@ -254,7 +272,7 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Instruc
 
 
 def _compiled(form: Any, folder: Path) -> Kernel:
-    """Return the kernel of a pass, compiled for sm_90."""
+    """Return a kernel compiled for sm_90."""
     kernel, place = form.kernel, folder / form.kernel.module.name
     if not place.exists():
         kernel.module.options["block_dim"] = BLOCK
@@ -269,7 +287,7 @@ def _compiled(form: Any, folder: Path) -> Kernel:
 
 
 def counts(words: tuple[str, ...] = AREAS) -> Iterator[InstructionCount]:
-    """Count the passes whose names begin with one of some words."""
+    """Count the kernels whose names begin with one of some words."""
     if missing := tools_missing():
         raise SystemExit(f"{', '.join(missing)}: not installed: pip install 'warp-lcp[ptxas]'")
     with tempfile.TemporaryDirectory() as folder:
@@ -282,7 +300,7 @@ def counts(words: tuple[str, ...] = AREAS) -> Iterator[InstructionCount]:
 
 
 def table(found: Iterable[InstructionCount], n: int) -> Iterator[str]:
-    """Yield the lines of a table of passes, with times over n^3 cells."""
+    """Yield the lines of a table of kernels, with times over n^3 cells."""
     times = " | ".join(f"{name} ms | limit" for name in GPUS)
     yield (
         "| pass | issued a cell | loads | stores | L1 wavefronts | bytes | registers | warps | "

@@ -1,16 +1,17 @@
 # mypy: ignore-errors
-"""Kernels of a device against the same on the CPU, one by one: `python -m benchmarks.gpu_kernels [DEVICE]`, in the source tree.
+"""Comparison of each kernel on a device with the same kernel on the CPU.
 
-While solves and steps run, each kernel is launched once more on the CPU, with copies of all arrays
-as they were before, and what both have written is compared. With `--rehearse` the device is the CPU
-in CUDA's form and another order of threads, against the CPU's own form.
+Run `python -m benchmarks.gpu_kernels [DEVICE]` in the source tree. While solves and steps run, each
+kernel is launched once more on the CPU, with copies of all arrays from before the launch, and the
+results of both are compared. With `--rehearse` the device is the CPU in CUDA's form with another
+order of threads, against the CPU's own form.
 """
 
 import importlib
 import sys
 
 if "--rehearse" in sys.argv:
-    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+    importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
 
 # ruff: isort: split
 
@@ -31,12 +32,14 @@ from warp._src.types import array_t, launch_bounds_t
 from warp_lcp.benchmarks import gpu_cases
 from warp_lcp.kernels.launch_graph import CommandBuffer
 
-# of each form of a kernel: two sizes, and of each the first launch of sixteen that writes something
+# Comparisons of each variant of a kernel: two sizes, and of each the first launch of sixteen that
+# writes something.
 SIZES, TRIES = 2, 16
 STEPS = 3  # of each scene
-ALLOWED = {"float32": 1e-5, "float64": 1e-12}  # of the largest number that is written, or was there
-ENDLESS = 1e20  # numbers from here on stand for infinity, and are compared each for itself
-ROOM, LINE = 4096, 64  # bytes around a copy, for what is read beyond arrays, and those of alignment
+# Relative to the largest number that is written, or was there before.
+ALLOWED = {"float32": 1e-5, "float64": 1e-12}
+ENDLESS = 1e20  # larger numbers represent infinity, and are compared one by one
+ROOM, LINE = 4096, 64  # bytes around a copy, for reads beyond arrays, and bytes of alignment
 TEMPLATES = (
     "cpu_module_header",
     "cpu_module_template_forward",
@@ -57,26 +60,26 @@ def roots(parents, _):
 
 
 def in_order(numbers, _):
-    """Return lists whose entries stand in the order in which threads came."""
+    """Return the sorted entries of lists that depend on the order of threads."""
     return np.sort(numbers)
 
 
 def totals(numbers, threads):
-    """Return what nine sums and seven maxima of each thread come to."""
+    """Return the totals of nine sums and seven maxima of each thread."""
     columns = numbers[: 16 * threads].reshape(16, threads)
     return np.concatenate([columns[:9].sum(axis=1), columns[9:].max(axis=1)])
 
 
-# Kernels (module:name) of which integers (i) or floats (f) depend on the order of threads, or on
-# how many there are, and what does not
+# Kernels (module:name) whose integers (i) or floats (f) depend on the order or number of threads,
+# and a function of them that does not.
 UNORDERED = {
     "warp_lcp.components.unite.*:unite": ("i", roots),
     "warp_lcp.material.ballistic_fragments:unite": ("i", roots),
     "warp_lcp.material.ballistic_fragments:board_kernel": ("i", in_order),
     "warp_lcp.grid.node_distance:claim_groups": ("i", in_order),
-    "warp_lcp.grid.particles:total": ("f", totals),  # on CUDA a thread takes other particles
+    "warp_lcp.grid.particles:total": ("f", totals),  # on CUDA a thread sums other particles
 }
-# those whose numbers in float64 come of what is rounded to float32
+# Kernels whose float64 numbers are computed from numbers rounded to float32.
 SINGLE = (
     "warp_lcp.projected_multigrid.measure.*_float32:*",
     "*conjugate_gradient.update.float32:*",
@@ -88,21 +91,24 @@ SINGLE = (
     "granular.stress_*",
     "granular.report*",
 )
-# a hundred times as much is allowed: what one stage rounds, others compute with
+# The tolerance is a hundred times as large: rounding errors of a stage are amplified by later ones.
 MANY_STAGES = ("warp_lcp.small_levels.*",)
-# x less its last step, from 0 nothing but rounding: what counts is how large x is
+# x less its last step is rounding error from x = 0: the error is relative to the size of x.
 CANCEL = ("warp_lcp.projected_multigrid.undo.*",)
-# on a CPU one adds all, see `particles.h`
+# On a CPU one thread adds all, see `particles.h`.
 ONE_THREAD = ("warp_lcp.grid.transfer_*.scatter.*", "warp_lcp.grid.density.scatter_density.*")
 
 
 def among(name, patterns):
-    """Return whether a kernel is one of those."""
+    """Return whether a kernel's name matches one of some patterns."""
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def arrays_in(given):
-    """Yield the arrays of parameters, those in structs too, with the types of their elements and their bytes."""
+    """Yield the arrays of parameters, element types and sizes in bytes.
+
+    Arrays in structs count as well.
+    """
     for value, kind in given:
         if isinstance(value, array_t):
             shape, strides = value.shape[: value.ndim], value.strides[: value.ndim]
@@ -117,7 +123,7 @@ def arrays_in(given):
 
 
 def members(memory, table, dtype):
-    """Return the structs of a table, with their type; none where it has others."""
+    """Return the structs of a table with their type; [] for other tables."""
     if not isinstance(dtype, codegen.Struct):
         return []
     assert table.ndim == 1, "tables of structs are lists"
@@ -128,14 +134,14 @@ def members(memory, table, dtype):
 
 
 def has_handle(kind):
-    """Return whether a parameter has a number such as Warp's meshes have."""
+    """Return whether a parameter holds a handle, such as that of a mesh of Warp."""
     return kind is wp.uint64 or (
         isinstance(kind, codegen.Struct) and any(has_handle(var.type) for var in kind.vars.values())
     )
 
 
 def native(kind):
-    """Return the type that C has of a parameter."""
+    """Return the C type of a parameter."""
     if isinstance(kind, codegen.Struct):
         return kind.ctype
     return (
@@ -148,10 +154,12 @@ def native(kind):
 
 
 class Copies:
-    """The arrays of a launch on the CPU, which overlap as they do on the device.
+    """Copies of the arrays of a launch on the CPU.
+
+    They overlap as the arrays on the device do.
 
     Args:
-        device: where they are.
+        device: of the arrays.
         given: parameters, with their types (updated: addresses become those of the copies).
     """
 
@@ -167,11 +175,14 @@ class Copies:
         self._move(given)
 
     def there(self):
-        """Return what is on the device now."""
+        """Return the present contents of the device's arrays."""
         return [self._read(begin, len(copy)) for begin, copy in self.blocks]
 
     def views(self, blocks):
-        """Return the numbers of each array, in blocks such as `before`; structs have addresses."""
+        """Return the numbers of each array, from blocks such as `before`.
+
+        Arrays of structs hold addresses and are left out.
+        """
         found = []
         for address, size, dtype in self.arrays:
             if not isinstance(dtype, codegen.Struct):
@@ -218,7 +229,7 @@ class Copies:
 
 
 class KernelCheck:
-    """Compares launches, and counts them.
+    """Comparison of launches, with counts.
 
     Args:
         device: Warp device.
@@ -236,7 +247,10 @@ class KernelCheck:
         self._here, self.busy = {}, False
 
     def launch(self, kernel, addresses, run):
-        """Launch a kernel, whose bounds and arguments are at addresses, by `run`, and compare where that is still to be done."""
+        """Launch a kernel by `run`, and compare it if it is still to be compared.
+
+        The launch bounds and arguments are at the addresses.
+        """
         name, kinds = f"{kernel.module.name}:{kernel.key}", [arg.type for arg in kernel.adj.args]
         types = [type(launch_bounds_t((1,) * kernel.adj.kernel_dim)), *map(native, kinds)]
         bounds, *values = (
@@ -263,7 +277,10 @@ class KernelCheck:
         return done
 
     def _launch_here(self, kernel, name, bounds, values):
-        """Launch on the CPU; a kernel of blocks that is told how many threads one has is told that it has one."""
+        """Launch a kernel on the CPU.
+
+        A kernel of blocks that takes the number of threads of a block gets 1.
+        """
         labels = [arg.label for arg in kernel.adj.args]
         if "threads" in labels:
             threads = values[labels.index("threads")]
@@ -278,7 +295,7 @@ class KernelCheck:
         INVOKE(kernel, self._here[kernel][1], [bounds, *values], False)
 
     def _compare(self, name, threads, copies):
-        """Compare what was written, and return whether anything was."""
+        """Compare the results, and return whether the kernel wrote anything."""
         arrays, blocks = (
             self.arrays,
             (copies.before, [copy for _, copy in copies.blocks], copies.there()),
@@ -313,7 +330,7 @@ class KernelCheck:
         return self.arrays > arrays
 
     def found(self):
-        """Return what was compared, and what is wrong."""
+        """Return the summary of comparisons, and the differences."""
         launches = [key for key in self.compared if len(key) == 3]
         kernels = {name for name, *_ in launches}
         idle = {name for name, *_ in self.tried} - kernels
@@ -341,14 +358,17 @@ def bits(a):
 
 
 def largest(a):
-    """Return the largest number that does not stand for infinity."""
+    """Return the largest number that does not represent infinity."""
     with np.errstate(invalid="ignore"):
         a = np.abs(a.astype(np.float64))
     return float(a[a < ENDLESS].max(initial=0.0))
 
 
 def difference(here, there, size):
-    """Return the largest difference as a share of a size, or of a number that is larger; of integers, whether there is one."""
+    """Return the largest difference, relative to the larger of size and number.
+
+    For integers: whether any number differs.
+    """
     other = bits(here) != bits(there)
     if here.dtype.kind != "f":
         return float(other.any())
@@ -361,7 +381,11 @@ def difference(here, there, size):
 
 
 def spoiled(a, written, allowed):
-    """Return numbers of which one that was written is wrong: by three times what is allowed, if there is one that is no infinity."""
+    """Return a copy of results with one wrong number, to test the comparison.
+
+    A number that was written and is finite is changed by three times the tolerance, if there is
+    one.
+    """
     wrong, finite = a.copy(), written & (np.abs(a) < ENDLESS)
     at = int(np.argmax(finite if finite.any() else written))
     wrong[at] = (
@@ -372,7 +396,7 @@ def spoiled(a, written, allowed):
 
 @functools.cache
 def templates():
-    """Return what Warp makes kernels of on the CPU, whatever the emulation has changed."""
+    """Return Warp's own CPU kernel templates, without the emulation's changes."""
     body = ast.parse(Path(codegen.__file__).read_text()).body
     made = {
         node.targets[0].id: node.value
@@ -384,7 +408,10 @@ def templates():
 
 @contextlib.contextmanager
 def as_on_cpu(module):
-    """Have a module loaded in the CPU's own form, from where Warp keeps that, beside the emulated one."""
+    """Use a module's own CPU code in a `with` block, not the emulated CUDA code.
+
+    Kernels come from Warp's own cache.
+    """
     with contextlib.ExitStack() as stack:
         if EMULATED:
             stack.enter_context(mock.patch.multiple(codegen, **templates()))
@@ -401,13 +428,16 @@ def one_by_one(program):
 
 
 def looked_after(program, condition):
-    """Repeat a program as long as the host sees that it is to be."""
+    """Repeat a program while its condition holds, tested on the host."""
     wp.capture_while(condition, program._run_in_time)
 
 
 @contextlib.contextmanager
 def heard(check):
-    """Have every launch go through a check, those of programs one by one."""
+    """Send every launch through a comparison.
+
+    Programs are launched kernel by kernel.
+    """
     core, kernels, hooks_of = context.runtime.core, {}, context.ModuleExec.get_kernel_hooks
     on_cuda = core.wp_cuda_launch_kernel
 
@@ -416,8 +446,8 @@ def heard(check):
         kernels[ctypes.cast(hooks.forward, ctypes.c_void_p).value] = kernel
         return hooks
 
-    # context, function, threads, most blocks, threads of a block, strides, clusters, shared bytes,
-    # parameters, ...
+    # Parameters: context, function, threads, most blocks, threads of a block, strides, clusters,
+    # shared bytes, parameters, ...
     def launch(*args):
         kernel, run = kernels.get(args[1]), lambda: on_cuda(*args)
         return check.launch(kernel, args[8], run) if kernel else run()
@@ -448,7 +478,7 @@ def stepped(scene, device):
 
 
 def main():
-    """Compare, and print what was found in the last line; return 3 if something is wrong."""
+    """Compare, and print a summary in the last line; return 3 after differences."""
     given, broken = [argument for argument in sys.argv[1:] if not argument.startswith("-")], []
     wp.init()
     check = KernelCheck(*(given or ["cpu" if EMULATED else "cuda:0"]))
@@ -462,7 +492,7 @@ def main():
         ):
             try:
                 work(check.device.alias)
-            except Exception as error:  # what wrong kernels lead to
+            except Exception as error:  # wrong kernels can cause any error
                 broken.append(f"{type(error).__name__}: {error}")
             check.busy = False
     text, wrong = check.found()

@@ -1,22 +1,22 @@
-"""What solves and steps should take on GPUs, from what they launch: `python -m benchmarks.gpu_model`, in the source tree.
+"""Estimated times of solves and steps on GPUs: `python -m benchmarks.gpu_model`.
 
-Every launch of CUDA's form is heard on the CPU (`benchmarks/emulated_cuda.py`), with the bytes of
-the fields that its pass declares, each counted once. A launch takes as long as its bytes at `SHARE`
-of the memory's bandwidth, and no less than its latency; small levels take a barrier a stage; the
-host waits for each readback. The two passes that compute most in float64 take as long as that
-takes, if it is longer. What is heard stands for larger grids, each of which has launches for
-another level.
+Run it in the source tree. Every launch in CUDA's form is recorded on the CPU
+(`benchmarks/emulated_cuda.py`), with the bytes of the fields that its kernel declares, each counted
+once. A launch takes as long as its bytes at `SHARE` of the memory's bandwidth, and no less than its
+latency. A fused coarse level takes a barrier a stage. The host waits for each readback. The two
+kernels with most float64 arithmetic take the time of that arithmetic, if it is longer. Larger grids
+are extrapolated: each has the launches of one level more.
 
 Floors are fitted to solves measured on an H200, 10, 30 and 184 ms at 128^3, 256^3 and 512^3 cells
 with a cell a thread: launches of 4.5 to 8 us and stages of 4 to 1 us fit within 5 %. Of a launch,
 1.3 us are a graph's, as measured on an H100 (Hazy Research, "Look Ma, No Bubbles!", 2025), the rest
-is the latency of a small pass. A stage issues a third of the instructions since threads take four
+is the latency of a small kernel. A stage issues a third of the instructions since threads take four
 cells: 1.2 us by its counts. Nothing that is newer than those solves has been measured on a GPU.
 
-With --sass, the passes' machine code is counted instead: see `benchmarks/gpu_counts.py`.
+With --sass, the kernels' machine code is counted instead: see `benchmarks/gpu_counts.py`.
 """
 
-from benchmarks import emulated_cuda, gpu_counts  # before the package
+from benchmarks import emulated_cuda, gpu_counts  # must precede the package
 
 # ruff: isort: split
 
@@ -40,34 +40,34 @@ from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
-SHARE = 0.8  # of the bandwidth of data sheets that streaming kernels reach
+SHARE = 0.8  # share of the data sheets' bandwidth that streaming kernels reach
 RECORDED, LAUNCHED = 6.0, 12.0  # [us] a small launch in a graph, and one from Python
-BARRIER, READBACK = 1.2, 15.0  # [us] a stage of small levels with its barrier; in a cluster .5 more
+BARRIER, READBACK = 1.2, 15.0  # [us] a stage of fused levels with its barrier; in a cluster .5 more
 GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
     "H100 SXM": (3350.0, 16_700.0),
     "H200": (4800.0, 16_700.0),
     "RTX 4090": (1008.0, 645.0),
     "RTX 4070 laptop": (256.0, 158.0),
 }
-# such instructions a byte of the passes that have many, see `benchmarks.two_floats`
+# Float64 instructions a byte of the kernels that have many, see `benchmarks.two_floats`.
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
-STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
+STEPS, HEARD = 10, 5  # steps of the dam break: until it moves, and recorded ones
 SIZES = (128, 256, 512, 1024)
 
 
 @dataclass
 class Work:
-    """What was launched.
+    """Recorded launches.
 
     Attributes:
         bytes: of the fields that each launch declares.
-        graph: which launches were in a graph.
+        graph: whether each launch was in a graph.
         names: of the kernels.
-        keys: of passes, as `gpu_counts` names them.
+        keys: of stencil kernels, as `gpu_counts` names them.
         cells: that they visit.
-        bounds: a launch of each pass, by key.
-        stages: of small levels, each with a barrier.
-        readbacks: how often the host waited.
+        bounds: a launch of each stencil kernel, by key.
+        stages: of fused coarse levels, each with a barrier.
+        readbacks: number of waits of the host.
     """
 
     bytes: list[float] = field(default_factory=list)
@@ -80,7 +80,10 @@ class Work:
     readbacks: int = 0
 
     def ms(self, bandwidth: float, float64: float) -> float:
-        """Return the time [ms] at a bandwidth [GB/s] and a rate of instructions in float64 [10^9/s]."""
+        """Return the time of this work [ms].
+
+        The bandwidth is in GB/s, the rate of float64 instructions in 10^9/s.
+        """
         least = np.where(self.graph, RECORDED, LAUNCHED)
         slow = (
             np.array([FLOAT64.get(name.rpartition(":")[2], 0.0) for name in self.names]) / float64
@@ -96,7 +99,10 @@ class Work:
     def terms(
         self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]
     ) -> dict[str, float]:
-        """Return the time [ms] that each limit holds launches: that of a launch is the slowest one."""
+        """Return the time [ms] that each limit accounts for.
+
+        The time of a launch belongs to its slowest limit.
+        """
         found = {
             "barriers": BARRIER * self.stages / 1e3,
             "readbacks": READBACK * self.readbacks / 1e3,
@@ -113,12 +119,16 @@ class Work:
         return found
 
     def uncounted(self, counts: dict[str, gpu_counts.InstructionCount]) -> float:
-        """Return the share of the bytes that passes move which have not been counted."""
+        """Return the share of the bytes that belongs to uncounted kernels."""
         moved = [size for size, key in zip(self.bytes, self.keys, strict=True) if key not in counts]
         return sum(moved) / max(sum(self.bytes), 1.0)
 
     def grown(self, before: "Work", levels: int) -> "Work":
-        """Return the work on a grid 2^levels times as fine; `before`: on one half as fine. Launches and stages grow by as many a level."""
+        """Return the work on a grid 2^levels times as fine.
+
+        `before` is the work on a grid half as fine. Launches and stages grow by the same number
+        with each level.
+        """
         more = [b for b, g in zip(self.bytes, self.graph, strict=True) if g]
         added = max(len(self.bytes) - len(before.bytes), 0) * levels
         sizes = [b * 8.0**levels for b in self.bytes] + sorted(more)[len(more) // 2 :][:1] * added
@@ -134,7 +144,7 @@ class Work:
         )
 
     def passes(self, most: int = 12) -> str:
-        """Return a table of the kernels that move most."""
+        """Return a table of the kernels that move most bytes."""
         moved, launches = dict.fromkeys(self.names, 0.0), Counter[str](self.names)
         for name, size in zip(self.names, self.bytes, strict=True):
             moved[name] += size
@@ -146,7 +156,10 @@ class Work:
 
 
 class Launched(NamedTuple):
-    """A launch: bytes of its fields, barriers, and of a pass its name and its cells; the kernel's name."""
+    """One launch: bytes of its fields, barriers, and the kernel's name.
+
+    A stencil kernel also has the name of its declaration and its number of cells.
+    """
 
     bytes: float
     stages: int
@@ -161,7 +174,11 @@ def name_of(kernel: Any) -> str:
 
 
 def heard(make: Callable[[], Callable[[], object]]) -> Work:
-    """Return what a call launches; `make` returns it, and is heard itself, for what is made in the first run is replayed by later ones."""
+    """Return the launches of a call.
+
+    `make` returns the call. It is recorded as well, because later runs replay what the first run
+    has set up.
+    """
     given: dict[int, tuple[BoundKernel, Heard]] = {}
     tags: dict[int, tuple[Any, Launched]] = {}
     bind, launch_bound, launch_sequence = (
@@ -222,7 +239,8 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         record_cmd: bool = False,
         **options: Any,
     ) -> Any:
-        arrays = [a for a in inputs if isinstance(a, wp.array)]  # of a kernel that is no pass
+        # Of a Warp kernel without a declaration.
+        arrays = [a for a in inputs if isinstance(a, wp.array)]
         moved = float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays))
         launched = (current[-1] if current else Launched(moved, 0))._replace(name=name_of(kernel))
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
@@ -268,7 +286,9 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
 
 
 def solve(n: int, *, clusters: bool = False) -> tuple[Work, int]:
-    """Return the work of a cold solve of a splash with separating walls to 1e-6, and its iterations.
+    """Return the work and the iterations of a cold solve of a splash.
+
+    Walls separate; the tolerance is 1e-6.
 
     Args:
         n: cells along an axis.
@@ -307,7 +327,10 @@ def step(n: int) -> Work:
 
 
 def table(small: Work, large: Work, n: int, times: int = 1) -> str:
-    """Return a table of sizes and devices for one of some `times`, from the work at n / 2 and at n."""
+    """Return a table of estimated times, by grid size and device.
+
+    `times` are extrapolated from the work at n / 2 and at n.
+    """
     lines = [
         f"| cells | launches | GB | {' | '.join(GPUS)} |",
         "|---|---|---|" + "---|" * len(GPUS),
@@ -329,7 +352,10 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
 def limits_table(
     small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]
 ) -> str:
-    """Return a table of what holds solves on GPUs, from the work at n / 2 and at n and counted passes."""
+    """Return a table of the limits of solves on GPUs.
+
+    It is extrapolated from the work at n / 2 and at n, with counted kernels.
+    """
     names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
     lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
     for size in (s for s in SIZES[:3] if s >= n // 2):
@@ -350,7 +376,7 @@ def limits_table(
 def counted(
     counts: dict[str, gpu_counts.InstructionCount],
 ) -> Iterator[gpu_counts.InstructionCount]:
-    """Count passes, and note each by its key."""
+    """Count kernels, and yield each count by its key."""
     for one in gpu_counts.counts():
         counts[one.key] = one
         yield one

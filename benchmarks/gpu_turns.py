@@ -1,23 +1,23 @@
-"""Two source trees in turns on a GPU: `python -m benchmarks.gpu_turns --base FOLDER`.
+"""Interleaved timing of two source trees on a GPU.
 
-In the source tree:
+Run it in the source tree:
 
-    git archive COMMIT | tar -x -C out/base    # the other tree, before
-    python -m benchmarks.gpu_turns --base out/base --out benchmarks/results/DEVICE
+    git archive COMMIT | tar -x -C out/base    # the other tree, before python -m
+        benchmarks.gpu_turns --base out/base --out benchmarks/results/DEVICE
 
 Workers, a process each, do the same work one after another: this tree, this tree with a cell a
-thread (`WARP_LCP_QUADS=0`), and the other one. Timed are cold solves, solves by methods that take
+thread (`WARP_LCP_QUADS=0`), and the other tree. The work is cold solves, solves by methods for
 grids, and steps of a liquid, of sand and of floating bodies. `turns.json` and the page `turns.md`
-are written after each piece of work, and work that would begin after `--seconds` is left out.
-`--verdict` runs `benchmarks.gpu` after that. `--rehearse` does all of it small, on the CPU in
-CUDA's form (`benchmarks/emulated_cuda.py`).
+are written after each piece of work. Pieces that would begin after `--seconds` are left out.
+`--verdict` runs `benchmarks.gpu` after that. `--rehearse` does all of it at small sizes, on the CPU
+in CUDA's form (`benchmarks/emulated_cuda.py`).
 """
 
 import importlib
 import sys
 
 if __name__ == "__main__" and "--rehearse" in sys.argv and "--worker" in sys.argv:
-    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+    importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
 
 # ruff: isort: split
 
@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-ANSWER = "ANSWER "  # begins the line of a worker that has one
+ANSWER = "ANSWER "  # begins a worker's line with an answer
 METHODS = (
     "ProjectedMultigrid",
     "MinimumMapNewton",
@@ -44,14 +44,14 @@ METHODS = (
     "ProjectedSOR",
 )
 SCENES = {"liquid": "dam-break", "sand": "column-collapse", "bodies": "floating-bodies"}
-MOST_ITERATIONS = 200  # of a method: some take thousands
-BEFORE, TIMED = 10, 10  # steps until the material moves, and those that are timed
-SOLVES = 3  # timed, of which the least counts
+MOST_ITERATIONS = 200  # of a method: some need thousands
+BEFORE, TIMED = 10, 10  # steps until the material moves, and timed steps
+SOLVES = 3  # timed solves, of which the fastest counts
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Cells along an axis of each kind of work."""
+    """Cells along an axis, for each kind of work."""
 
     solves: tuple[int, ...] = (128, 256, 512)
     methods: int = 128
@@ -64,7 +64,7 @@ SMALL = Sizes(solves=(16,), methods=8, steps=(16,), before=1, timed=1)
 
 
 def pieces(sizes: Sizes) -> Iterator[tuple[str, str, int]]:
-    """Yield what is timed: its kind, the method or scene, and cells along an axis."""
+    """Yield the pieces of work: kind, method or scene, and cells along an axis."""
     for n in sizes.solves:
         yield "cold solve", "ProjectedMultigrid", n
     for n in sizes.steps:
@@ -75,7 +75,7 @@ def pieces(sizes: Sizes) -> Iterator[tuple[str, str, int]]:
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the time of some work on the device [s], and what it returns."""
+    """Return the time of some work on the device [s], and its result."""
     import warp as wp
 
     wp.synchronize()
@@ -86,7 +86,7 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def solve(method: str, n: int, device: str) -> dict[str, float | str]:
-    """Return the least time of a solve from 0 to 1e-6 [ms], its iterations and its status."""
+    """Return the least time of a cold solve to 1e-6 [ms], iterations and status."""
     import warp_lcp as wl
     from warp_lcp.benchmarks.problems import splash
 
@@ -120,12 +120,12 @@ def step(scene: str, n: int, device: str, sizes: Sizes) -> dict[str, float | str
 
 
 def worker(device: str, sizes: Sizes) -> None:
-    """Do what lines of the standard input ask for, and answer by lines."""
+    """Read requests from the standard input, a line each, and answer by lines."""
     for line in sys.stdin:
         kind, name, n = json.loads(line)
         try:
             found = step(name, n, device, sizes) if kind == "step" else solve(name, n, device)
-        except Exception as error:  # what fails is written down, and the next piece of work follows
+        except Exception as error:  # a failure is recorded, and the next piece of work follows
             found = {"error": f"{type(error).__name__}: {error}"[:300]}
         print(f"\n{ANSWER}{json.dumps(found)}", flush=True)
 
@@ -136,7 +136,7 @@ class TreeWorker:
     Args:
         tree: of the package.
         quads: value of `WARP_LCP_QUADS`.
-        rehearse: whether it works on the CPU in CUDA's form.
+        rehearse: whether it runs on the CPU in CUDA's form.
         device: Warp device.
     """
 
@@ -153,7 +153,7 @@ class TreeWorker:
         )
 
     def ask(self, piece: tuple[str, str, int]) -> dict[str, Any]:
-        """Return what a piece of work has come to."""
+        """Return the result of a piece of work."""
         asked, answers = self._process.stdin, self._process.stdout
         assert asked is not None
         assert answers is not None
@@ -175,7 +175,7 @@ class TreeWorker:
 
 @dataclass
 class Turns:
-    """All pieces of work by all workers, and what they have come to so far."""
+    """All pieces of work by all workers, with the results so far."""
 
     out: Path
     names: list[str]
@@ -183,13 +183,13 @@ class Turns:
     left_out: list[str] = field(default_factory=list)
 
     def add(self, piece: tuple[str, str, int], found: dict[str, dict[str, Any]]) -> None:
-        """Add a piece of work, and write the files."""
+        """Add the results of a piece of work, and write the files."""
         kind, name, n = piece
         self.rows.append({"kind": kind, "name": name, "cells": n, "found": found})
         self.write()
 
     def write(self) -> None:
-        """Write what there is as JSON and as a page."""
+        """Write the results so far as JSON and as a page."""
         kept = {"workers": self.names, "work": self.rows, "left_out": self.left_out}
         (self.out / "turns.json").write_text(json.dumps(kept, indent=1) + "\n")
         (self.out / "turns.md").write_text("\n".join(self.page()) + "\n")
@@ -211,7 +211,7 @@ class Turns:
 
 
 def shown(found: dict[str, Any]) -> str:
-    """Return what a piece of work has come to, for the page."""
+    """Return the text of a piece of work's results, for the page."""
     if "ms" not in found:
         return found.get("error", "")
     if "iterations" not in found:
@@ -221,7 +221,7 @@ def shown(found: dict[str, Any]) -> str:
 
 
 def run(given: argparse.Namespace) -> int:
-    """Time everything in turns; return the exit status."""
+    """Time all pieces of work, interleaved; return the exit status."""
     begun, sizes = time.monotonic(), SMALL if given.rehearse else Sizes()
     given.out.mkdir(parents=True, exist_ok=True)
     device = "cpu" if given.rehearse else given.device
@@ -252,7 +252,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 def verdict(given: argparse.Namespace) -> int:
-    """Run `benchmarks.gpu`; return its exit status, 124 where its time is over."""
+    """Run `benchmarks.gpu`; return its exit status, 124 after a timeout."""
     command = [sys.executable, "-m", "benchmarks.gpu", "--out", str(given.out)]
     command += ["--rehearse"] if given.rehearse else ["--device", given.device]
     try:
@@ -263,7 +263,7 @@ def verdict(given: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    """Time two trees, or be a worker."""
+    """Time two trees, or run as a worker."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

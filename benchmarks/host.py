@@ -1,9 +1,9 @@
 """Host time of a simulation step by stage, and of the native work in it.
 
 Run `python -m warp_lcp.benchmarks.host`. A step consists of Python, which prepares operations, and
-of native calls, which execute tables of them (`warp_lcp.kernels.thread_pool.ThreadPool.run`). The *floor* of a
-stage is the time of its native calls alone: each call is repeated from the same memory, without
-Python in between, and the fastest one counts.
+of native calls, which execute tables of them (`warp_lcp.kernels.thread_pool.ThreadPool.run`). The
+*floor* of a stage is the time of its native calls alone: each call is repeated from the same
+memory, without Python in between, and the fastest one counts.
 """
 
 from __future__ import annotations

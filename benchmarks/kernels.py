@@ -1,7 +1,7 @@
-"""Rates of all passes over the finest grid, against the copy bandwidth.
+"""Rates of all kernels over the finest grid, against the copy bandwidth.
 
-Rates are in cells and bytes per second. The passes are those that solves of a full basin bind, so
-that the list follows the code. The bytes are those of the fields that a pass declares to read and
+Rates are in cells and bytes per second. The kernels are those that solves of a full basin bind, so
+that the list follows the code. The bytes are those of the fields that a kernel declares to read and
 to write, each counted once.
 """
 
@@ -48,7 +48,7 @@ PEER_ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """Pass with its fields by name, recorded when it was bound."""
+    """Stencil kernel with its fields by name, recorded when it was bound."""
 
     bound: BoundKernel
     fields: dict[str, wp.array[Any]]
@@ -132,7 +132,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_form(n: int, form: str, options: Options) -> list[BenchmarkRecord]:
-    """Record the passes of one form of coefficients and time them, interleaved.
+    """Record the kernels of one form of coefficients and time them, interleaved.
 
     Copies and the peers take part in the rounds.
     """
@@ -214,7 +214,7 @@ def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
 
 
 def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
-    """Return the passes over the finest grid that solves of the scene bind.
+    """Return the kernels over the finest grid that solves of the scene bind.
 
     Each pass has a unique label. The float32 product among them is returned as well.
     """

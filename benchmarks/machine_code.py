@@ -1,4 +1,6 @@
-"""Machine code of NVIDIA GPUs (SASS of sm_90): made by `ptxas`, printed by `cuobjdump` and `nvdisasm`, read from that.
+"""Parser of the machine code of NVIDIA GPUs (SASS of sm_90).
+
+`ptxas` makes the code; `cuobjdump` and `nvdisasm` print it.
 
 The tools are in the extra `ptxas`; no GPU is needed.
 """
@@ -17,7 +19,7 @@ GUARD = re.compile(r"@(!?)(U?P\w+)\s+(.*)")
 
 
 def tool(name: str) -> Path | None:
-    """Return where a tool of the extra `ptxas` is; None if it is not installed."""
+    """Return the path of a tool of the extra `ptxas`; None if it is not installed."""
     spec = importlib.util.find_spec("nvidia")
     places = [Path(p) for p in (spec.submodule_search_locations or [])] if spec else []
     return next((found for place in places for found in place.glob(f"*/bin/{name}")), None)
@@ -30,7 +32,10 @@ def tools_missing() -> list[str]:
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction: its guard (predicate, whether it is negated), its operation with modifiers, its operands."""
+    """One instruction: guard, operation with modifiers, operands.
+
+    The guard is a predicate and whether it is negated.
+    """
 
     guard: tuple[str, bool] | None
     name: str
@@ -53,7 +58,7 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
     """Assemble PTX to a cubin and return its kernels."""
     ptxas, cuobjdump, nvdisasm = (tool(name) for name in ("ptxas", "cuobjdump", "nvdisasm"))
     assert ptxas and cuobjdump and nvdisasm, tools_missing()
-    text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
+    text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas rejects
     made = subprocess.run(
         [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin],
         input=text,
@@ -92,7 +97,7 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
 
 
 def parsed(text: str) -> Instruction:
-    """Return an instruction from its text."""
+    """Parse the text of an instruction."""
     guard, rest = None, text
     if found := GUARD.match(text):
         guard, rest = (found[2], bool(found[1])), found[3]

@@ -1,8 +1,8 @@
-"""What a warp of a kernel issues: instructions, loads, stores, passes through the L1 cache.
+"""Instructions, loads, stores and L1 wavefronts that a warp of a kernel issues.
 
 The lanes of the warp are executed one after another (`benchmarks/machine_thread.py`). An
-instruction of the warp is issued as often as by the lane that executes it most often, as branches
-join again.
+instruction of the warp is issued as often as by the lane that executes it most often, because
+branches join again.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ ATOMIC = frozenset(("RED", "REDG", "ATOM", "ATOMG"))
 
 @dataclass
 class Issued:
-    """What a warp issues.
+    """Counts of a warp.
 
     Attributes:
-        instructions: how many.
+        instructions: issued instructions.
         float64: of these, in float64.
         loads: from global memory.
         stores: to global memory.
@@ -49,7 +49,9 @@ def issued(
     memory: Memory,
     threads: Sequence[tuple[int, int]],
 ) -> Issued:
-    """Return what a warp issues whose threads have these (place in the block, block).
+    """Count the instructions of a warp.
+
+    Its threads have these pairs (index in the block, index of the block).
 
     Raises:
         NotImplementedError: the kernel has an instruction that is not known here.

@@ -1,6 +1,7 @@
-"""Executes a thread's machine code (SASS of sm_90) on the host, on copies of the device's memory.
+"""Emulator of a GPU thread's machine code (SASS of sm_90) on the host.
 
-Shuffles, votes and atomics, which need other threads, do nothing.
+It works on copies of the device's memory. Shuffles, votes and atomics, which need other threads, do
+nothing.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from benchmarks.machine_code import Instruction
 
 PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
-MOST = 200_000  # instructions of a lane
+MOST = 200_000  # most instructions of a lane
 PREDICATE = re.compile(r"U?P(\d|T)$")
 NO_VALUE = "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL"
 ATOMIC = "RED REDG ATOMG ATOM"
 IGNORED = frozenset(f"{NO_VALUE} {ATOMIC}".split())
-COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: true of NaN
+COMPARED: dict[str, Callable[[float, float], bool]] = {  # a second letter U: true for NaN
     "LT": lambda a, b: a < b,
     "EQ": lambda a, b: a == b,
     "LE": lambda a, b: a <= b,
@@ -44,7 +45,10 @@ COMPARED: dict[str, Callable[[float, float], bool]] = {  # the second letter U: 
 
 
 class Memory:
-    """Copies of arrays at their addresses; what is written lies on top of them."""
+    """Copies of arrays at their addresses.
+
+    Writes are kept apart and override the copies.
+    """
 
     def __init__(self, arrays: Iterable[tuple[int, np.ndarray]]) -> None:
         self._spans = sorted(
@@ -55,7 +59,9 @@ class Memory:
         self.shared: dict[int, int] = {}
 
     def read(self, at: int, count: int) -> bytes:
-        """Return bytes; those up to 64 KiB outside of an array, which guarded loads do not use, are 0.
+        """Return bytes of memory.
+
+        Bytes up to 64 KiB outside of an array are 0: guarded loads read them and drop the values.
 
         Raises:
             KeyError: there is no array near the address.
@@ -107,7 +113,7 @@ def _half_bits(value: float) -> int:
 
 @dataclass
 class Lane:
-    """A thread that executes a kernel."""
+    """State of a thread that executes a kernel."""
 
     code: dict[int, Instruction]
     constants: bytes
@@ -118,14 +124,15 @@ class Lane:
     predicates: dict[str, bool] = field(
         default_factory=lambda: defaultdict(bool, PT=True, UPT=True)
     )
-    count: Counter[int] = field(default_factory=Counter)  # of instructions by address
-    # instruction, its turn, address, bytes, is a load
+    count: Counter[int] = field(default_factory=Counter)  # executions by address of the instruction
+    # Each access: instruction, how often it was executed before, address, bytes, whether it is a
+    # load.
     accesses: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
-    local: dict[int, int] = field(default_factory=dict)  # memory of its own, by address
+    local: dict[int, int] = field(default_factory=dict)  # local memory, by address
     at: int = 0
 
     def run(self) -> None:
-        """Execute until the end."""
+        """Execute the kernel until it ends."""
         order = sorted(self.code)
         following = dict(itertools.pairwise(order))
         at = order[0]
@@ -145,7 +152,7 @@ class Lane:
         raise RuntimeError(f"a lane executes more than {MOST} instructions")
 
     def _step(self, instruction: Instruction) -> int | None:
-        """Execute an instruction; return where it jumps to."""
+        """Execute an instruction; return the target of a jump."""
         name, operands = instruction.name, list(instruction.operands)
         if name in IGNORED:
             return None
@@ -168,7 +175,7 @@ class Lane:
             execute(set(instruction.modifiers), operands, instruction)
         return None
 
-    # operands
+    # Operands.
 
     def _register(self, name: str) -> int:
         plain = name.split(".", maxsplit=1)[0]
@@ -185,7 +192,7 @@ class Lane:
 
     @staticmethod
     def _signs(operand: str) -> tuple[bool, bool, bool, str]:
-        """Return whether an operand is negated, inverted, absolute, and what it is without."""
+        """Split an operand: negated, inverted, absolute, and the rest."""
         negative = operand.startswith("-") and not re.match(r"-0x|-[\d.]|-INF|-QNAN", operand)
         operand = operand[1:] if negative else operand
         inverted = operand.startswith("~")
@@ -286,10 +293,13 @@ class Lane:
 
     @staticmethod
     def _predicate_first(operands: list[str]) -> str | None:
-        """Take a predicate that stands before the operands away from them; None if there is none."""
+        """Split a leading predicate from the operands.
+
+        The predicate is None if there is none.
+        """
         return operands.pop(0) if PREDICATE.match(operands[0]) else None
 
-    # moves
+    # Moves.
 
     def _do_s2r(self, m: set[str], o: list[str], i: Instruction) -> None:
         which = {"SR_TID.X": self.thread, "SR_CTAID.X": self.block, "SR_LANEID": self.thread % 32}
@@ -313,7 +323,7 @@ class Lane:
 
     def _do_fsel(self, m: set[str], o: list[str], i: Instruction) -> None:
         chosen = o[1] if self._predicate(o[3]) else o[2]
-        # upper halves of infinite doubles are shown so
+        # Upper halves of infinite doubles are printed like this.
         halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}
         negative, _, absolute, plain = self._signs(chosen)
         if chosen in halves:
@@ -357,14 +367,14 @@ class Lane:
             if re.match(r"U?R\d", operand):
                 self._put(operand, 1)
 
-    # whole numbers
+    # Integers.
 
     def _do_iadd3(self, m: set[str], o: list[str], i: Instruction) -> None:
         carries, rest = [], o[1:]
         while PREDICATE.match(rest[0]):
             carries.append(rest.pop(0))
         total = sum(self._predicate(p) for p in rest[3:]) if "X" in m else 0
-        # a negated one is inverted and one more, so that the carry is that of the sum
+        # A negated operand is inverted, and 1 is added, so that the carry is that of the sum.
         for operand in rest[:3]:
             negated = operand.startswith("-") and not operand.startswith("-0x")
             total += (~self._int(operand[1:]) & LOW) + 1 if negated else self._int(operand)
@@ -457,7 +467,7 @@ class Lane:
         a, b = self._int(o[2]), self._int(o[3])
         a, b = (a, b) if "U32" in m else (_signed(a), _signed(b))
         result = COMPARED[kind](a, b)
-        if "EX" in m:  # the upper halves of two numbers; the predicate is of the lower ones
+        if "EX" in m:  # the upper halves of two numbers; the predicate is that of the lower ones
             low = self._predicate(o[5])
             result = low if a == b and kind != "NE" else (result or low) if kind == "NE" else result
         self._set_both(m, o, result)
@@ -491,9 +501,9 @@ class Lane:
     def _do_popc(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._put(o[0], self._int(o[1]).bit_count())
 
-    # real numbers
+    # Floating-point numbers.
 
-    # used to load two halves
+    # The compiler uses it to load two halves.
     def _do_hfma2(self, m: set[str], o: list[str], i: Instruction) -> None:
         if o[1] != "-RZ":
             raise NotImplementedError(i.text)
@@ -542,7 +552,7 @@ class Lane:
         )
 
     def _do_fchk(self, m: set[str], o: list[str], i: Instruction) -> None:
-        """Set a predicate where a quotient needs more than the usual instructions."""
+        """Set a predicate where a division needs the slow path."""
         a, b = (_bits(self._real(operand)) >> 23 & 255 for operand in o[1:3])
         usual = self._real(o[1]) == 0 or (1 < b < 252 and 24 < a < 255 and -126 < a - b < 127)
         self._set(o[0], not usual)
@@ -616,7 +626,7 @@ class Lane:
     def _do_f2fp(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._put(o[0], _half_bits(self._real(o[1])) << 16 | _half_bits(self._real(o[2])))
 
-    # memory
+    # Memory.
 
     @staticmethod
     def _size(m: set[str]) -> int:
@@ -686,5 +696,8 @@ ALIASES = {
 
 
 def constants_of(parameters: bytes, block: int, blocks: int) -> bytes:
-    """Return a kernel's constant memory: the size of a block, the number of blocks, and the parameters."""
+    """Return a kernel's constant memory.
+
+    It holds the size of a block, the number of blocks, and the parameters.
+    """
     return struct.pack("<6I", block, 1, 1, blocks, 1, 1).ljust(PARAMETERS, b"\0") + parameters

@@ -302,7 +302,7 @@ def compare() -> None:
 
 
 def drawn_problem(seed: int) -> wl.LCP:
-    """Return a problem on a grid with holes and air, with bounds here and there, as it comes."""
+    """Return a random problem on a grid with holes, air and some bounds."""
     rng = np.random.default_rng(seed)
     shape = tuple(rng.integers(5, 50, 3))
     share = rng.uniform(0.93, 1)  # few cells are cut off from the air
@@ -315,7 +315,7 @@ def drawn_problem(seed: int) -> wl.LCP:
 
 
 def compare_drawn(count: int) -> None:
-    """Print what residuals are by each way of evaluation at solutions of drawn problems."""
+    """Print residuals of each evaluation at solutions of random problems."""
     rows = []
     for rtol in (1e-6, 1e-8, 1e-10):
         found: dict[str, list[float]] = {way: [] for way in WAYS}
@@ -335,7 +335,9 @@ def compare_drawn(count: int) -> None:
 
 
 def count(module: str, kind: str, stored: str) -> list[int]:
-    """Return the instructions of a cell, of each kind and in all.
+    """Return the instructions of a cell, by kind and in total.
+
+    A thread has one cell. Each copy of an unrolled loop stores one `stored`.
 
     A thread has one cell. Each copy of an unrolled loop stores one `stored`.
     """
@@ -352,7 +354,7 @@ def count(module: str, kind: str, stored: str) -> list[int]:
 
 
 def instructions() -> None:
-    """Print instruction counts and times of the solver's passes and the evaluations."""
+    """Print instruction counts and times of the solver's kernels and the evaluations."""
     made = {
         name: next(m for m in user_modules if m.startswith(f"warp_lcp.projected_multigrid.{name}."))
         for name in BYTES

@@ -1,4 +1,7 @@
-"""Grids that are shared by the ranks of MPI: PETSc cuts and exchanges them, the solvers are those of one process."""
+"""Grids distributed over MPI ranks.
+
+PETSc partitions the grid and exchanges halos; the solvers are those of one process.
+"""
 
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo

@@ -1,4 +1,7 @@
-"""Cuts by load: the boxes of ranks end where the busiest has least to do, and are cut anew when material has moved so far that it pays."""
+"""Load balancing: boxes whose busiest rank has the least work.
+
+The grid is repartitioned when material has moved far enough for that to pay.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +19,17 @@ from warp_lcp.multigrid.halo_levels import GATHERED
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-# cells full of material whose work is that which a step takes however little there is of it
+# Fixed cost of a step, as the work of cells full of material.
 STEP = 1 << 13
-BLOCKS = 128  # of a rank, five along an axis
-ROUNDS = 4  # over the axes: each leaves the busiest rank no more to do than before
+BLOCKS = 128  # blocks of a rank, five along an axis
+ROUNDS = 4  # sweeps over the axes: none of them increases the work of the busiest rank
 
 Parts = list[list[int]]  # cells of each box along x, y, z
 
 
 @dataclass(frozen=True)
 class Load:
-    """What there is to do in a step, by blocks of cells.
+    """Work of a step, by blocks of cells.
 
     Cuts lie between blocks, so that the levels of multigrid that ranks share end at them.
 
@@ -45,21 +48,21 @@ class Load:
     def best(
         self, ranks: int, start: Parts | None = None, *, rank: int | None = None
     ) -> tuple[float, Parts] | None:
-        """Return what the busiest rank has to do at least, and the cuts for that; None: there are too many ranks for the grid.
+        """Return the least work of the busiest rank, and the cuts for it.
 
-        Cuts along one axis are the best there are for those along the others (dynamic programming);
-        the axes take turns.
+        Returns None if there are too many ranks for the grid. Cuts along one axis are optimal for
+        the given cuts along the others (dynamic programming); the axes are optimized in turn.
 
         Args:
-            ranks: how many.
-            start: cuts to start from as well, so that what is found is no worse.
-            rank: look at what falls to this one where all look, each at some numbers of boxes along
-                x, y, z; None: at all.
+            ranks: number of ranks.
+            start: cuts to start from as well, so that the result is no worse than they are.
+            rank: search only this rank's share of the numbers of boxes along x, y, z, where all
+                ranks search together; None: search all of them.
         """
         total, found = float(self.material.sum()), list[tuple[float, Parts]]()
 
         def least(p: Triple) -> float:
-            """Return what the busiest rank has to do if all have as much."""
+            """Return a lower bound of the busiest rank's work: an even share of all work."""
             return (
                 total
                 + OPEN
@@ -79,7 +82,10 @@ class Load:
         return min(found) if found else None
 
     def _improved(self, cut: Parts) -> tuple[float, Parts] | None:
-        """Return better cuts, as many along each axis, and what the busiest rank then has to do; None: there is no room for them."""
+        """Return improved cuts and the work of the busiest rank.
+
+        The number of boxes along each axis stays. Returns None if they do not fit into the grid.
+        """
         work = math.inf
         for _ in range(ROUNDS):
             before = work
@@ -96,7 +102,14 @@ class Load:
         return work, cut
 
     def _along(self, axis: int, cut: Parts) -> tuple[float, list[int]] | None:
-        """Return the best cuts along an axis for those along the others, and what the busiest rank then has to do; None: there are none."""
+        """Return the optimal cuts along an axis, and the work of the busiest rank.
+
+        The cuts along the other axes are fixed. Returns None if the boxes do not fit. The method is
+        dynamic programming. w(a, e) is the work of the busiest box between the block boundaries a
+        and e. The least work of the busiest box, with k boxes along the axis up to e, is
+
+            W_1(e) = w(0, e),   W_k(e) = min over a of max(W_(k-1)(a), w(a, e))
+        """
         n, ranks, others = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
         ends = np.append(np.arange(0, n, self.edge), n)
         beside, material = (
@@ -117,7 +130,7 @@ class Load:
             / n
             * (np.minimum(ends + self.layers, n)[None] - np.maximum(ends - self.layers, 0)[:, None])
         )
-        # of the busiest box from a block up to another
+        # Work of the busiest box from a block up to another.
         work = np.where(thick >= min(max(self.layers, self.edge), n), 0.0, np.inf)
         for box, cells in enumerate(beside.ravel()):
             np.maximum(work, through[None, :, box] - through[:, None, box] + cells * seen, out=work)
@@ -142,17 +155,17 @@ def _through(material: np.ndarray, axis: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Balance:
-    """When the boxes of ranks are cut anew.
+    """Rules for repartitioning.
 
-    Whether that is in a step depends on the step's number, on where particles are and on the boxes
-    alone, so that a run that goes on from a checkpoint does the same.
+    Whether a step repartitions depends on the step's number, the particles' positions and the boxes
+    alone, so that a run resumed from a checkpoint does the same.
 
     Args:
-        every: steps between two looks.
-        bound: how many times what it will be the time of a step must be: then a fifth of `every`
-            steps is gained until the next look. To cut anew takes the time of 2 to 3 steps, of 5 to
-            8 where it has to measure a mesh.
-        fixed: what a step takes besides, in cells full of material.
+        every: steps between two checks.
+        bound: least ratio of a step's time to its time after repartitioning. With it a fifth of
+            `every` steps is gained until the next check. Repartitioning takes the time of 2 to 3
+            steps, of 5 to 8 where it has to measure a mesh.
+        fixed: other cost of a step, in cells full of material.
     """
 
     every: int = 20
@@ -160,15 +173,17 @@ class Balance:
     fixed: float = STEP
 
     def should_rebalance(self, part: Subdomain, step: int) -> bool:
-        """Return whether a step looks for other cuts."""
+        """Return whether a step checks the balance."""
         return part.ranks.size > 1 and step % self.every == 0
 
     def rebalance(self, part: Subdomain, particles: Particles, a_cell: int) -> Decomposition | None:
-        """Return boxes that are so much better that the ranks should have them; collective. None: those they have will do.
+        """Return boxes with a better balance, if they are worth the change; collective.
+
+        Returns None if the present boxes are good enough.
 
         Args:
-            part: where this rank works.
-            particles: this rank's, whose totals have been found.
+            part: the subdomain of this rank.
+            particles: this rank's, whose totals have been computed.
             a_cell: particles of a full cell.
         """
         now, layers, fixed = part.decomposition, part.layers, self.fixed
@@ -180,13 +195,14 @@ class Balance:
                 strict=True,
             )
         ]
-        # the same on all ranks
+        # The condition is the same on all ranks.
         if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):
             return None
+        # Each rank searches its share of the box counts; the best result of all ranks counts.
         edge = edge_of_blocks(now.counts, part.ranks.size)
         load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
-        # none end between blocks
+        # The present boxes stay if no boxes end between blocks.
         least, cut = min(
             (found for found in everyone if found is not None), default=(math.inf, now.parts)
         )
@@ -195,7 +211,10 @@ class Balance:
 
 
 def edge_of_blocks(counts: Triple, ranks: int) -> int:
-    """Return the edge of blocks of cells: they are the cells that multigrid gathers, or finer where ranks are many."""
+    """Return the edge of the blocks of cells whose load is measured.
+
+    Blocks are the cells that multigrid gathers, or finer where ranks are many.
+    """
     edge = 1
     while math.prod(-(-n // edge) for n in counts) > max(GATHERED, BLOCKS * ranks):
         edge *= 2
@@ -203,7 +222,7 @@ def edge_of_blocks(counts: Triple, ranks: int) -> int:
 
 
 def blocks(part: Subdomain, particles: Particles, edge: int) -> np.ndarray:
-    """Return how many of all ranks' particles each block of cells has; collective."""
+    """Return the number of all ranks' particles in each block; collective."""
     counts = part.decomposition.counts
     shape = [-(-n // edge) for n in counts]
     place = np.clip(

@@ -1,4 +1,8 @@
-"""Work that ranks end alike: what fails on one fails on all, with a message that names it, and none waits for ever."""
+"""Raise an exception on all ranks if one raises.
+
+An error on one rank ends the operation on all of them with a message that names the rank, so that
+no rank waits for ever.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +20,22 @@ from warp_lcp.distributed.interruptible_wait import finish, waiting
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.watchdog import Watchdog
 
-# seconds that a rank waits for the others after a failure: they may be inside MPI, from where
-# nothing brings them back
+# Seconds that a rank waits for the others after a failure. They may be inside MPI, which cannot be
+# interrupted.
 PATIENCE = 5.0
 SHOWN = 3  # failures in one message
 
 
 class RankFailed(RuntimeError):
-    """Another rank has failed in a way that no message was planned for. The message names the rank and the error."""
+    """An unexpected error of another rank.
+
+    The message names the rank and the error.
+    """
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What went wrong on a rank.
+    """Error of a rank.
 
     Args:
         kind: of the exception.
@@ -75,7 +82,7 @@ class Collective:
         planned: tuple[type[Exception], ...] = (OSError,),
         last_words: Callable[[str], object] = lambda text: None,
     ) -> None:
-        """Take a communicator of its own, so that its messages are never mistaken for others."""
+        """Duplicate the communicator, so that its messages are not mixed with others."""
         self.ranks = ranks
         self.last_words = last_words
         self._planned = planned
@@ -83,7 +90,7 @@ class Collective:
         self.failed: list[int] = []
         self.watchdog: Watchdog | None = None
         self._depth = 0
-        self._told: BaseException | None = None  # what a block has raised on all ranks
+        self._told: BaseException | None = None  # exception that a block has raised on all ranks
 
     @classmethod
     def of_one(cls) -> Collective:
@@ -99,11 +106,11 @@ class Collective:
         return self._block(named=False)
 
     def exchange(self, value: Any) -> list[Any]:
-        """Return an object of every rank."""
+        """Gather an object of every rank."""
         return self._own.collect(value)
 
     def share(self, value: Any) -> Any:
-        """Return the object of the root rank."""
+        """Broadcast the object of the root rank."""
         return self._own.share(value)
 
     def share_of_device(self, device: str) -> float:
@@ -128,12 +135,12 @@ class Collective:
         """End a block.
 
         Args:
-            error: what ends it on this rank.
-            named: say which rank has failed.
+            error: exception that ends it on this rank.
+            named: name the failed rank in the message.
 
         Raises:
-            BaseException: what failed on other ranks, or on this one with a message that tells the
-                rank.
+            BaseException: the exception of other ranks, or of this one with a message that names
+                the rank.
         """
         failure = self._failure(error)
         found = self._meet(error, failure)
@@ -148,7 +155,7 @@ class Collective:
         self._told = error
         fresh = [(rank, other) for rank, other in failed if not other.told]
         if failure is not None and (failure.told or not fresh):
-            return  # the error goes on as it is
+            return  # the exception is raised unchanged
         if error is not None and failure is not None and not failure.planned:
             error.add_note(f"on rank {self.ranks.rank} of {self.ranks.size}")
             return
@@ -167,7 +174,7 @@ class Collective:
         return Failure(kind, text, getattr(error, "errno", None), planned, error is self._told)
 
     def _meet(self, error: BaseException | None, failure: Failure | None) -> list[Failure | None]:
-        """Return how the block ended on every rank."""
+        """Gather the outcome of a block on every rank."""
         if self.ranks.size == 1:
             return [failure]
         while True:
@@ -178,8 +185,8 @@ class Collective:
             found: list[tuple[int, Failure | None]] = self._own.collect((self._depth, failure))
             if max(depth for depth, _ in found) <= self._depth or failure is None:
                 return [other for _, other in found]
-            # a rank that failed between two blocks meets those that were still inside one: they
-            # come again
+            # A rank that failed between two blocks meets ranks that were still inside one: they
+            # gather once more.
 
     def _end_all(self, error: BaseException) -> None:
         text = (
@@ -190,7 +197,7 @@ class Collective:
         self.end_all(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks are aborted")
 
     def told_as(self, error: BaseException) -> BaseException:
-        """Return the error to raise in place of a block's error; the same on all ranks."""
+        """Return the exception to raise for a block's error; the same on all ranks."""
         self._told = error
         return error
 
@@ -201,10 +208,10 @@ class Collective:
 
 
 def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
-    """Return one error for what failed on some ranks."""
+    """Return one exception for the failures of some ranks."""
     first = failed[0][1]
     texts = list(_lines(failed)) if named else [first.text]
-    # without __init__, whose arguments are not the same for all kinds
+    # Without __init__, whose arguments differ between exceptions.
     error = first.kind.__new__(first.kind)
     error.args = ("; ".join(texts),)
     if isinstance(error, OSError):
@@ -228,7 +235,10 @@ def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
 
 
 def on_root(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Have the root rank alone run a method of an object with a `collective`: the others get None, and its error is theirs."""
+    """Run a method on the root rank alone; errors are raised on all ranks.
+
+    The object has a `collective`. The other ranks get None.
+    """
 
     @functools.wraps(method)
     def collective(self: Any, *arguments: Any, **options: Any) -> Any:

@@ -1,4 +1,8 @@
-"""Components that may reach over several ranks: each finds the parts in its box, which are then joined as the nodes of a graph."""
+"""Connected components over several ranks.
+
+Each rank finds the parts in its box. The parts are the nodes of a graph, whose components are then
+found.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,14 @@ import scipy.sparse.csgraph
 
 from warp_lcp.distributed.ranks import Ranks
 
-GROUND = 0  # what holds a component, among the nodes of the graph
+GROUND = 0  # node of the graph that stands for all supports
 
 
 def nodes_of(ranks: Ranks, counts: np.ndarray) -> tuple[int, int]:
-    """Return the node of this rank's first part, and how many nodes there are, of how many parts each rank has."""
+    """Return the node of this rank's first part, and the number of all nodes.
+
+    The argument is the number of parts of each rank.
+    """
     return 1 + int(counts[: ranks.rank].sum()), 1 + int(counts.sum())
 
 
@@ -20,9 +27,9 @@ def joined(ranks: Ranks, nodes: int, edges: np.ndarray) -> np.ndarray:
     """Return the number of each node's component, shape (nodes,); collective.
 
     Args:
-        ranks: who have the parts.
-        nodes: how many.
-        edges: pairs of nodes that this rank knows to belong together, int32, shape (n, 2).
+        ranks: that have the parts.
+        nodes: number of nodes.
+        edges: pairs of nodes that are connected, as far as this rank knows, int32, shape (n, 2).
     """
     everyone = np.concatenate(ranks.collect(edges))
     graph = scipy.sparse.coo_matrix(

@@ -1,4 +1,7 @@
-"""How a grid's cells are shared by the ranks: boxes, one a rank, whose cuts lie where coarse cells end."""
+"""Domain decomposition: one box of cells a rank.
+
+Cuts lie on the boundaries of coarse cells.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,8 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.settings import renamed_method
 
-# the largest part may exceed an even share by this factor, so that cuts lie at multiples of large
-# powers of two
+# The largest part may exceed an even share by this factor, so that cuts lie at multiples of large
+# powers of two.
 UNEVEN = 1.125
 
 
@@ -47,7 +50,8 @@ class Decomposition:
         >>> from warp_lcp.distributed import Decomposition, Ranks
         >>> def operator(n):
         ...     boxes = Decomposition((n, n, n), Ranks.world())
-        ...     return wl.GridPoisson(np.full(boxes.box.counts[::-1], wl.FLUID), decomposition=boxes)
+        ...     cells = np.full(boxes.box.counts[::-1], wl.FLUID)
+        ...     return wl.GridPoisson(cells, decomposition=boxes)
     """
 
     def __init__(
@@ -87,7 +91,7 @@ class Decomposition:
         other = Decomposition(
             self.counts, self.ranks, processes=(px, py, pz), cuts=cuts, periodic=self.periodic
         )
-        other.collective = self.collective  # a communicator of its own for each would use them up
+        other.collective = self.collective  # MPI would run out of communicators if each had its own
         return other
 
     cut_anew = renamed_method("cut_anew", repartition)
@@ -131,7 +135,7 @@ class Decomposition:
     def neighbor(self, axis: int, side: int) -> int | None:
         """Return the neighbor rank at the lower (0) or upper (1) side along an axis.
 
-        None at a side of the domain.
+        Returns None at a side of the domain.
         """
         place = list(self.place(self.ranks.rank))
         place[axis] += 2 * side - 1
@@ -145,7 +149,7 @@ class Decomposition:
     def coarser(self, factors: Triple) -> Decomposition | None:
         """Return the decomposition of aggregates of cells along x, y, z.
 
-        None if a box boundary would cut an aggregate, or a rank would have no cells.
+        Returns None if a box boundary would cut an aggregate, or a rank would have no cells.
         """
         new = []
         for part, factor in zip(self.parts, factors, strict=True):
@@ -163,12 +167,12 @@ class Decomposition:
 
     @property
     def ghosts(self) -> Halo | None:
-        """Halo exchange of operators; None: there is one rank."""
+        """Halo exchange of operators; None if there is one rank."""
         return self.halo if self.ranks.size > 1 else None
 
     @property
     def across(self) -> Ranks | None:
-        """The ranks, as sums take them; None: there is one."""
+        """The ranks as the communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
     def together(self) -> AbstractContextManager[Any]:
@@ -178,7 +182,7 @@ class Decomposition:
     def check_operator(
         self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
     ) -> None:
-        """Refuse a grid operator that does not fit the boxes; collective.
+        """Check that a grid operator fits the boxes; collective.
 
         Args:
             shape: of its cells.
@@ -240,7 +244,9 @@ class Decomposition:
 
 
 def parts(n: int, p: int) -> list[int]:
-    """Return how many of n cells each of p ranks has: about as many, with cuts at multiples of a power of two.
+    """Return the number of cells of each of p ranks, for n cells.
+
+    The numbers are about equal, with cuts at multiples of a power of two.
 
     >>> parts(129, 2), parts(100, 3)
     ([64, 65], [32, 32, 36])
@@ -256,7 +262,10 @@ def parts(n: int, p: int) -> list[int]:
 
 
 def _processes(counts: Triple, size: int) -> Triple:
-    """Return the ranks along x, y, z with the least cells at cuts; of equal ones those that cut z, whose planes lie in one piece."""
+    """Return the ranks along x, y, z with the fewest cells at cuts.
+
+    Among equals, the numbers that cut z are chosen: planes of constant z are contiguous.
+    """
     nx, ny, nz = counts
     found = [
         ((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz))
@@ -272,7 +281,10 @@ def _processes(counts: Triple, size: int) -> Triple:
 
 
 def cuttings(counts: Triple, size: int) -> list[Triple]:
-    """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
+    """Return all numbers of ranks along x, y, z whose product is `size`.
+
+    Each rank has at least one cell.
+    """
     divisors = [p for p in range(1, size + 1) if size % p == 0]
     triples = [
         (px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0
@@ -280,7 +292,7 @@ def cuttings(counts: Triple, size: int) -> list[Triple]:
     return [p for p in triples if all(a <= n for a, n in zip(p, counts, strict=True))]
 
 
-# of the work that a cell full of material makes: what a cell without makes, ghost cells too
+# Work of a cell without material, ghost cells too, relative to a cell full of material.
 OPEN = 0.1
 
 Corners = tuple[np.ndarray, np.ndarray]  # low and high x, y, z of a box of material, in cells
@@ -289,7 +301,9 @@ Corners = tuple[np.ndarray, np.ndarray]  # low and high x, y, z of a box of mate
 def balanced_processes(
     counts: Triple, size: int, *, layers: int, states: Sequence[Sequence[Corners]]
 ) -> Triple | None:
-    """Return the ranks along x, y, z for which the busiest has least to do; None if there are too many for the grid.
+    """Return the ranks along x, y, z with the least work of the busiest rank.
+
+    Returns None if there are too many ranks for the grid.
 
     Args:
         counts: cells (nx, ny, nz).
@@ -310,13 +324,14 @@ def balanced_processes(
 
 
 def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> Corners:
-    """Return the box that some cells of material fill when they have come to rest.
+    """Return the box that material fills at rest.
 
     Args:
         counts: cells (nx, ny, nz).
         dimension: 2 or 3.
         volume: of the material, in cells.
-        gravity: [m/s^2]; the box lies at the side that it points to most; 0: it is the whole grid.
+        gravity: [m/s^2]; the box lies at the side along its largest component; 0: it is the whole
+            grid.
     """
     low, high = np.zeros(3), np.array(counts, dtype=float)
     axis = int(np.argmax(np.abs(gravity[:dimension])))
@@ -333,7 +348,7 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
 def _most_work(
     counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]
 ) -> float:
-    """Return what the busiest rank has to do, in cells full of material."""
+    """Return the work of the busiest rank, in cells full of material."""
     low, high = _ends(cuts)
     work = OPEN * seen_by(counts, cuts, layers)
     for corners in state:
@@ -347,7 +362,10 @@ def _most_work(
 
 
 def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.ndarray:
-    """Return how many cells each box has with its ghost layers, shape (boxes along x, y, z)."""
+    """Return the number of cells of each box with its ghost layers.
+
+    Shape (boxes along x, y, z).
+    """
     return _of_boxes(
         [
             np.minimum(h + layers, n) - np.maximum(l - layers, 0)
@@ -357,12 +375,12 @@ def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.nd
 
 
 def _ends(cuts: Sequence[Sequence[int]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return where boxes begin and end along x, y, z."""
+    """Return the first and end indices of boxes along x, y, z."""
     ends = [np.cumsum([0, *cut]) for cut in cuts]
     return [end[:-1] for end in ends], [end[1:] for end in ends]
 
 
 def _of_boxes(sides: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the volumes of all boxes from the lengths of their sides along x, y, z."""
+    """Return the volumes of all boxes from the lengths of their sides."""
     x, y, z = sides
     return np.multiply.outer(np.multiply.outer(x, y), z)

@@ -1,4 +1,4 @@
-"""How far material and velocities that are continued go beyond a rank's box."""
+"""Reach of particles and extrapolated velocities beyond a rank's box."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ import warp as wp
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-# layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so
-# far
+# Layers of ghost cells that stay correct during velocity extrapolation: cut cells read faces at
+# this distance.
 LEAST_RIGHT = 2
 
 
 def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
-    """Return how many cells a face's velocity goes in a time step that may take particles out of the ghost layers; 0: none does.
+    """Return the largest displacement [cells] that may leave the ghost layers.
 
-    A particle at most looks at faces three quarters of its way from where it starts, so that those
-    deep in the box may be faster. Values that are not finite are left to the particles to tell.
+    Returns 0 if no particle can leave them. A particle reads faces up to three quarters of its path
+    from its start, so faces deep in the box may be faster. Values that are not finite are not
+    counted: the particles report them.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         velocity: of each component on the faces [m/s].
         dt: time step [s].
     """
@@ -33,7 +34,8 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
         if not any(sides):
             continue
         host, others = field.numpy(), tuple(n for n in range(3) if n != 2 - axis)
-        if max(host.max(), -host.min()) * (dt / part.grid.spacing) <= most:  # usual, and cheap
+        # The usual case, and cheap.
+        if max(host.max(), -host.min()) * (dt / part.grid.spacing) <= most:
             continue
         way = np.maximum(host.max(axis=others), -host.min(axis=others)) * (dt / part.grid.spacing)
         face = np.arange(len(way))
@@ -45,18 +47,24 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
 
 
 class Refill:
-    """Called after every layer that velocities are continued by: fills the ghost layers before what is wrong in them comes near the box.
+    """Halo exchange of ghost layers during velocity extrapolation.
+
+    The extrapolation calls it after every layer. Ghost layers are filled before wrong values in
+    them can reach the box.
 
     Args:
-        part: where this rank works; its ghost layers have been filled.
+        part: the subdomain of this rank; its ghost layers have been filled.
     """
 
     def __init__(self, part: Subdomain) -> None:
         self._part = part
-        self._right: dict[int, int] = {}  # layers that are right, by the field's address
+        self._right: dict[int, int] = {}  # number of correct layers, by the field's address
 
     def __call__(self, marks: wp.array, field: wp.array) -> None:
-        """Note a layer of a component; collective."""
+        """Count a layer of a component; collective.
+
+        If few layers are left correct, it exchanges halos.
+        """
         right = self._right.get(field.ptr, self._part.layers) - 1
         if right <= LEAST_RIGHT:
             self._part.fill(marks, field)

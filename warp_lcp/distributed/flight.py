@@ -1,4 +1,7 @@
-"""Bodies of material in flight that reach over several ranks: which trees of cells, one rank's each, make one body."""
+"""Airborne bodies of material that extend over several ranks.
+
+A body consists of trees of cells, each of one rank, which are joined at the cuts.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +17,20 @@ from warp_lcp.grid.staggered import Window
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-ALONE = -1  # of a cell that belongs to nothing
+ALONE = -1  # a cell that belongs to no body
 Plane = tuple[tuple[slice, ...], np.ndarray]  # cells, and their nodes
 
 
 class TreesAtCuts:
-    """Join the trees of several ranks to bodies.
+    """Joins the trees of several ranks to bodies.
 
-    A rank grows the trees of its cells and of those beside them at cuts, where weights are right.
+    A rank grows the trees of its cells and of those beside them at cuts, where weights are correct.
     Its trees are nodes of a graph, whose edges are cells that two ranks know. Sums over the
-    particles of a body are whole numbers, so that those of all ranks, of bodies that several have
-    trees of, are one process's to the bit; a rank keeps all others to itself.
+    particles of a body are whole numbers, so that sums over several ranks have the bits of one
+    process. Only bodies with trees on several ranks are summed over ranks.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
     """
 
     def __init__(self, part: Subdomain) -> None:
@@ -40,7 +43,10 @@ class TreesAtCuts:
         ]
 
     def _planes(self, axis: int, side: int) -> list[Window]:
-        """Return the cells of the box at a cut, and those beyond it, with the rings at the domain's sides."""
+        """Return the box's cells at a cut and the cells beyond it.
+
+        The rings at the domain's sides are included.
+        """
         known, place = self._part.known, 2 - axis
         first, planes = (
             self._part.owned.high[place] - 1 if side else self._part.owned.low[place],
@@ -53,20 +59,22 @@ class TreesAtCuts:
         return planes
 
     def join(self, trees: int, seen: Window | None, *found: wp.array) -> BodyNumbers:
-        """Number the bodies that this rank knows, first those that several ranks have trees of; collective.
+        """Number the bodies of this rank, those on several ranks first; collective.
 
         Args:
-            trees: how many this rank has found.
+            trees: number of trees that this rank has found.
             seen: the cells that it has looked at; None: none.
             found: parent, number and held of `GridPart.join_trees`.
         """
         part, ranks = self._part, self._part.ranks
         planes = self._nodes_at_cuts(seen, *found) if trees else []
+        # Without trees at the cuts of any rank, every body belongs to one rank.
         near = any(bool((nodes > GROUND).any()) for pair in planes for _, nodes in pair)
         everyone = ranks.gather(np.array([trees, near]))
         if not everyone[:, 1].any():
             return BodyNumbers(trees)
         planes = planes or self._nodes_at_cuts(seen, *found)
+        # The nodes of this rank's planes are exchanged; a cell that two ranks know is an edge.
         first, count = nodes_of(ranks, everyone[:, 0])
         grid = np.full(part.grid.shape, ALONE, dtype=np.int32)
         for pair in planes:
@@ -80,6 +88,7 @@ class TreesAtCuts:
             both = np.stack([nodes.ravel(), grid[cells].ravel()], axis=1)
             edges.append(both[(both > ALONE).all(axis=1)])
         component = joined(ranks, count, np.unique(np.concatenate(edges), axis=0))
+        # Bodies of several trees are numbered first, then those that are this rank's alone.
         several = np.bincount(component) > 1
         several[component[GROUND]] = False
         mine, shared = component[first : first + trees], int(several.sum())
@@ -102,7 +111,10 @@ class TreesAtCuts:
         number: np.ndarray,
         held: np.ndarray,
     ) -> Plane:
-        """Return those of a plane's cells that were seen, and their nodes with this rank's first tree as 1, int32, in their shape."""
+        """Return the cells of a plane that were seen, and their nodes.
+
+        The nodes count from 1 for this rank's first tree; int32, in the cells' shape.
+        """
         inside = None if seen is None else plane.common(seen)
         if inside is None:
             return (slice(0), slice(0), slice(0)), np.zeros((0, 0, 0), dtype=np.int32)

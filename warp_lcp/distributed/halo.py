@@ -78,7 +78,7 @@ class Halo:
 
     def coarser(self, factors: tuple[int, int, int]) -> Halo | None:
         """Return the halo of aggregates of cells along x, y, z; None if one is cut."""
-        if factors not in self._coarser:  # solves on the same boxes share what it takes to exchange
+        if factors not in self._coarser:  # solves on the same boxes share the exchanges
             decomposition = self.decomposition.coarser(factors)
             self._coarser[factors] = (
                 None if decomposition is None else Halo(decomposition, self.width)
@@ -88,40 +88,45 @@ class Halo:
     def join_components(
         self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]
     ) -> np.ndarray | None:
-        """Join components of this rank's cells with those of others; collective.
+        """Join components of this rank's cells with those of other ranks; collective.
 
-        Components of boxes that nothing holds are nodes of a graph, whose edges are open faces at
-        cuts; one more node is all that is held.
+        Free components of boxes are nodes of a graph, whose edges are open faces at cuts. One more
+        node stands for all held components.
 
         Args:
-            number: of the component of each stored cell, flat, from 0; -1: none, or something holds
-                it.
-            held: which stored cells belong to components that something holds, bool.
+            number: of the component of each stored cell, flat, from 0; -1: none, or it is held.
+            held: mask of the stored cells that belong to held components, bool.
             faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
 
         Returns:
-            The numbers of the joined components that nothing holds on any rank, int32, flat, from
-            0, -1 elsewhere; None: there are none.
+            The numbers of the joined components that are held on no rank, int32, flat, from 0, -1
+            elsewhere; None: there are none.
         """
         ranks = self.decomposition.ranks
+        # Nodes of the graph: GROUND for all held components, then the free ones, rank by rank.
         first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
         node = np.where(number >= 0, number + first, np.where(held, GROUND, -1)).astype(np.int32)
         component = joined(ranks, nodes, self._edges(node, faces))
         floating = component != component[GROUND]
         if not floating.any():
             return None
+        # The joined components that are not connected with GROUND are numbered from 0.
         names = np.full(nodes, -1, dtype=np.int32)
         names[floating] = np.unique(component[floating], return_inverse=True)[1]
         return np.where(number >= 0, names[np.maximum(node, 0)], -1).astype(np.int32)
 
     def _edges(self, node: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray:
-        """Return the pairs of nodes of this rank and its neighbors between which a face at a cut is open, shape (n, 2)."""
+        """Return pairs of nodes of neighboring ranks that an open face connects.
+
+        The face lies at a cut. Shape (n, 2).
+        """
         found, grid = [], node.reshape(self.shape).copy()
-        # ghost cells at the domain's sides are not written
+        # Ghost cells at the domain's sides are not written.
         for axis in self.decomposition.cut_axes:
             for end in (0, -1):
                 grid[(*[slice(None)] * (2 - axis), end, ...)] = -1
         self.fill(grid)
+        # An edge connects a ghost cell below a cut with the first cell of the box above it.
         for axis in self.decomposition.cut_axes:
             lower = [slice(1, -1)] * 3
             lower[2 - axis] = slice(0, 1)
@@ -137,7 +142,7 @@ class Halo:
 
     @cached_property
     def gathering(self) -> Gathering:
-        """Gathers the fields of all ranks on every rank."""
+        """Gathering of the fields of all ranks on every rank."""
         return Gathering(self.decomposition)
 
     def fill(self, field: wp.array[Any] | np.ndarray) -> None:
@@ -166,7 +171,11 @@ class Halo:
         )
 
     def _fill_through_host(self, field: wp.array[Any]) -> None:
-        """Fill a field on a device: what lies within the width of the cuts goes through the host's memory, PETSc needs no CUDA then."""
+        """Fill a field on a device.
+
+        Cells within `width` of the cuts are copied through the host's memory, so that PETSc needs
+        no CUDA.
+        """
         assert self._forest is not None
         host = self._staging.setdefault(
             field.dtype, np.zeros(self.shape, dtype=wp.dtype_to_numpy(field.dtype))
@@ -181,7 +190,10 @@ class Halo:
             )
 
     def _slabs(self, *, ghost: bool) -> list[tuple[slice, ...]]:
-        """Return the slabs of a stored field beside this rank's cuts: ghost cells, or the cells that other ranks' ghost cells repeat."""
+        """Return the slabs of a stored field beside this rank's cuts.
+
+        They are ghost cells, or the cells that other ranks have as ghost cells.
+        """
         found, w = [], self.width
         for axis, side in self.cuts:
             n = self.shape[2 - axis]
@@ -193,7 +205,9 @@ class Halo:
 
 
 class Gathering:
-    """Collects what the ranks store for their boxes into one field of the whole grid on every rank; both have one layer of ghost cells.
+    """Gathers a field of all boxes into one field of the whole grid on every rank.
+
+    Both fields have one layer of ghost cells.
 
     Args:
         decomposition: the boxes.
@@ -230,7 +244,7 @@ class Gathering:
         )
 
     def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = launch_now) -> None:
-        """Write this rank's part of the whole grid's field to its own, ghost cells too."""
+        """Write this rank's part of the whole grid's field to its own, with ghost cells."""
         given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
         launch(take_kernel, self._shape[:2], given, device=mine.device)
 
@@ -253,16 +267,16 @@ for _T in (wp.float32, wp.float64):
 class StarForest:
     """A star forest of PETSc that is freed with the last reference to it.
 
-    What Python frees as a part of a cycle petsc4py keeps for PETSc's own end, for which ranks wait
-    for ever unless all have kept equally much; but each looks for cycles at another time.
+    petsc4py keeps objects that Python's garbage collector frees until PETSc ends. Ranks then wait
+    for ever unless all have kept equally many, but each collects garbage at another time.
 
     Args:
-        made: the forest, of no use when this is gone.
+        made: the forest, invalid after this object is freed.
 
     Attributes:
         handle: PETSc's handle of it, which recorded exchanges read in each run.
-        pairs: units and addresses of roots and leaves that recorded exchanges read, by what they
-            hold.
+        pairs: units and addresses of roots and leaves that recorded exchanges read, by their
+            content.
     """
 
     def __init__(self, made: Any) -> None:
@@ -272,7 +286,7 @@ class StarForest:
         self.pairs: dict[tuple[int, ...], Any] = {}
 
     def replace(self, made: Any) -> None:
-        """Free the forest and use another one, in recorded exchanges too; collective."""
+        """Free the forest and use another one, also in recorded exchanges; collective."""
         self.free()
         self.made, self.free = made, weakref.finalize(self, made.destroy)
         self.handle[0] = made.handle
@@ -290,19 +304,21 @@ def star_forest(
     shifts: Sequence[Triple] = ((0, 0, 0),),
     into: StarForest | None = None,
 ) -> StarForest:
-    """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
+    """Return a star forest that fills ghost cells; collective.
+
+    Its leaves are this rank's ghost cells, its roots the cells of other ranks that they repeat.
 
     Args:
-        ranks: who have the boxes.
-        owned: the cells that each rank is the one to know; they do not overlap.
+        ranks: that have the boxes.
+        owned: the cells that each rank owns; they do not overlap.
         stored: the cells that each rank stores.
-        filled: the ghost cells that are wanted lie in it; None: all.
+        filled: region of the ghost cells to fill; None: all.
         layers: of numbers of those cells, one behind the other.
-        whole: the cells of other fields, in which what each rank knows is wanted, this one too;
-            None: leaves lie among the roots.
-        which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx);
-            None: all.
-        shifts: cells along x, y, z by which what ranks know lies around this one again.
+        whole: the cells of other fields that receive the values of all ranks, this rank's too;
+            None: leaves and roots lie in the same field.
+        which: mask of the stored cells to fill, bool of their shape (nz, ny, nx); None: all.
+        shifts: periodic images: cells along x, y, z by which owned cells are repeated around this
+            rank.
         into: a forest that this one replaces, see `StarForest.replace`; None: there is none.
     """
     mine, roots = ranks.rank, layers * stored[ranks.rank].cells
@@ -330,7 +346,7 @@ def star_forest(
 
 
 def _elements(box: CellBox, within: CellBox) -> np.ndarray:
-    """Return where a box's cells lie in a flat array of the cells of another box."""
+    """Return the indices of a box's cells in a flat array of another box's cells."""
     nx, ny, _ = within.counts
     x, y, z = (np.arange(l, h) - o for l, h, o in zip(box.low, box.high, within.low, strict=True))
     return ((z[:, None, None] * ny + y[:, None]) * nx + x).ravel()

@@ -1,4 +1,4 @@
-"""What this process waits in for other ranks, and how it waits."""
+"""Waits for other ranks that can be observed and interrupted."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ import math
 import time
 from typing import Any, Self
 
-# seconds that a wait spends asking: between two operations ranks rarely differ by more
+# Seconds that a wait polls: between two operations ranks rarely differ by more.
 AWAKE = 1e-3
-SHARE = 1 / 16  # of a wait's length so far, which a rank that has nothing to do sleeps at a time
-LONGEST = 5e-3  # seconds of such a sleep
+SHARE = 1 / 16  # length of a sleep of a waiting rank, relative to its wait so far
+LONGEST = 5e-3  # longest sleep [s]
 
 
 class InterruptibleWait:
-    """Tells others, such as a `Watchdog`, whether this process is inside an operation that other ranks take part in.
+    """State of collective operations: whether this process is inside one.
+
+    Others read it, such as a `Watchdog`.
 
     Attributes:
         native: entries and exits of operations in native code, and the error of the first one that
             has failed, 0 while none has.
 
-    >>> waiting = Waiting()
+    >>> waiting = InterruptibleWait()
     >>> with waiting("a sum"):
     ...     waiting.name, waiting.count
     ('a sum', 1)
@@ -34,12 +36,12 @@ class InterruptibleWait:
 
     @property
     def name(self) -> str:
-        """Of the operation, "" outside."""
+        """Name of the operation, "" outside."""
         return "an exchange among launches" if self.native[0] % 2 else self._name
 
     @property
     def count(self) -> int:
-        """Of entries and exits so far."""
+        """Number of entries and exits so far."""
         return self._count + int(self.native[0])
 
     def __call__(self, name: str) -> Self:
@@ -57,11 +59,14 @@ class InterruptibleWait:
         self._count += 1
 
 
-waiting = InterruptibleWait()  # MPI's world is one a process, and its main thread alone is in it
+waiting = InterruptibleWait()  # MPI's world is one per process, and only its main thread uses MPI
 
 
 def finish(request: Any, seconds: float = math.inf) -> bool:
-    """Wait for a request of MPI without using up a core, and return whether it has ended within some seconds."""
+    """Wait for an MPI request for some seconds; return whether it has ended.
+
+    The wait does not use a core.
+    """
     begun = time.monotonic()
     while not request.Test():
         waited = time.monotonic() - begun

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-# where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
+# Directory of Debian's builds, from which petsc4py chooses by PETSC_DIR.
 DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"
 INSTALL = (
     "install MPI, petsc4py and mpi4py (the extra `distributed`, or Debian's "
@@ -23,20 +23,21 @@ HOW_TO_INSTALL = (
     "with --system-site-packages and numpy < 2, "
     "and PETSC_DIR set to a folder like /usr/lib/petscdir/petsc3.18/x86_64-linux-gnu-real"
 )
-# Open MPI: more ranks than cores, none bound to a core, root; MPICH allows all of that and ignores
-# these names
+# Open MPI: allow more ranks than cores, do not bind ranks to cores, allow root. MPICH allows all of
+# that and ignores these names.
 OPEN_MPI = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
     "OMPI_MCA_hwloc_base_binding_policy": "none",
-    "OMPI_MCA_mpi_yield_when_idle": "1",  # a rank that waits gives its core to others
-    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",  # the same of Open MPI 5
+    "OMPI_MCA_mpi_yield_when_idle": "1",  # a waiting rank yields its core to others
+    # The option for oversubscription in Open MPI 5.
+    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
     "PRTE_MCA_hwloc_default_binding_policy": "none",
 }
-# each rank has a core, not a machine
+# A rank has one core, not all of the machine.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-# what mpiexec and srun tell the processes that they start
+# Environment variables that mpiexec and srun set for their processes.
 RANK = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
 
 
@@ -51,10 +52,8 @@ def rank_here() -> int | None:
 def find_petsc() -> None:
     """Add Debian's petsc4py to the import path of this interpreter.
 
-    It is located next to the PETSc build that PETSC_DIR names when Python starts.
-
-    Does nothing where petsc4py is found already, where PETSC_DIR is set, and in an interpreter
-    without Debian's mpi4py.
+    It is located next to the PETSc build that PETSC_DIR names when Python starts. Does nothing if
+    petsc4py is found already, if PETSC_DIR is set, and in an interpreter without Debian's mpi4py.
     """
     if (
         "PETSC_DIR" in os.environ

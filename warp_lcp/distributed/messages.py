@@ -1,4 +1,7 @@
-"""Messages between ranks, now or as operations of the team: a program's passes and the exchanges between them are one table then."""
+"""Messages between ranks, at once or as operations of the thread pool.
+
+Recorded, the kernels of a program and the exchanges between them form one operation table.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,10 @@ COUNT, DATA = 7101, 7102  # tags of messages
 
 
 class Mailbox(Protocol):
-    """Carries messages from each rank to its neighbors."""
+    """Mailbox: carries messages from each rank to its neighbors."""
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """Return what the neighbors have sent, in the order of their ranks.
+        """Return the messages of the neighbors, in the order of their ranks.
 
         Args:
             outgoing: an array of one type for every neighbor, of any length.
@@ -33,7 +36,7 @@ class Mailbox(Protocol):
 
 
 class MpiMailbox:
-    """Messages of MPI.
+    """Mailbox by MPI messages.
 
     Args:
         comm: of mpi4py.
@@ -43,7 +46,7 @@ class MpiMailbox:
         self._comm = comm
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """Send lengths, then what is not empty."""
+        """Exchange messages: first their lengths, then those that are not empty."""
         from mpi4py import MPI
 
         neighbors, comm = sorted(outgoing), self._comm
@@ -86,7 +89,8 @@ for (int i = 0; i < 2; ++i)
     for (int p = 0; p < count; ++p)
         if (!told[1]) {
             const unsigned long long* pair = pairs + 3*p;
-            told[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], (void*)pair[2], (void*)replace_); }
+            told[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], \
+(void*)pair[2], (void*)replace_); }
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
@@ -99,18 +103,21 @@ def copy_to_leaves(
     count: int,
     told_: wp.uint64,
 ):
-    """Call PetscSFBcastBegin for each pair, a unit and the addresses of roots and leaves, then PetscSFBcastEnd.
+    """Copy roots to leaves: PetscSFBcastBegin for each pair, then PetscSFBcastEnd.
 
-    `forest_` is the address of the star forest's handle, read in each run.
+    A pair is three addresses: the unit, the roots and the leaves. `forest_` is the address of the
+    star forest's handle, read in each run.
     """
 
 
 @wp.func_native("""
 #ifndef __CUDA_ARCH__
-unsigned long long* told = (unsigned long long*)told_; double* sums = (double*)sums_; double* of_all = (double*)of_all_;
+unsigned long long* told = (unsigned long long*)told_; double* sums = (double*)sums_; \
+double* of_all = (double*)of_all_;
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 typedef int Fault; typedef Fault (*Call)(const void*, int, void*, void*, int, void*, void*);
-if (!told[1]) told[1] = ((Call)gather_)(sums, count, (void*)unit_, of_all, count, (void*)unit_, (void*)comm_);
+if (!told[1]) told[1] = ((Call)gather_)(sums, count, (void*)unit_, \
+of_all, count, (void*)unit_, (void*)comm_);
 for (int c = 0; c < count; ++c) {
     double sum = of_all[c];
     for (int r = 1; r < ranks; ++r) sum += of_all[r*count + c];
@@ -156,15 +163,15 @@ def add_kernel(
     ranks: int,
     told: wp.uint64,
 ):
-    """Add to sums those of the other ranks; one thread, on the CPU."""
+    """Add the sums of the other ranks; one thread, on the CPU."""
     add_of_all(gather, unit, comm, sums, of_all, count, ranks, told)
 
 
 class _Library:
-    """Functions of PETSc and MPI, and MPI's constants, as C takes them.
+    """Functions of PETSc and MPI, and MPI's constants, for calls from C.
 
-    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog
-    either: PETSc is called directly.
+    PETSc is called directly, because petsc4py holds Python's interpreter lock while PETSc waits for
+    other ranks, and then no watchdog could run.
     """
 
     def __init__(self) -> None:
@@ -187,7 +194,10 @@ _library = cache(_Library)
 
 
 def handle(of: Any) -> Any:
-    """Return what C calls an object of mpi4py: Open MPI's are pointers, MPICH's numbers."""
+    """Return the C handle of an mpi4py object.
+
+    Open MPI's handles are pointers, MPICH's are numbers.
+    """
     from mpi4py import MPI
 
     kind = ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
@@ -200,7 +210,9 @@ def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = 
 
 
 def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-    """Copy roots to leaves over a star forest, many of them at once: their messages are under way together.
+    """Copy roots to leaves of a star forest, many pairs at once.
+
+    Their messages are in transit together.
 
     Raises:
         RuntimeError: PETSc has failed.
@@ -221,12 +233,12 @@ def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarra
 
 
 def exchanging(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
-    """Return `exchange` as an operation of the team."""
+    """Return `exchange` as an operation of the thread pool."""
     return exchanging_all(forest, [(roots, leaves)])
 
 
 def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Operation:
-    """Return `exchange_all` as an operation of the team."""
+    """Return `exchange_all` as an operation of the thread pool."""
     library = _library()
     functions = (ctypes.cast(call, ctypes.c_void_p).value for call in (library.begin, library.end))
     listed = [
@@ -245,7 +257,10 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
 
 
 def adding(comm: Any, sums: np.ndarray) -> Operation:
-    """Return what replaces float64 sums by those over all ranks, in their order, as an operation of the team."""
+    """Return an operation that replaces float64 sums by those over all ranks.
+
+    The partial sums are added in the order of the ranks. The operation runs in the thread pool.
+    """
     library, of_all = _library(), np.empty((comm.size, sums.size))
     given = [
         ctypes.cast(library.gather, ctypes.c_void_p).value,
@@ -260,7 +275,7 @@ def adding(comm: Any, sums: np.ndarray) -> Operation:
 
 
 def _operation(kernel: Any, given: list[Any], kept: Any) -> Operation:
-    # handles of MPICH may be negative
+    # Handles of MPICH may be negative.
     words = [word & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]
     launch = wp.launch(kernel, 1, words, device="cpu", record_cmd=True)
     operation = launched_alone(launch, kept)

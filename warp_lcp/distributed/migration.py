@@ -1,4 +1,4 @@
-"""Pieces of a state that go from the ranks that have them to those whose boxes they are in."""
+"""Migration of a state's pieces to the ranks of new boxes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ if TYPE_CHECKING:
 
 
 def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subdomain) -> Piece:
-    """Send each rank what of this one's piece lies in the box that it has now, and return the piece of this rank's box; collective.
+    """Send pieces of particles to the ranks of new boxes; collective.
 
     Args:
-        piece: this rank's, of where it worked `before`.
+        piece: this rank's, of the part `before`.
         particles: names of the particles' arrays.
-        before: the part that the piece is of.
-        now: that of other boxes of the same ranks.
+        before: the part that the piece belongs to.
+        now: the part with the new boxes of the same ranks.
+
+    Returns:
+        The piece of this rank's new box.
     """
     mine, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
 
-    def gives(giver: int, taker: int) -> bool:  # particles move on to their rank when a step begins
+    def gives(giver: int, taker: int) -> bool:  # particles migrate when a step begins
         return now.decomposition.meet(old[giver].grown(before.layers), new[taker])
 
     others = [
@@ -58,7 +61,7 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
 
 
 def _cut_out(values: np.ndarray, box: CellBox, other: CellBox) -> np.ndarray:
-    """Return the values of a box's cells that are in another one too, one after another."""
+    """Return the values of a box's cells that lie in another box, too, flat."""
     shared = box.common(other)
     return (
         values[..., *shared.moved(box.low, -1).slices].ravel()
@@ -68,11 +71,13 @@ def _cut_out(values: np.ndarray, box: CellBox, other: CellBox) -> np.ndarray:
 
 
 def cuts_of(pieces: Sequence[Piece], part: Subdomain) -> list[list[int]] | None:
-    """Return how many cells along x, y, z the boxes of pieces have, if ranks can have the same; else None.
+    """Return the boxes' sizes in pieces, in cells along x, y, z, if usable.
+
+    Returns None if the ranks cannot have the same boxes.
 
     Args:
         pieces: of all ranks, in their order.
-        part: where this rank works now.
+        part: the subdomain of this rank.
     """
     now = part.decomposition
     if len(pieces) != now.ranks.size or any("box" not in piece for piece in pieces):

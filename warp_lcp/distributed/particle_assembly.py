@@ -1,4 +1,4 @@
-"""The start of particles on ranks: which rank has which box."""
+"""Initial boxes of ranks for a scene with particles."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ NOT_ON_RANKS = (
 def check_shared(
     scene: ParticleScene, ranks: Ranks, refused: Sequence[str], methods: Sequence[str]
 ) -> None:
-    """Refuse a scene that is not the same on all ranks, or asks for what runs on ranks have not; collective.
+    """Reject a scene that differs between ranks or cannot run on ranks; collective.
 
     Args:
         scene: the scene.
-        ranks: who share it.
-        refused: keys of it.
+        ranks: that share it.
+        refused: keys of the scene that are not available on ranks.
         methods: that solve problems of several ranks.
 
     Raises:
@@ -53,16 +53,18 @@ def part_of(
     smoothing: int = 0,
     balance: Balance = DEFAULT_BALANCE,
 ) -> Subdomain:
-    """Return where this rank works: all have about as much material, at the start and when it has come to rest; collective.
+    """Return this rank's part of the grid; collective.
+
+    The ranks have about equal amounts of material, at the start and when it has come to rest.
 
     Args:
         scene: the scene, which must be the same on all ranks.
-        ranks: who share it.
+        ranks: that share it.
         device: a Warp device's name.
         methods: that solve problems of several ranks.
-        refused: keys of the scene that ask for what runs on ranks have not.
+        refused: keys of the scene that are not available on ranks.
         smoothing: binomial passes over the level set.
-        balance: when ranks look for other boxes.
+        balance: when to repartition.
 
     Raises:
         ValueError: as of `check_shared`; on all ranks.

@@ -1,4 +1,4 @@
-"""Messages of particles between ranks: packed, unpacked and put in their place in native code."""
+"""Messages of particles between ranks, packed and unpacked in native code."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
 REACH = 1  # cells from a box within which particles touch its faces and cells
-ENDLESS = 1e30  # a coordinate beyond all
+ENDLESS = 1e30  # a coordinate beyond all others
 COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept")
-PLACE_WORDS, COLUMN_WORDS = 2, 3  # of 4 bytes, of a particle in a message
+PLACE_WORDS, COLUMN_WORDS = 2, 3  # words of 4 bytes, of a particle in a message
 KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (
     KERNELS[f"warp_lcp.distributed.particles.{name}"]
@@ -31,14 +31,14 @@ FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (
 
 
 class Buffer:
-    """Memory of the host that grows, for recorded launches.
+    """Host memory that grows, for recorded launches.
 
     Args:
         dtype: of its elements, a Warp type.
 
     Attributes:
         array: the memory now.
-        host: the same as NumPy sees it.
+        host: the same as a NumPy array.
     """
 
     def __init__(self, dtype: Any) -> None:
@@ -46,14 +46,17 @@ class Buffer:
         self._allocate(1)
 
     def reserve(self, count: int, kept: int = 0) -> None:
-        """Make room for so many elements, and keep the first ones; the others hold anything."""
+        """Allocate room for so many elements, and keep the first ones.
+
+        The other elements are not initialized.
+        """
         if count > len(self.host):
             before = self.host
             self._allocate(2 * count)
             self.host[:kept] = before[:kept]
 
     def take(self, values: np.ndarray) -> None:
-        """Hold these values."""
+        """Store these values."""
         self.reserve(values.size)
         self.host[: values.size] = values.ravel()
 
@@ -64,10 +67,10 @@ class Buffer:
 
 
 class ParticleMessages:
-    """Particles that a rank's neighbors must know, and those that come from them.
+    """Exchange of particles between a rank and its neighbors.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         particles: this rank's.
         place: int64, of each particle in the order of all ranks' particles; grows with them.
         neighbors: ranks, ascending.
@@ -87,7 +90,8 @@ class ParticleMessages:
         self._end = beyond(part.decomposition.counts, part.grid.spacing)
         self._ends = self._take_boxes()
         self._copies: dict[str, wp.array[Any]] = {}
-        copied = particles.grid.device.is_cuda  # others in each run
+        # Columns of a GPU are copied to new arrays in each run.
+        copied = particles.grid.device.is_cuda
         launches = (
             self._launch_packing,
             self._launch_unpacking,
@@ -99,10 +103,10 @@ class ParticleMessages:
         self._packing, self._unpacking, self._settling, self._search, self._giving = graphs
 
     def _take_boxes(self) -> list[int]:
-        """Set the boxes that are searched, and return how many each neighbor has, this rank behind them.
+        """Set the search boxes; return the number of particles for each neighbor.
 
-        Particles are in a neighbor's sight in its box and within REACH of it, at every periodic
-        shift of it; in that of this rank itself at those other than 0.
+        This rank comes last. A neighbor needs the particles in its box and within REACH of it, at
+        every periodic shift; this rank itself needs those at nonzero shifts.
         """
         part, joined, mine = self.part, self.part.decomposition.joined, self.part.ranks.rank
         counts, origin = np.array(part.grid.counts), np.array(part.grid.origin)
@@ -125,10 +129,12 @@ class ParticleMessages:
         return [sum(rank == other for other, _ in seen) for rank in ranks]
 
     def exchange(self, *, positions_only: bool) -> int:
-        """Exchange what neighbors must know, with what lies behind the others, and return how many particles have come; collective.
+        """Exchange particles with the neighbors; return how many have arrived; collective.
+
+        Arrived particles are stored behind the others.
 
         Args:
-            positions_only: positions and places come alone.
+            positions_only: send positions and places alone.
         """
         particles, count = self._particles, self._particles.count
         self._fetch(positions_only=positions_only)
@@ -158,14 +164,14 @@ class ParticleMessages:
         return come
 
     def settle(self, come: int) -> tuple[int, int, np.ndarray]:
-        """Put ghosts behind this rank's particles, after `exchange` of all columns.
+        """Store ghosts behind this rank's particles, after `exchange` of all columns.
 
         Args:
-            come: what `exchange` has returned.
+            come: result of `exchange`.
 
         Returns:
-            How many are this rank's, how many there are with ghosts, and the numbers of those
-            before this rank's end that are others now.
+            The number of this rank's particles, the number with ghosts, and the indices before this
+            rank's end whose particles were replaced.
         """
         found = self._found.host
         most = int(found[0]) + come
@@ -179,7 +185,7 @@ class ParticleMessages:
         return own, end, self._others.host[:free].astype(np.int64)
 
     def give_places(self) -> None:
-        """Give particles places that lie in the order of their cells, and have been numbered by these."""
+        """Renumber the particles' places in the order of their cells."""
         self._count.value = self._particles.count
         self._place.reserve(self._particles.count)
         self._giving.run()
@@ -299,7 +305,10 @@ class ParticleMessages:
 
 
 def bounds_of(part: Subdomain) -> dict[str, float]:
-    """Return what tells the side of a rank's box from the other, for kernels: sides that are not cut have no end."""
+    """Return the bounds of a rank's box, for kernels.
+
+    Sides that are not cuts are unbounded.
+    """
     bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
     low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
     high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
@@ -308,7 +317,10 @@ def bounds_of(part: Subdomain) -> dict[str, float]:
 
 
 def beyond(counts: Sequence[int], spacing: float) -> np.ndarray:
-    """Return the least coordinates [m] for which kernels find the cell beyond the last along x, y, z, float32."""
+    """Return the coordinates [m] beyond the last cell along x, y, z.
+
+    They are the least float32 numbers that kernels assign to the cell beyond the last.
+    """
     one, inverse = np.float32(1.0), np.float32(1.0 / spacing)
     end = np.array(counts, dtype=np.float32) * np.float32(spacing)
     while (short := end * inverse + one < np.array(counts, dtype=np.float32) + one).any():

@@ -1,4 +1,4 @@
-"""What a rank takes from the pieces that any number of ranks have left of a state."""
+"""Selection of a rank's state from the pieces of any number of ranks."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ def take_pieces(
     pieces: Sequence[Piece],
     solids: np.ndarray | None,
 ) -> tuple[Piece, Piece, Piece]:
-    """Take from pieces what lies in this rank's box; collective.
+    """Select from pieces the particles and cells in this rank's box; collective.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         particles: names of the particles' arrays, float32 of shape (n, 3).
-        like: what else there is of the part: its fields, `cells` among them, and numbers, which all
-            pieces have alike.
+        like: the other arrays of the part: its fields, `cells` among them, and numbers, which are
+            the same in all pieces.
         signature: numbers that tell this scene's state from another's.
         pieces: of all ranks of a run.
         solids: int8, SOLID in cells without material, of the part; None: solids move.
 
     Returns:
         By name: the particles with their `place`, the cells of this rank's box, shape (..., nz, ny,
-        nx), and numbers that all pieces have alike.
+        nx), and the numbers that are the same in all pieces.
 
     Raises:
         ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
@@ -79,7 +79,7 @@ def take_pieces(
                 values[..., *shared.moved(part.box.low, -1).slices] = piece[name][
                     ..., *shared.moved(box.low, -1).slices
                 ]
-            # particles move on to their rank when the next step begins
+            # Particles migrate to their rank when the next step begins.
             if part.decomposition.meet(box.grown(part.layers), part.box):
                 inside = part.owners(cells_of(part, piece["position"])) == part.ranks.rank
                 found.append({name: np.asarray(piece[name])[inside] for name in own})
@@ -101,7 +101,10 @@ def take_pieces(
 def _numbers(
     pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str], signature: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the numbers that all pieces have alike, after a look whether they have all else, and belong to a scene."""
+    """Return the numbers that all pieces share.
+
+    The pieces are first checked: they must agree in everything else and belong to a scene.
+    """
     missing = sorted({name for piece in pieces for name in (*names, *others) if name not in piece})
     if missing or not pieces:
         raise ValueError(
@@ -120,7 +123,10 @@ def _numbers(
 
 
 def cells_of(part: Subdomain, position: np.ndarray) -> np.ndarray:
-    """Return the cells (x, y, z) of the whole domain that positions [m] lie in, as kernels find them, shape (n, 3)."""
+    """Return the cells (x, y, z) of positions [m], as kernels compute them.
+
+    They count over the whole domain. Shape (n, 3).
+    """
     inverse, one = np.float32(1.0 / part.grid.spacing), np.float32(1.0)
     cells = np.zeros((len(position), 3), dtype=np.int64)
     for axis in range(part.grid.dimension):

@@ -1,11 +1,12 @@
-"""Particles that belong to the rank whose box they are in: they move on to others, and cells at a cut know those beside them.
+"""Distributed particles: migration between ranks, and ghost particles at cuts.
 
-In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then
-its own alone. Sums take all in one order that does not depend on the ranks, so that those around a
-face have the same bits on any number of ranks: that of the last sort by cell, which a number stands
-for, the particle's `place`. Until the next sort ghosts lie behind the others, and what comes takes
-the room of what goes: `runs` tell the order. Messages go from rank to rank: their lengths change
-from step to step, so that a star forest would have to be made anew each time.
+A particle belongs to the rank of its box. In a step a rank has its own particles and copies of
+those within a cell of its box, the ghosts; later its own alone. Sums over particles have one order
+that does not depend on the ranks, so that sums at a face have the same bits on any number of ranks:
+the order of the last sort by cell. A particle's number in that order is its `place`. Until the next
+sort, ghosts are stored behind the others, and new particles take the memory of those that have
+left: `runs` describe the order. Messages go from rank to rank. Their lengths change from step to
+step, so a star forest would have to be rebuilt each time.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ from warp_lcp.grid.particles import NEW, Particles, ParticleTotals
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
-# of a box: in it and away from its cuts, within reach of them, beyond them
+# Position relative to a box: in it and away from its cuts, within reach of them, beyond them.
 INNER, BORDER, OUTSIDE = 0, 1, 2
 WHERE = KERNELS["warp_lcp.distributed.particles.where"]
-ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
+ROOM = 1.25  # storage relative to the particles at the start: ghosts come before the first step
 
 
 class ParticleMigration(ParticleExchange):
-    """The particles of a rank among those of all.
+    """The particles of a rank, as a part of the particles of all ranks.
 
     Args:
-        part: where this rank works.
+        part: the subdomain of this rank.
         particles: this rank's, in its box or within its ghost layers.
     """
 
@@ -51,15 +52,18 @@ class ParticleMigration(ParticleExchange):
         self._places, self._placed = Buffer(wp.int64), 0
         self._counts: list[int] = []
         self._expected = 0
-        self._added = 0  # by this rank since the last totals
+        self._added = 0  # particles added by this rank since the last totals
         self.move_to(part)
 
     def move_to(self, part: Subdomain) -> None:  # type: ignore[override]
-        """Belong to another box from now on; `assign` then brings what lies in it."""
+        """Move to another box.
+
+        `assign` then sets its particles.
+        """
         self.part, decomposition, around = part, part.decomposition, part.box.grown(REACH)
-        # which particles are this rank's, or how many of the first; None: all
+        # Indices of this rank's own particles, or how many of the first; None: all.
         self._own: np.ndarray | int | None = None
-        self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
+        self._lying: PlaceOrder | None = None  # order of this rank's particles; None: not known
         self._neighbors = [
             r
             for r, box in enumerate(decomposition.boxes)
@@ -71,7 +75,7 @@ class ParticleMigration(ParticleExchange):
 
     @property
     def place(self) -> np.ndarray:
-        """Where each particle is in the order of all ranks' particles, int64, shape (count,)."""
+        """Place of each particle in the order of all ranks, int64, shape (count,)."""
         return self._places.host[: self._placed]
 
     @place.setter
@@ -81,20 +85,27 @@ class ParticleMigration(ParticleExchange):
 
     @property
     def counts(self) -> list[int]:
-        """Particles of each rank when the last totals found them."""
+        """Number of particles of each rank at the last totals."""
         return self._counts
 
     @property
     def expected(self) -> int:
-        """How many particles all ranks had before the last totals, with those that had been added and removed since then."""
+        """Number of particles of all ranks.
+
+        It is the last total, with the particles added and removed since then.
+        """
         return self._expected
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return `place`."""
+        """Return `place`, the key of the order."""
         return {"place": self.place.copy()}
 
     def arrange(self, *, sort: bool) -> None:
-        """Hand particles that have left the box to their ranks, take in those that came, with ghosts, and bring all into order."""
+        """Migrate particles to the ranks of their boxes, add ghosts, and sort.
+
+        Particles that have left the box are sent; those that arrive, and ghosts, are brought into
+        order.
+        """
         self.drop_ghosts()
         if self._neighbors:
             self._exchange()
@@ -106,7 +117,10 @@ class ParticleMigration(ParticleExchange):
                 self._find_runs()
 
     def look_around(self) -> None:
-        """Let ghosts be there with their positions alone; own particles stay this rank's, wherever they are."""
+        """Make ghosts available with their positions alone.
+
+        Own particles stay on this rank, wherever they are.
+        """
         if self.particles.offsets is not None:
             self.arrange(sort=True)
         elif self._neighbors:
@@ -117,14 +131,17 @@ class ParticleMigration(ParticleExchange):
 
     @contextmanager
     def with_ghosts(self, step: int) -> Iterator[None]:
-        """Let the particles around this rank's box be there, arranged as in a step of this number."""
+        """Restore the particles around this rank's box.
+
+        They are arranged as in the step of this number.
+        """
         self.particles.arrange(step)
         self._lie_in_order()
         yield
         self.drop_ghosts()
 
     def _exchange(self) -> None:
-        """Hand over and take in, and put ghosts behind the others."""
+        """Migrate particles, and store ghosts behind the others."""
         first, come = self.particles.count, self._messages.exchange(positions_only=False)
         own, end, free = self._messages.settle(come)
         self.particles.resize(end)
@@ -133,7 +150,10 @@ class ParticleMigration(ParticleExchange):
             self._lying = self._lying.changed(free, first, own)
 
     def _find_runs(self) -> None:
-        """Find the order in which sums take the particles, of which the first are this rank's."""
+        """Compute the summation order of the particles.
+
+        The first particles are this rank's.
+        """
         assert isinstance(self._own, int), "ghosts lie behind the others"
         if self._lying is None:
             self._order_first(self._own)
@@ -142,7 +162,7 @@ class ParticleMigration(ParticleExchange):
         self.particles.set_runs(wp.array(runs, dtype=wp.int32, device=self.part.grid.device))
 
     def _order_first(self, count: int) -> None:
-        """Bring the first particles into the order of their places, of which others have been added or gone."""
+        """Sort the first particles by place, after some were added or removed."""
         place = self.place[:count]
         if (place[1:] < place[:-1]).any():
             self._take(
@@ -156,25 +176,28 @@ class ParticleMigration(ParticleExchange):
         self.place = self.place[order]
 
     def _lie_in_order(self) -> None:
-        """Bring the particles into the order in which sums take them, ghosts among them."""
+        """Sort the particles, ghosts among them, into the summation order."""
         self._order_first(self.particles.count)
         if self._own is not None:
             self._own = self._where() != OUTSIDE
         self._lying = self.particles.runs = None
 
     def begin_sort(self) -> None:
-        """Bring the particles into the order of their places."""
+        """Sort the particles by place."""
         self._lie_in_order()
 
     def end_sort(self) -> None:
-        """Give the particles, which lie in the order of their cells, new places."""
+        """Renumber the places of the particles, which are sorted by cell."""
         if self._own is not None:
             self._own = self._where() != OUTSIDE
         self._messages.give_places()
         self._placed = self.particles.count
 
     def next_place(self) -> int:
-        """Return a place behind those of all ranks' particles, when this rank's own are there alone, numbered; collective."""
+        """Return a place behind the particles of all ranks; collective.
+
+        This rank has its own particles alone, numbered.
+        """
         self.drop_ghosts()
         self.particles.number()
         return max(NEW, 1 + int(self.part.ranks.max(self.place.max(initial=0))))
@@ -185,22 +208,22 @@ class ParticleMigration(ParticleExchange):
         self._expected = sum(self._counts)
 
     def appended(self, count: int) -> None:
-        """Give particles behind the others places behind theirs."""
+        """Assign the next places to new particles, which are stored behind the others."""
         self.add_places(max(NEW, 1 + int(self.place.max(initial=0))) + np.arange(count))
 
     def add_places(self, places: np.ndarray) -> None:
-        """Give particles behind the others their places."""
+        """Set the places of particles stored behind the others."""
         self.place, self._lying = np.append(self.place, places), None
         self._added += len(places)
 
     def removing(self, marks: wp.array) -> None:
-        """Forget the places of particles that are about to be removed."""
+        """Drop the places of particles that are about to be removed."""
         before = len(self.place)
         self.place, self._lying = self.place[marks.numpy()[: self.particles.count] == 0], None
         self._added += len(self.place) - before
 
     def drop_ghosts(self) -> None:
-        """Keep this rank's own particles alone; `key` then holds their cells."""
+        """Drop ghosts; `key` then holds the cells of this rank's own particles."""
         mine, self._own, self.particles.runs = self._own, None, None
         if isinstance(mine, int):
             self.particles.resize(mine)
@@ -211,13 +234,14 @@ class ParticleMigration(ParticleExchange):
             self._lying = PlaceOrder(self.place.copy())
 
     def joined_totals(self, own: ParticleTotals) -> ParticleTotals:
-        """Return sums over all ranks' particles; there are no ghosts now."""
+        """Return sums over all ranks' particles; there must be no ghosts."""
         assert self._own is None, "ghosts would be counted twice"
         n, ranks = own.count, self.part.ranks
         before, added, self._added = sum(self._counts), self._added, 0
         if ranks.size == 1:
             self._counts, self._expected = [n], before + added
             return own
+        # One message: count, bad values, 7 means times the count, additions; then 7 maxima.
         mine = np.full(18, -np.inf)
         mine[:3], mine[10] = (n, own.bad_positions, own.bad_velocities), added
         mine[3:10] = own.mean_square_speed, *own.center.tolist(), *own.velocity.tolist()
@@ -248,7 +272,7 @@ class ParticleMigration(ParticleExchange):
         )
 
     def assign(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:
-        """Take other particles, in the order of their places; collective."""
+        """Replace the particles, in the order of their places; collective."""
         self._own = self._lying = None
         super().assign(arrays, place)
         self.place = np.sort(np.asarray(place, dtype=np.int64))

@@ -1,8 +1,9 @@
-"""The grid operator as PETSc's Mat and a multigrid cycle as PETSc's PC: for KSP, SNES and TAO, matrix-free.
+"""Grid operator as a PETSc Mat, and multigrid cycle as a PETSc PC; matrix-free.
 
-Vectors are those of a DMDA with one degree of freedom a cell: each rank's cells one after another,
-x fastest, without ghost cells. Warp reads and writes them where PETSc keeps them; fields have a
-ring of ghost cells, so each product and each cycle costs two strided copies.
+They serve KSP, SNES and TAO. Vectors are those of a DMDA with one degree of freedom a cell: each
+rank's cells one after another, x fastest, without ghost cells. Warp reads and writes them in
+PETSc's memory. Fields have a ring of ghost cells, so each product and each cycle costs two strided
+copies.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ LEAVE = KERNELS["vector_copies.leave"]
 TRUE_RESIDUAL = frozenset(
     {"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"}
 )
-"""Methods of KSP that measure b - A x if asked to; others know other norms only."""
+"""Methods of KSP that can monitor b - A x; others compute other norms only."""
 
 
 class VectorCopies:
     """Copies between PETSc's vectors and the stored fields of a stencil's grid.
 
     Args:
-        stencil: of the rank's cells; its diagonal says which of them are unknowns. Read at every
+        stencil: of the rank's cells; cells with a nonzero diagonal are unknowns. Read at every
             copy.
         comm: PETSc's communicator of the vectors, each rank having its own cells.
 
@@ -52,11 +53,11 @@ class VectorCopies:
     def __init__(self, stencil: PaddedStencil, comm: Any) -> None:
         self.stencil, self.comm, self.device = stencil, comm, stencil.device
         self._n = math.prod(stencil.padding.counts)
-        self.sizes = self._n, None  # PETSc adds the ranks' up
+        self.sizes = self._n, None  # PETSc computes the sum over ranks
         counts = stencil.padding.counts
         dense = Rows.strided(self._n, self.device, (0, counts[1] * counts[2], counts[2]), counts)
         self._rows = Rows.of(stencil.padding, self.device).beside(dense, (1, 1, 1))
-        staged = self.device.is_cuda  # PETSc's vectors are the host's
+        staged = self.device.is_cuda  # PETSc's vectors are in host memory
         self._staging = (
             [wp.zeros(self._n, dtype=wp.float64, device=self.device) for _ in range(2)]
             if staged
@@ -72,8 +73,11 @@ class VectorCopies:
         return v
 
     def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
-        """Set the field to scale v on the unknowns and to 0 on the other cells; its ghost cells stay as they are."""
-        values = v.getArray(readonly=True)  # PETSc counts accesses: it ends with the array
+        """Set the field to scale v on the unknowns, and to 0 on the other cells.
+
+        Ghost cells keep their values.
+        """
+        values = v.getArray(readonly=True)  # PETSc counts accesses: this one ends with the array
         ENTER.bind(
             self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale
         ).launch()
@@ -81,7 +85,10 @@ class VectorCopies:
     def leave(
         self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
     ) -> None:
-        """Set v to scale times the field on the unknowns and to `others` (0 if None) on the other cells."""
+        """Set v to scale times the field on the unknowns.
+
+        On the other cells v becomes `others`, or 0 if that is None.
+        """
         given = None if others is None else others.getArray(readonly=True)
         values = v.getArray()
         seen, target = None if given is None else self._seen(given, 0), self._seen(values, 1)
@@ -92,7 +99,7 @@ class VectorCopies:
             values[:] = target.numpy()
 
     def _seen(self, values: np.ndarray, buffer: int) -> wp.array[Any]:
-        """Return a vector's memory as the device sees it: itself on the CPU, a copy on a GPU."""
+        """Return a vector's memory on the device: itself on the CPU, a copy on a GPU."""
         if not self._staging:
             return wp.array(
                 ptr=values.ctypes.data, dtype=wp.float64, shape=self._n, device=self.device
@@ -102,14 +109,14 @@ class VectorCopies:
 
 
 class StencilMatrix:
-    """The product with a stencil, as the context of a Mat of PETSc's type `python`.
+    """Product with a stencil, as the context of a Mat of PETSc's type `python`.
 
     B = A on the cells with a diagonal that is not 0, for x = 0 on the others; the identity on the
     others. A stencil whose diagonal a free set I has masked thus gives B = D_I A D_I + D_(not I),
     symmetric if A is, and on ranks the same matrix as on one.
 
     Args:
-        stencil: as it is at each product.
+        stencil: read at each product.
         copies: of its grid.
     """
 
@@ -120,7 +127,7 @@ class StencilMatrix:
         )
 
     def as_mat(self) -> PETSc.Mat:
-        """Return it as a Mat of PETSc."""
+        """Return the product as a Mat of PETSc."""
         matrix = petsc().Mat().createPython((self._copies.sizes,) * 2, self, comm=self._copies.comm)
         matrix.setOption(petsc().Mat.Option.SYMMETRIC, True)
         matrix.setUp()
@@ -137,7 +144,10 @@ class StencilMatrix:
     def createSubMatrix(  # noqa: N802  # PETSc's name
         self, matrix: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, out: PETSc.Mat | None = None
     ) -> PETSc.Mat:
-        """Return B on some rows and columns, as products with zeros elsewhere: methods for bounds solve on free cells."""
+        """Return the submatrix of B on some rows and columns.
+
+        Its products are those of B with zeros elsewhere. Methods for bounds solve on free cells.
+        """
         return petsc().Mat().createSubMatrixVirtual(matrix, rows, columns)
 
     def getDiagonal(self, matrix: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802  # PETSc's name
@@ -151,7 +161,9 @@ class StencilMatrix:
 
 
 class CyclePreconditioner:
-    """One linear multigrid cycle, as the context of a PC of PETSc's type `python`: symmetric positive definite.
+    """One linear multigrid cycle, as the context of a PC of PETSc's type `python`.
+
+    The preconditioner is symmetric positive definite.
 
     Args:
         hierarchy: rebuilt for the free set by the caller.
@@ -162,10 +174,13 @@ class CyclePreconditioner:
         self._hierarchy, self._copies = hierarchy, copies
 
     def apply(self, preconditioner: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
-        """Z = one cycle on r; the identity on cells that are held."""
+        """Apply the preconditioner: Z = one cycle on r.
+
+        It is the identity on cells that are held.
+        """
         finest = self._hierarchy.finest
-        # corrections may be float32: r is brought to length 1. PETSc remembers the norms that its
-        # KSP has asked for
+        # Corrections may be float32: r is scaled to length 1. PETSc caches the norms that its KSP
+        # has requested.
         size = r.norm()
         if size == 0 or not math.isfinite(size):
             r.copy(z)
@@ -219,7 +234,8 @@ class PetscGrid:
         cycle: CycleSettings | None = None,
     ) -> None:
         self._A, comm = A, communicator(A)
-        # what ranks share ends when all have let go of it, and PETSc has time to look
+        # Objects that ranks share are destroyed when all ranks have released them and PETSc
+        # collects garbage.
         petsc().garbage_cleanup(comm)
         self._kept: list[Any] = []
         weakref.finalize(self, _let_go, self._kept).atexit = False
@@ -277,10 +293,10 @@ class PetscGrid:
         return ksp
 
     def _keep(self, thing: Any) -> Any:
-        """Return an object whose methods are Python's, with one reference more as long as this grid lives.
+        """Return a proxy of a Python object with one reference more.
 
-        When a program ends, PETSc ends what is left of its objects, and Python has ended already:
-        it must not come to these.
+        The reference lives as long as this grid. At the end of a program PETSc destroys its
+        remaining objects after Python has ended, and must not destroy these.
         """
         thing.incRef()
         self._kept.append(thing)
@@ -288,7 +304,7 @@ class PetscGrid:
 
 
 def _let_go(kept: list[Any]) -> None:
-    """Let PETSc end objects when nobody refers to them."""
+    """Make PETSc destroy objects that are no longer referenced."""
     for thing in kept:
         thing.decRef()
 

@@ -1,4 +1,4 @@
-"""In what order sums take particles of which most lie in it."""
+"""Deterministic summation order for nearly sorted particles."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ def _none() -> np.ndarray:
 
 @dataclass(frozen=True)
 class PlaceOrder:
-    """Which of a list's particles lie in the order of their places.
+    """Sorted and unsorted particles of a list, by place.
 
     Args:
-        places: of all particles when all lay in order.
-        loose: numbers of those that others have taken the place of, ascending.
+        places: of all particles when all were sorted.
+        loose: indices whose particles were replaced since, ascending.
     """
 
     places: np.ndarray
     loose: np.ndarray = field(default_factory=_none)
 
     def changed(self, numbers: np.ndarray, before: int, count: int) -> PlaceOrder:
-        """Return what is known when there are other particles of some numbers, and `count` instead of those there were `before`."""
+        """Return the order after particles of some numbers were replaced.
+
+        There are then `count` particles, where there were `before`.
+        """
         loose = np.concatenate([self.loose, numbers, np.arange(before, count)])
         return PlaceOrder(self.places, np.unique(loose[loose < count]))
 
     def runs(self, place: np.ndarray, count: int) -> np.ndarray:
-        """Return begin and end of each run of particles in order, one run after another, shape (2 runs,).
+        """Return begin and end of each sorted run of particles, shape (2 runs,).
 
         Args:
             place: of the particles as they are, and of others behind them that are in any order.
@@ -41,7 +44,7 @@ class PlaceOrder:
             np.append(self.loose, np.arange(count, len(place))),
         )
         others = others[np.argsort(place[others], kind="stable")]
-        # which of those in order they belong
+        # Sorted particle before which each of them belongs.
         before = np.searchsorted(self.places[:end], place[others], side="right")
         cuts = np.sort(np.concatenate([[0, end], before, gaps, gaps + 1]), kind="stable")
         held = cuts[1:] > cuts[:-1]

@@ -1,4 +1,4 @@
-"""The processes that share a problem, and what they find out about each other."""
+"""Collective operations of the processes that share a problem."""
 
 from __future__ import annotations
 
@@ -159,7 +159,10 @@ class Ranks:
 
 @cache
 def _in_rows(handle: int, count: int) -> Ranks:
-    """Return some ranks of a communicator; made once, as MPI has room for some thousand of them."""
+    """Return a communicator of some ranks.
+
+    It is created once: MPI has room for some thousand communicators.
+    """
     from mpi4py import MPI
 
     comm = MPI.Comm.f2py(handle)
@@ -169,11 +172,11 @@ def _in_rows(handle: int, count: int) -> Ranks:
 
 @cache
 def _world() -> Any:
-    """Return PETSc's own communicator of all ranks, for the life of this process.
+    """Return PETSc's own communicator of all ranks, kept for the life of this process.
 
-    PETSc would make it with the first object on a communicator, which all ranks must do together,
-    and free it with the last one. Python ends objects on each rank at another time: with none left
-    on one rank, that rank would wait for the others to make it again.
+    PETSc creates it with the first object on a communicator, which is a collective operation, and
+    frees it with the last one. Python frees objects at another time on each rank: a rank that has
+    none left would wait for the others to create it again.
     """
     return petsc().COMM_WORLD.duplicate()
 
@@ -181,13 +184,13 @@ def _world() -> Any:
 def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
     """Return the Warp device of this rank; collective.
 
-    Ranks on GPUs exchange ghost cells through the host's memory. None has run on more than one GPU
-    so far.
+    Ranks on GPUs exchange ghost cells through the host's memory. More than one GPU has not been
+    tested so far.
 
     Args:
         ranks: all of them.
-        name: `cpu`; `cuda`: the GPUs of a machine in turns, one a rank; `cuda:N`: that one on every
-            machine; None: GPUs where there are some.
+        name: `cpu`; `cuda`: the GPUs of a machine, assigned round-robin to its ranks; `cuda:N`:
+            that one on every machine; None: GPUs where there are some.
 
     Raises:
         ValueError: the machine of this rank has no such device; the message names the rank.
@@ -204,10 +207,10 @@ def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
 
 
 def dealt(name: str | None, number: int, found: list[str]) -> str:
-    """Return the device of the rank of this number on its machine.
+    """Return the device of a rank, by its number on its machine.
 
     Args:
-        name: what was asked for, as `device_of_rank` takes it.
+        name: requested device, as `device_of_rank` takes it.
         number: of the rank among those of its machine.
         found: GPUs of the machine.
 

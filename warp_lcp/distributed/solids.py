@@ -1,4 +1,4 @@
-"""The solids of a rank's part of a grid, as the whole grid would have them."""
+"""Solids in a rank's part of a grid, equal to those of the whole grid."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
 def boundary_of_part(
     scene: ParticleScene, part: Subdomain, solids: Sequence[PlacedSolid]
 ) -> tuple[Boundary, list[str]]:
-    """Return the solids that meet a rank's part, and the domain's walls where it has them; collective.
+    """Return the solids in a rank's part, and the domain's walls there; collective.
 
-    Each rank measures its part and takes what lies beyond its cuts from the ranks that have
-    measured more of it. Solids thinner than cells are exact shapes: every rank knows all of them,
-    and finds the same faces closed. If no rank has cut cells or such solids all have whole ones.
+    Each rank measures its part and receives the cells beyond its cuts from the ranks that have
+    measured more of them. Solids thinner than cells are exact shapes: every rank knows all of them,
+    and finds the same faces closed. If no rank has cut cells or such solids, all ranks have whole
+    cells.
 
     Args:
         scene: says whether solids cut cells, the domain's wall separates, sides are open, and cells

@@ -1,4 +1,4 @@
-"""The part of a staggered grid that a rank works on: its own box of cells, and layers of other ranks' cells around it."""
+"""Subdomain of a staggered grid: a rank's box and its ghost layers."""
 
 from __future__ import annotations
 
@@ -35,21 +35,20 @@ from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
 
 DEFAULT_BALANCE = Balance()
-MOST_KEPT = 32  # exchanges of fields that are filled again and again
-# of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is
-# held
+MOST_KEPT = 32  # most cached exchanges
+# Ghost layers. Whether liquid is held can depend on a closed face up to 4.8 cells away.
 LAYERS = 5
 
 
 def ghost_layers(cfl: float, smoothing: int) -> int:
-    """Return how many layers of ghost cells a box needs.
+    """Return the number of ghost layers that a box needs.
 
-    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors
-    is then wrong in the outermost layer, what those take in the next, and so on. Fields are filled
-    again before that would reach the box. Nothing is filled while particles move: a stage of their
-    way looks at faces within 1.5 cells of a place, and three layers more than the Courant number
-    leave room for liquid that the step makes faster. Nor between the binomial passes over a level
-    set, a layer each, the slope beside walls, another, and the two layers of cells in solids.
+    Ghost layers are correct after a halo exchange. Each computation that reads neighbors then makes
+    one more layer wrong, beginning with the outermost. The next exchange comes before wrong values
+    reach the box. No exchange takes place during advection: each stage reads faces within 1.5 cells
+    of the particle, and three layers more than the Courant number allow for liquid that the step
+    makes faster. Neither does one take place during the smoothing of the level set: each binomial
+    pass takes a layer, the slope beside walls another, and cells in solids two.
 
     Args:
         cfl: the Courant number of the run.
@@ -72,12 +71,12 @@ for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
 
 
 def _stays(field: wp.array | np.ndarray) -> bool:
-    """Return whether a recorded launch may know a field by its address."""
+    """Return whether a recorded launch may identify a field by its address."""
     return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
 
 
 def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
-    """Copy cells of a field to another, now or among recorded launches; both may be views."""
+    """Copy cells of a field to another, now or recorded; both may be views."""
     if is_recording():
         launch(copy_kernel, to.shape[:2], [to, source], device=to.device)
     else:
@@ -85,7 +84,7 @@ def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
 
 
 def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
-    """Fill the ghost cells of fields that a star forest has as leaves."""
+    """Fill the ghost cells that a star forest has as leaves."""
     hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
     exchange_all(forest, [(host, host) for host in hosts])
     for field, host in zip(fields, hosts, strict=True):
@@ -94,18 +93,19 @@ def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
 
 
 def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
-    """Return `_fill` as an operation of the team."""
+    """Return `_fill` as an operation of the thread pool."""
     hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
     return exchanging_all(forest, [(host, host) for host in hosts])
 
 
 class Subdomain(GridPart):
-    """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
+    """Subdomain of a rank: the cells of its box and ghost layers around it.
 
-    The outermost layer is the ring that every staggered grid has around its cells. At the domain's
-    sides the ring is that of the whole grid, at cuts it is the last of the ghost layers: there the
-    sides of the part must be open, see `cuts`. Along an axis without an end that is cut, the part
-    goes on beyond the domain's sides, with the cells that lie there again.
+    Ghost layers hold the cells of the domain within `layers` of the box. The outermost layer is the
+    ring that every staggered grid has around its cells. At the domain's sides the ring is that of
+    the whole grid, at cuts it is the last of the ghost layers: there the sides of the part must be
+    open, see `cuts`. Along a periodic axis that is cut, the part continues beyond the domain's
+    sides with the periodic images of the cells.
 
     Args:
         decomposition: the boxes of all ranks.
@@ -114,7 +114,7 @@ class Subdomain(GridPart):
         device: a Warp device or its name.
         layers: ghost cells at cuts, the ring included.
         mailbox: carries messages between neighbors; None: MPI's.
-        balance: when ranks look for other boxes.
+        balance: when to repartition.
 
     Attributes:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
@@ -150,7 +150,7 @@ class Subdomain(GridPart):
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         self._trees: TreesAtCuts | None = None
-        self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # by the layers around the box
+        self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # key: layers around the box
         for axis in decomposition.cut_axes:
             least, most = (
                 min(decomposition.parts[axis]),
@@ -187,12 +187,15 @@ class Subdomain(GridPart):
 
     @property
     def across(self) -> Communicator | None:
-        """The other processes, as reductions take them; None: there are none."""
+        """Communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
     @property
     def at_once(self) -> bool:
-        """Whether launches cannot be recorded where ranks exchange halos in them: on CUDA that goes through the host."""
+        """Whether launches with halo exchanges cannot be recorded.
+
+        On CUDA the exchange goes through the host.
+        """
         return bool(self.grid.device.is_cuda)
 
     @property
@@ -202,13 +205,16 @@ class Subdomain(GridPart):
 
     @property
     def stored(self) -> Window:
-        """Stored cells that this rank is the one to know: those of the box and the ring beyond the domain's sides."""
+        """Stored cells that this rank owns.
+
+        They are the cells of the box and the ring beyond the domain's sides.
+        """
         known = self.known
         return Window.of(known.low[::-1], known.high[::-1], self.grid.device)
 
     @property
     def first(self) -> tuple[int, int, int]:
-        """The first of them along x, y, z, counted from 0 in the whole domain."""
+        """First cell of the box along x, y, z, counted from 0 in the whole domain."""
         return self.box.low
 
     def faces(self, window: Window) -> Window:
@@ -216,11 +222,11 @@ class Subdomain(GridPart):
         return self.own_faces
 
     def whole(self, window: Window) -> Window:
-        """Return all cells: others may have material where this rank has none."""
+        """Return all cells: other ranks may have material where this rank has none."""
         return self.grid.everywhere
 
     def repartition(self, decomposition: Decomposition) -> Subdomain:
-        """Return the part that this rank works on with other boxes."""
+        """Return the part of this rank with other boxes."""
         return Subdomain(
             decomposition,
             spacing=self.grid.spacing,
@@ -232,20 +238,26 @@ class Subdomain(GridPart):
         )
 
     def should_rebalance(self, step: int) -> bool:
-        """Return whether the ranks look for better boxes in a step."""
+        """Return whether the ranks check for better boxes in a step."""
         return self.balance.should_rebalance(self, step)
 
     def rebalance(self, particles: Particles, a_cell: int) -> Subdomain | None:
-        """Return the part with better boxes, see `Balance.rebalance`; None: those there are will do. Collective."""
+        """Return the part with better boxes, see `Balance.rebalance`; collective.
+
+        Returns None if the present boxes are good enough.
+        """
         better = self.balance.rebalance(self, particles, a_cell)
         return None if better is None else self.repartition(better)
 
     def migrate(self, piece: Piece, particles: Sequence[str], before: Subdomain) -> Piece:
-        """Return the piece of a state that lies in this box, given that of the box before, as all ranks do; collective."""
+        """Return the piece of a state in this box, from the former boxes; collective."""
         return migrate(piece, particles, before, self)
 
     def of_pieces(self, pieces: Sequence[Piece]) -> Subdomain | None:
-        """Return the part with the boxes of pieces of a state, this one if they are the same; None: ranks cannot have them. Collective."""
+        """Return the part with the boxes of pieces of a state; collective.
+
+        Returns this part if the boxes are the same, and None if the ranks cannot have them.
+        """
         with self.decomposition.collective.led():
             cuts = cuts_of(pieces, self)
         if cuts is None or cuts == self.decomposition.parts:
@@ -260,20 +272,27 @@ class Subdomain(GridPart):
         signature: np.ndarray,
         solids: np.ndarray | None,
     ) -> tuple[Piece, Piece, Piece]:
-        """Return what of pieces lies in this box; collective. See `warp_lcp.distributed.particle_pieces.take_pieces`."""
+        """Return the contents of pieces that lie in this box; collective.
+
+        See `warp_lcp.distributed.particle_pieces.take_pieces`.
+        """
         return take_pieces(self, particles, like, signature, pieces, solids)
 
     @property
     def corners(self) -> tuple[Corner, Corner]:
-        """The first cell (x, y, z) of the box and the one behind its last."""
+        """First cell (x, y, z) of the box, and the one behind its last."""
         return self.box.low, self.box.high
 
     def where(self) -> dict[str, np.ndarray]:
-        """Return `box`, int64 (2, 3), the box's first cell and the one behind its last, and `counts`, int64 (3,), the whole grid's."""
+        """Return the arrays that describe the box in a piece.
+
+        `box`, int64 (2, 3), is the box's first cell and the one behind its last; `counts`, int64
+        (3,), are the whole grid's cells.
+        """
         return {"box": np.array(self.corners), "counts": np.array(self.decomposition.counts)}
 
     def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what fields have in the box, shape (..., nz, ny, nx), and numbers among them as they are."""
+        """Return fields on the box, shape (..., nz, ny, nx); numbers are unchanged."""
         cells = fields_of(fields)
         return {
             name: np.ascontiguousarray(self.box_of(values)) if name in cells else values
@@ -281,15 +300,21 @@ class Subdomain(GridPart):
         }
 
     def refill(self) -> Refill:
-        """Return what fills ghost cells again while velocities are continued, before what is wrong in them comes near the box."""
+        """Return a function that fills ghost cells during velocity extrapolation.
+
+        It exchanges halos before wrong values in the ghost cells can reach the box.
+        """
         return Refill(self)
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
-        """Return how many cells velocities of any rank move particles out of its ghost layers in a time step; 0: none does."""
+        """Return the largest displacement in a step that may leave the ghost layers.
+
+        It is the largest of all ranks, in cells; 0: no particle leaves them.
+        """
         return float(self.ranks.max(too_far(self, velocity, dt)))
 
     def notes(self) -> list[str]:
-        """Return how many ranks there are, and how large their boxes."""
+        """Return the number of ranks and the size of their boxes, as text."""
         boxes = self.decomposition.boxes
         largest = " x ".join(
             map(str, max(boxes, key=lambda box: box.cells).counts[: self.dimension])
@@ -300,7 +325,10 @@ class Subdomain(GridPart):
         ]
 
     def coarser(self, layers: int) -> StaggeredGrid | None:
-        """Return this rank's part of the grid of cells of twice the edge; None if a cut lies in one, or a box is thinner than `layers`."""
+        """Return this rank's part of the grid with cells of twice the edge.
+
+        Returns None if a cut lies inside a coarse cell, or a box is thinner than `layers`.
+        """
         if self.across is None:
             return super().coarser(layers)
         boxes, grid = self.decomposition.coarser((2, 2, self.dimension - 1)), self.grid
@@ -316,7 +344,7 @@ class Subdomain(GridPart):
 
     @property
     def row_ranks(self) -> Any:
-        """The ranks that have cells of the same rows along x, in their order; None if rows are not cut."""
+        """Ranks with cells of the same rows along x, in order; None if x is not cut."""
         return (
             self.ranks.in_rows(self.decomposition.processes[0])
             if 0 in self.decomposition.cut_axes
@@ -332,7 +360,10 @@ class Subdomain(GridPart):
         )
 
     def _at_sides(self, box: CellBox) -> list[list[bool]]:
-        """Tell whether a box ends at the domain's lower and upper sides along x, y, z, beyond which nothing goes on."""
+        """Return whether a box ends at the domain's lower and upper sides.
+
+        One pair for each of x, y, z. Periodic sides do not count.
+        """
         counts, joined = self.decomposition.counts, self.decomposition.joined
         ends = [
             [n == 0 for n in box.low],
@@ -348,11 +379,11 @@ class Subdomain(GridPart):
         which: np.ndarray | None = None,
         into: StarForest | None = None,
     ) -> StarForest:
-        """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
+        """Return a star forest that fills ghost cells and rings; collective.
 
         Args:
             layers: of a field.
-            width: how far from the box; None: all.
+            width: distance from the box in cells; None: all.
             parts: the fields are of `grid.refined(parts)`.
             which: of a field's cells, bool; None: all.
             into: a forest that this one replaces, in recorded exchanges too; None: there is none.
@@ -376,14 +407,17 @@ class Subdomain(GridPart):
         )
 
     def _refined(self, box: CellBox, parts: int) -> CellBox:
-        """Return a box in cells that are cut into so many along each axis."""
+        """Return a box of cells refined by a factor along each axis."""
         each = [parts if axis < self.dimension else 1 for axis in range(3)]
         return CellBox.of(
             *([n * p for n, p in zip(corner, each, strict=True)] for corner in (box.low, box.high))
         )
 
     def _with_sides(self, box: CellBox, parts: int = 1) -> CellBox:
-        """Return a box, refined, with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
+        """Return a box, refined, with the ring cells that its rank owns.
+
+        They lie beyond the domain's sides that the box touches.
+        """
         found = self._refined(box, parts)
         low, high = list(found.low), list(found.high)
         at_low, at_high = self._at_sides(box)
@@ -399,14 +433,15 @@ class Subdomain(GridPart):
         parts: int = 1,
         forest: StarForest | None = None,
     ) -> None:
-        """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
+        """Fill the ghost cells of fields of the part, or of stacks of them; collective.
 
-        On the CPU it may be recorded among launches, which all ranks then run alike.
+        A stack has equally many layers. On the CPU the exchange may be recorded among launches,
+        which all ranks then run alike.
 
         Args:
             fields: any types, the last axes z, y, x; or the host's views of their memory, which
                 cost less to fill often.
-            width: how far from the box; None: all.
+            width: distance from the box in cells; None: all.
             parts: the fields are of `grid.refined(parts)`.
             forest: of `forest`, for such fields; None: one that is made once.
         """
@@ -421,12 +456,12 @@ class Subdomain(GridPart):
         self.filling(*fields, forest=forest).launch()
 
     def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
-        """Return `fill` over a star forest of several ranks, to run now or within a recorded program."""
+        """Return `fill` over a star forest, to run now or in a recorded program."""
         operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
         return Task(partial(_fill, forest, fields), operation)
 
     def _fill_again(self, forest: StarForest, fields: Sequence[Any]) -> None:
-        """Fill fields that have been filled before: the exchange is kept, with what it costs to make it."""
+        """Fill fields that were filled before, by the exchange set up then."""
         key = forest, *((field.ptr, field.dtype) for field in fields)
         if key not in self._fillings:
             if len(self._fillings) >= MOST_KEPT:
@@ -438,7 +473,10 @@ class Subdomain(GridPart):
         run_table(self._fillings[key])
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
-        """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""
+        """Gather fields of the part into fields of the whole grid; collective.
+
+        Every rank gets the whole fields.
+        """
         if self._gathering is None:
             boxes, cells = self.decomposition.boxes, CellBox((0, 0, 0), self.decomposition.counts)
             stored = [self._cells(box).grown(1) for box in boxes]
@@ -455,11 +493,14 @@ class Subdomain(GridPart):
                 field.assign(host)
 
     def take(self, whole: wp.array, field: wp.array) -> None:
-        """Write what a field of the whole grid has on this part to a field of the part."""
+        """Write this part's values of a whole-grid field to a field of the part."""
         wp.copy(field, whole[self._cells(self.box).grown(1).moved((1, 1, 1)).slices])
 
     def box_of(self, field: wp.array, ring: int = 0) -> Any:
-        """Return the view of a field, host or device, or of layers of one, on the cells of the box and on so many cells around it."""
+        """Return the view of a field on the box and some cells around it.
+
+        The field may be on the host or a device, and may have layers.
+        """
         low, high = self.owned.low, self.owned.high
         edge = (ring if self.dimension == 3 else 0, ring, ring)
         box = (slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))
@@ -467,20 +508,30 @@ class Subdomain(GridPart):
 
     @property
     def known(self) -> CellBox:
-        """The stored cells that this rank is the one to know: those of the box and the ring beyond the domain's sides."""
+        """Stored cells that this rank owns.
+
+        They are the cells of the box and the ring beyond the domain's sides.
+        """
         return self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
 
     def known_of(self, field: np.ndarray) -> np.ndarray:
-        """Return the view of a host's field on what this rank alone knows."""
+        """Return the view of a host field on the cells that this rank owns."""
         return field[self.known.slices]
 
     def stored_box_of(self, field: wp.array) -> Any:
-        """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""
+        """Return the view of a field on the box and one cell around it.
+
+        It has the stored shape of such a box.
+        """
         low, high = self.owned.low, self.owned.high
         return field[low[0] - 1 : high[0] + 1, low[1] - 1 : high[1] + 1, low[2] - 1 : high[2] + 1]
 
     def box_like(self, field: wp.array) -> wp.array:
-        """Return a field of the box with a ring: memory of the field itself where boxes are layers of planes, else one of zeros."""
+        """Return a field of the box with a ring.
+
+        It shares the part's memory where boxes are layers of planes; otherwise it is a new field of
+        zeros.
+        """
         view = self.stored_box_of(field)
         return (
             view
@@ -489,14 +540,17 @@ class Subdomain(GridPart):
         )
 
     def copy_to_box(self, field: wp.array, box: wp.array) -> None:
-        """Give a field of the box what one of the part holds, if it does not share its memory."""
+        """Copy the part's values to a field of the box, unless they share memory."""
         view = self.stored_box_of(field)
         if view.ptr != box.ptr:
             copy_cells(box, view)
 
     def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
-        """Write the solution of a problem on the box to a field of the part, in ghost cells as others have it; collective."""
-        if x.dtype is not wp.float64:  # of a method in single precision
+        """Write the solution of a problem on the box to the part; collective.
+
+        Ghost cells get the values of the ranks that own them.
+        """
+        if x.dtype is not wp.float64:  # result of a method in single precision
             convert(x.flatten(), spare.flatten())
             x = spare
         nx, ny, nz = self.box.counts
@@ -505,13 +559,11 @@ class Subdomain(GridPart):
 
     @property
     def gathered_from(self) -> Corner:
-        """The first cell of what `gathered` returns: of the whole domain."""
+        """First cell of the result of `gathered`, in the whole domain."""
         return 0, 0, 0
 
     def gathered(self, values: np.ndarray) -> np.ndarray | None:
-        """Return what all ranks have of a field in their boxes as an array of the whole grid on the root rank; None elsewhere.
-
-        Collective.
+        """Return a field of the whole grid on the root rank, None elsewhere; collective.
 
         Args:
             values: of this part without its ring.
@@ -540,15 +592,21 @@ class Subdomain(GridPart):
     def make_boundary(
         self, scene: ParticleScene, solids: Sequence[PlacedSolid]
     ) -> tuple[Boundary, list[str]]:
-        """Return solids and walls of the part as the whole grid would have them, and warnings; collective."""
+        """Return solids and walls of the part, and warnings; collective.
+
+        They are those of the whole grid.
+        """
         return boundary_of_part(scene, self, solids)
 
     def exchange_of(self, particles: Particles) -> ParticleMigration:
-        """Return what particles on this part have to do with those of other ranks."""
+        """Return the exchange of this part's particles with other ranks."""
         return ParticleMigration(self, particles)
 
     def nearest(self, cells: np.ndarray) -> np.ndarray:
-        """Return cells (x, y, z) of the part, shape (n, 3), along axes without an end those images that are nearest to the box."""
+        """Return the images of cells (x, y, z) that are nearest to the box.
+
+        Shape (n, 3). Images exist along periodic axes.
+        """
         for axis in self.joined:
             count = self.decomposition.counts[axis]
             first = self.owned.low[2 - axis] - 1 - (count - self.box.counts[axis]) // 2
@@ -556,7 +614,10 @@ class Subdomain(GridPart):
         return cells
 
     def near(self, window: Window, layers: int) -> Window | None:
-        """Return the cells of a window in the box and some layers around it: a window that moves there, for recorded launches."""
+        """Return a window clipped to the box and some layers around it.
+
+        It follows a window that moves, for recorded launches.
+        """
         if layers not in self._near:
             low, high = self.owned.low[::-1], [h - 1 for h in self.owned.high[::-1]]
             around = self.grid.window(low, high, grow=layers)
@@ -571,13 +632,13 @@ class Subdomain(GridPart):
     def join_trees(
         self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array
     ) -> BodyNumbers:
-        """Join the trees of cells that reach over several ranks' boxes to bodies; collective."""
+        """Join the trees of cells that extend over several boxes; collective."""
         if self._trees is None:
             self._trees = TreesAtCuts(self)
         return self._trees.join(trees, seen, parent, number, held)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
-        """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""
+        """Return the rank of each cell (x, y, z) of the whole domain, shape (n, 3)."""
         place = [
             np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right")
             for axis, part in enumerate(self.decomposition.parts)

@@ -1,4 +1,4 @@
-"""A thread on each rank that sees when ranks wait for one that does not come, and ends all with its name."""
+"""Deadlock watchdog: names the rank that does not answer and aborts."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from warp_lcp.distributed.interruptible_wait import InterruptibleWait, waiting
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.atomic import SUFFIX, open_in_place
 
-LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
-BEATS = 20  # of the thread within the limit; it looks at the clock no more often
+LIMIT = 600.0  # seconds: compilation of kernels and the largest frames take less
+BEATS = 20  # heartbeats within the limit, which is checked as often
 LONGEST_BEAT = 30.0  # seconds
-# beats, and seconds, after which a rank that has told nothing new cannot: stopped, or its machine
-# is gone
+# Beats, and seconds, after which a rank without a new heartbeat counts as dead: stopped, or its
+# machine has failed.
 SILENT, SILENCE = 4, 2.0
 POST = r"waits_\d{4,}"  # names of the files
-# ranks that look one beat after another, so that one of them speaks; later ones only if those
-# cannot
+# Ranks that check one beat after another, so that only one of them reports; later ranks check only
+# if those cannot.
 FIRST = 5
-# seconds that it may take to end all ranks before this one ends itself, which mpiexec notices
+# Seconds that it may take to end all ranks. After them this rank ends itself, which mpiexec
+# notices.
 GRACE = 5.0
-ROOM = 512  # bytes of a post: written over in place, which a full disk allows
+ROOM = 512  # bytes of a heartbeat: overwritten in place, which works on a full disk
 OWN = "warp_lcp."
-# wait for whom calls them
+# Modules that wait on behalf of their callers.
 PASSING = {
     "contextlib",
     *(f"{OWN}distributed.{name}" for name in ("waiting", "ranks", "collective", "halo")),
@@ -44,11 +45,11 @@ PASSING = {
 
 @dataclass(frozen=True)
 class HeartbeatMessages:
-    """What a rank's thread tells of its main thread.
+    """Heartbeat: state of a rank's main thread.
 
     Args:
         beat: a number that grows while the thread lives.
-        count: of entries into operations of all ranks, and exits.
+        count: of entries into collective operations, and exits.
         name: of the operation that the rank waits in, "" outside.
         seconds: since the count grew.
         place: in the program.
@@ -62,10 +63,10 @@ class HeartbeatMessages:
 
 
 class HeartbeatTable:
-    """Where ranks tell each other what they do while MPI cannot: a small file a rank.
+    """Heartbeat files, one a rank: communication while MPI is blocked.
 
     Args:
-        folder: that all of them see; those that do not are not heard of.
+        folder: shared by the ranks; a rank that does not see it is ignored.
         label: tells the ranks of different programs apart in it.
     """
 
@@ -77,41 +78,45 @@ class HeartbeatTable:
         return self._folder / f".{self._label}waits_{rank:04d}{SUFFIX}"
 
     def write(self, rank: int, post: HeartbeatMessages) -> None:
-        """Put up a post."""
+        """Write a heartbeat."""
         line = (json.dumps({**asdict(post), "place": post.place[: ROOM // 2]}) + "\n").encode()
         descriptor = open_in_place(self.path(rank), os.O_WRONLY | os.O_CREAT, 0o600)
-        with open(descriptor, "wb") as file:  # closed each time: that is when other machines see it
+        # The file is closed each time, so that other machines see the change.
+        with open(descriptor, "wb") as file:
             file.write(line.ljust(ROOM))
 
     def read(self, rank: int) -> HeartbeatMessages | None:
-        """Return the post of a rank; None if there is none, or a half-written one."""
+        """Read the heartbeat of a rank.
+
+        Returns None if there is none, or a half-written one.
+        """
         with suppress(OSError, ValueError, TypeError):
             return HeartbeatMessages(**json.loads(self.path(rank).read_bytes().split(b"\n")[0]))
         return None
 
     def clear(self, ranks: Sequence[int]) -> None:
-        """Take posts away."""
+        """Remove the heartbeat files."""
         for rank in ranks:
             with suppress(OSError):
                 self.path(rank).unlink()
 
 
 class Watchdog:
-    """A `with` block in which all ranks end, with a message, once one has kept the others waiting for too long.
+    """A `with` block that ends all ranks once one keeps the others waiting too long.
 
-    On each rank a thread tells by a small file, some times within the limit, what its main thread
-    does. A rank that has waited so long reads what the others have told, and says who is late. Time
-    in which processes are stopped, by Ctrl-Z or a batch system, does not count. Before there is a
-    folder that all see, ranks of one machine hear of each other.
+    On each rank a thread writes a heartbeat several times within the limit: a small file with the
+    state of its main thread. A rank that has waited for the limit reads the other heartbeats and
+    names the late rank. Time in which processes are stopped, by Ctrl-Z or a batch system, does not
+    count. Before there is a folder that all ranks see, heartbeats are shared on one machine.
 
     Args:
         ranks: all of them.
         limit: seconds that a rank may keep the others waiting; 0: any.
         end: takes the message, and ends all processes.
-        watched: what the main thread waits in.
+        watched: state of the main thread's collective operations.
 
     >>> from types import SimpleNamespace
-    >>> with Watchdog(Ranks(SimpleNamespace(rank=0, size=1)), 600.0, print):  # one rank waits for nobody
+    >>> with Watchdog(Ranks(SimpleNamespace(rank=0, size=1)), 600.0, print):  # a single rank
     ...     pass
     """
 
@@ -133,7 +138,7 @@ class Watchdog:
         self._over = threading.Event()
         self._main = threading.main_thread().ident
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        # of ranks: since when they stay, the last post, its age in beats
+        # Of each rank: first heartbeat without progress, last one, its age in beats.
         self._seen: dict[int, tuple[HeartbeatMessages | None, HeartbeatMessages | None, int]] = {}
 
     def __enter__(self) -> Self:
@@ -149,16 +154,16 @@ class Watchdog:
     ) -> None:
         self._over.set()
         if self._thread.is_alive():
-            self._thread.join(1.0)  # not longer: a file system may hang
+            self._thread.join(1.0)  # a limited wait: the file system may hang
         self._board.clear([self._ranks.rank])
 
     def post_in(self, folder: Path) -> None:
-        """Tell in a folder, which all ranks see, from now on."""
+        """Write heartbeats to a folder that all ranks see, from now on."""
         with self._posting:
             self._board.clear([self._ranks.rank])
             self._board = HeartbeatTable(folder)
             if self._thread.is_alive():
-                # while the disk has room
+                # Written at once, while the disk has room.
                 self._board.write(
                     self._ranks.rank, HeartbeatMessages(0, 0, "", 0.0, "its beginning")
                 )
@@ -167,7 +172,7 @@ class Watchdog:
         beat, count, idle, then = 0, self._watched.count, 0.0, time.monotonic()
         while not self._over.wait(self._beat):
             now = time.monotonic()
-            # longer if the process was stopped
+            # now - then is longer if the process was stopped; that time does not count.
             beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now
             if count != self._watched.count:
                 count, idle = self._watched.count, 0.0
@@ -181,7 +186,7 @@ class Watchdog:
             with self._posting:
                 if self._over.is_set():
                     return
-                # a disk that takes no file: the others will say that this rank tells nothing
+                # If the disk accepts no file, the other ranks report this one as silent.
                 with suppress(OSError):
                     self._board.write(self._ranks.rank, mine)
             if idle < self._limit + min(self._ranks.rank, FIRST) * self._beat:
@@ -193,8 +198,12 @@ class Watchdog:
                 return
 
     def _look(self, mine: HeartbeatMessages) -> str:
-        """Return what is wrong; "" while ranks go on, or have not yet told twice that they do not."""
-        # a rank that computes waits for nobody
+        """Return the error message; "" while ranks make progress.
+
+        It is also "" until two different heartbeats of each rank, or none for long, show that it
+        does not.
+        """
+        # A rank that computes waits for no other rank.
         patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)
         posts: dict[int, HeartbeatMessages | None] = {self._ranks.rank: mine}
         certain = True
@@ -202,7 +211,7 @@ class Watchdog:
             post = self._board.read(rank)
             first, last, age = self._seen.get(rank, (post, post, 0))
             if post and first and post.count != first.count:
-                first = post  # it goes on
+                first = post  # the rank makes progress
             age = 0 if post and last and post.beat != last.beat else age + 1
             self._seen[rank] = first or post, post or last, age
             posts[rank] = None if age > patience else post or last
@@ -214,16 +223,16 @@ class Watchdog:
 
 
 def verdict(posts: Mapping[int, HeartbeatMessages | None]) -> str:
-    """Return which ranks keep the others waiting, in a line; "" if none does.
+    """Return a line about ranks that keep the others waiting; "" if there are none.
 
     Args:
-        posts: of all ranks, which have not gone on for long; None: it tells nothing.
+        posts: heartbeats of all ranks, without progress for long; None: no heartbeat.
     """
     inside = {rank: post for rank, post in sorted(posts.items()) if post and post.name}
     outside = {rank: post for rank, post in sorted(posts.items()) if post and not post.name}
     silent = sorted(rank for rank, post in posts.items() if post is None)
     if not inside and not silent:
-        return ""  # all compute
+        return ""  # all ranks compute
     waits = _grouped({rank: f"{post.name} ({post.place})" for rank, post in inside.items()})
     if not outside and not silent:
         return f"all ranks wait for each other in different operations: {waits}"
@@ -246,7 +255,10 @@ def verdict(posts: Mapping[int, HeartbeatMessages | None]) -> str:
 
 
 def place_of(frame: FrameType | None) -> str:
-    """Return where a thread is: in which line of ours, and of the module that this has called."""
+    """Return the position of a thread: the line in this library.
+
+    Also the line of the module that it has called.
+    """
     found = list[str]()
     while frame is not None:
         name, line = str(frame.f_globals.get("__name__", "")), frame.f_lineno
@@ -263,7 +275,7 @@ def _named(ranks: Sequence[int]) -> str:
 
 
 def _grouped(texts: dict[int, str]) -> str:
-    """Return who waits in what."""
+    """Return text that groups ranks by the operation they wait in."""
     ranks: dict[str, list[int]] = {}
     for rank, text in texts.items():
         ranks.setdefault(text, []).append(rank)

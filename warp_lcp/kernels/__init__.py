@@ -1,4 +1,7 @@
-"""Rows: what owns layout, bounds, sums, waves and launches of passes over grids; a method supplies what is done to a cell."""
+"""Launch layer: layout, bounds, sums and launches of stencil kernels.
+
+It also fuses kernels and records them in graphs. A method supplies the computation of a cell.
+"""
 
 from warp_lcp.kernels.device_graph import DeviceGraph
 from warp_lcp.kernels.fused_kernel import FusedKernel

@@ -1,4 +1,4 @@
-"""How Warp's compiler is called for the project's kernels on CPUs."""
+"""Compiler settings of the project's Warp kernels on CPUs."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ from typing import Any
 
 import warp as wp
 
-# WP_NO_BFLOAT16: no kernel here computes with bfloat16, and Warp's header of all built-in
-# functions, which the first module of a process compiles to a precompiled header, is a third
-# shorter without it. -fpch-instantiate-templates: templates that this header uses itself are
-# instantiated when it is compiled, not again in each module. Neither changes a module's object
-# code.
+# WP_NO_BFLOAT16: no kernel here computes with bfloat16. Without it, Warp's header of all built-in
+# functions is a third shorter; the first module of a process compiles that to a precompiled header.
+# -fpch-instantiate-templates: templates that this header uses itself are instantiated when it is
+# compiled, not again in each module. Neither changes a module's object code.
 HEADER_FLAGS = "-DWP_NO_BFLOAT16= -fpch-instantiate-templates"
 # LLVM inlines the functions of a module before it optimizes any, instead of optimizing a kernel
 # again at each level of calls: a fifth less time for code of the same size.
 INLINE_FIRST = "-mllvm=-enable-module-inliner"
-# Not so in these modules: sums of the first four would be rounded in another order; the others have
-# large functions that are called from many places, and would be four times as long.
+# These modules do not inline first. Sums of the first four would be rounded in another order. The
+# others have large functions that are called from many places, and would be four times as long.
 INLINE_LATER = (
     "fluids.surface_tension",
     "fluids.viscosity",
@@ -26,12 +25,13 @@ INLINE_LATER = (
     "warp_lcp.grid.barriers",
     "warp_lcp.grid.thin_walls",
 )
-# Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
+# Warp writes functions to add structs for gradients. Functions local to the module are not
+# compiled.
 LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
 #define CUDA_CALLABLE __attribute__((internal_linkage))
 """
-# Versions of Warp with which INLINE_FIRST and LOCAL_FUNCTIONS were tried. Others might not have
-# that option of LLVM, and then no kernel would compile, or this experimental interface.
+# Versions of Warp with which INLINE_FIRST and LOCAL_FUNCTIONS were tested. Other versions might
+# lack that option of LLVM, and then no kernel would compile, or this experimental interface.
 TRIED_VERSIONS = ("1.19",)
 
 
@@ -50,14 +50,14 @@ def forward_kernel(*, module: Any, **options: Any) -> Any:
 
 
 def project_module(name: str) -> Any:
-    """Return a Warp module, made if need be, with the project's compiler flags.
+    """Return a Warp module with the project's compiler flags.
 
-    Most modules have the same flags, which is quickest: each set of flags has a precompiled header
-    of its own, and that takes a second. They are added to `wp.config.cpu_compiler_flags` as it is
-    when a kernel of the module is declared.
+    The module is created if it does not exist. Most modules share their flags: each set of flags
+    has a precompiled header of its own, which takes a second. The flags are appended to
+    `wp.config.cpu_compiler_flags` as it is when a kernel of the module is declared.
     """
     flags = wp.config.cpu_compiler_flags
-    words = ["-march=native" if flags is None else flags, HEADER_FLAGS]  # what Warp takes for None
+    words = ["-march=native" if flags is None else flags, HEADER_FLAGS]  # Warp's default
     options: dict[str, Any] = {}
     if ".".join(wp.__version__.split(".")[:2]) in TRIED_VERSIONS:
         options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)

@@ -1,12 +1,12 @@
 # mypy: ignore-errors
-"""CUDA graphs of a step's launches: captured once, their arguments are read from memory of the device.
+"""CUDA graphs of a step's launches, whose arguments lie in device memory.
 
-What changes from run to run (windows, list lengths, replaced arrays, `Scalar`s) stands in memory of
-the host, see `memory.py`. The arguments of all kernels of a graph lie one after another in one
-array of the device, the *image*. Each run gathers the changed numbers in one pinned buffer. The
-graph copies it to the device, writes its bytes to their places in the image (one kernel), and
-launches the kernels, each of which reads its arguments from there. Launch dimensions are those of
-the largest rows; threads beyond the present ones return at once.
+A graph is captured once. Quantities that change from run to run (windows, list lengths, replaced
+arrays, `Scalar`s) stand in memory of the host, see `memory.py`. The arguments of all kernels of a
+graph lie one after another in one array of the device, the *image*. Each run gathers the changed
+numbers in one pinned buffer. The graph copies it to the device, writes its bytes to their places in
+the image (one kernel), and launches the kernels, each of which reads its arguments from there.
+Launch dimensions are those of the largest rows; threads beyond the present ones return at once.
 """
 
 import ast
@@ -41,7 +41,8 @@ BEYOND = {
 plane_, row_, chunk_ = wp.tid()
 if row_ >= given_[0].{{0}}.rows or chunk_ >= given_[0].{{0}}.chunks:
     return
-if wp.int64((plane_ * given_[0].{{0}}.rows + row_) * given_[0].{{0}}.chunks + chunk_) >= given_[0].{FIRST}:
+if wp.int64((plane_ * given_[0].{{0}}.rows + row_) * given_[0].{{0}}.chunks + chunk_) \
+>= given_[0].{FIRST}:
     return
 """,
 }
@@ -54,14 +55,17 @@ def patch_kernel(
     place: wp.array(dtype=int),
     image: wp.array(dtype=wp.uint8),
 ):
-    """Write a byte that changes from run to run to its place in the arguments."""
+    """Write a byte that changes from run to run to its position in the arguments."""
     t = wp.tid()
     image[place[t]] = cells[source[t]]
 
 
 @functools.cache
 def pass_from_memory(form: Any) -> Any:
-    """Return the struct of a pass's arguments, and the kernel that reads them from the first element of an array of such structs."""
+    """Return a kernel's argument struct, and the kernel that reads it from memory.
+
+    That kernel takes an array of such structs and reads the first element.
+    """
     if form.pattern is not None and form.pattern.touch is not None:
         raise NotRecordable(f"{form.declared.label}: a stencil of Warp functions")
     run, Fields = form.run, form.fields
@@ -93,7 +97,9 @@ _KERNELS: dict[Any, Any] = {}
 
 
 def kernel_from_memory(kernel: Any, sized: int) -> Any:
-    """Return the struct of a Warp kernel's arguments, and the same kernel with arguments from an array of one such struct.
+    """Return the struct of a Warp kernel's arguments, and a kernel that reads it.
+
+    That kernel takes an array of one such struct instead of arguments.
 
     Args:
         kernel: the kernel.
@@ -131,7 +137,7 @@ def _made_from_memory(kernel: Any, sized: int) -> Any:
 
 
 class DeviceGraph(CommandBuffer):
-    """Launches recorded once for a CUDA device, whose arguments are patched in each run.
+    """Recorded launches on a CUDA device, whose arguments are patched in each run.
 
     Args:
         device: the device.
@@ -139,11 +145,11 @@ class DeviceGraph(CommandBuffer):
 
     def __init__(self, device: wp.Device) -> None:
         super().__init__(device)
-        # of `_add`, each with its command and its place
+        # Arguments of `_add`, each with its command and its place.
         self._pieces: list[tuple[int, Any, Any, tuple[int, ...], bytes, int, int]] = []
         self._patches: list[tuple[int, int, int]] = []
         self._bytes = 0
-        # memory of rows, and the launch dimensions that have been captured
+        # Memory of rows, and the launch dimensions that have been captured.
         self._extents: list[tuple[Any, tuple[int, ...]]] = []
         self._buffer: np.ndarray | None = None
         self._copied: Any = None  # event after which the buffer may be written
@@ -185,7 +191,10 @@ class DeviceGraph(CommandBuffer):
         sized: int,
         extent: Any,
     ) -> None:
-        """Record a launch of a kernel with ranges of tasks; arguments as of `launch_ranges`."""
+        """Record a kernel launch with ranges of tasks.
+
+        Arguments as of `launch_ranges`.
+        """
         if extent is None or not sized:
             self._record_kernel(kernel, dim, inputs, (), 0, sized=0)
             return
@@ -195,7 +204,7 @@ class DeviceGraph(CommandBuffer):
         )
 
     def record_pass(self, bound: Any) -> None:
-        """Record the launch of a pass."""
+        """Record the launch of a stencil kernel."""
         patches, layout = bound.patches(), bound.layout
         if not patches:
             if 0 not in threads(layout):
@@ -214,7 +223,10 @@ class DeviceGraph(CommandBuffer):
         self._add(kernel, struct, room, memory, patches, bound)
 
     def _hold(self, memory: Any) -> tuple[int, ...]:
-        """Return the launch dimensions for rows in memory, which `fits` compares with those of a later run."""
+        """Return the launch dimensions for rows in memory.
+
+        `fits` compares them with those of a later run.
+        """
         self._extents.append((memory, memory.room))
         return memory.room
 
@@ -273,7 +285,7 @@ class DeviceGraph(CommandBuffer):
         self._commands.append(None)
 
     def finish(self) -> None:
-        """Lay out the image, and make the launches that read from it."""
+        """Allocate the image, and create the launches that read from it."""
         if not self._pieces:
             return
         host = np.zeros(self._bytes, dtype=np.uint8)
@@ -291,7 +303,10 @@ class DeviceGraph(CommandBuffer):
         self._prepare_patches(image)
 
     def _prepare_patches(self, image: wp.array[Any]) -> None:
-        """Make the buffer of what changes, its copy to the device, and the launch that writes it to the image."""
+        """Create the buffer of changing arguments, its copy, and the patch launch.
+
+        The launch writes the bytes to the image.
+        """
         places: dict[tuple[int, int], int] = {}
         size, source, place = 0, [], []
         for at, address, count in self._patches:
@@ -315,7 +330,7 @@ class DeviceGraph(CommandBuffer):
         self._commands[:0] = [DeviceCopy(cells, pinned), made]
 
     def fits(self) -> bool:
-        """Return whether all rows have no more threads now than were captured."""
+        """Return whether all rows need at most the captured threads."""
         return all(
             e <= r
             for memory, room in self._extents
@@ -324,23 +339,29 @@ class DeviceGraph(CommandBuffer):
 
     @property
     def commands(self) -> list[Any]:
-        """What a graph of the program holds, in order."""
+        """Commands of the program's graph, in order."""
         return self._commands
 
     def captured(self, commands: list[Any]) -> Any:
-        """Return the graph of some launches."""
+        """Capture some launches and return their graph."""
         return self._captured(commands)
 
     def run(self) -> None:
-        """Launch the graph, or have it wait for others, see `joined.py`; the first time launch by launch, which loads the kernels."""
-        settle(self)  # whose buffer is still to be read
+        """Launch the graph, or queue it to be joined with others, see `joined_graphs.py`.
+
+        The first run launches kernel by kernel, which loads the kernels.
+        """
+        settle(self)  # in case its buffer is still queued
         if self._buffer is not None:
             self._refresh()
         if not waits(self):
             self.launch_now()
 
     def launch_now(self) -> None:
-        """Launch the graph with what its buffer holds; loops that are new launch a graph of their own."""
+        """Launch the graph with the arguments in its buffer.
+
+        New loops launch a graph of their own.
+        """
         if self._runs:
             super().run()
         else:
@@ -353,7 +374,7 @@ class DeviceGraph(CommandBuffer):
         self._note_copy()
 
     def note_launch(self) -> None:
-        """Take note that a joined graph has launched it."""
+        """Note that a joined graph has launched it."""
         self._runs += 1
         self._note_copy()
 
@@ -362,7 +383,10 @@ class DeviceGraph(CommandBuffer):
             self._copied = noted(self.device, self._copied)
 
     def _refresh(self) -> None:
-        """Bring what has changed to the pinned buffer, once the copy of an earlier run has read it."""
+        """Write changed arguments to the pinned buffer.
+
+        It waits until the copy of an earlier run has read the buffer.
+        """
         address = self._buffer.ctypes.data
         for begin, source, count in self._sources:
             ctypes.memmove(address + begin, source, count)
@@ -375,11 +399,13 @@ class DeviceGraph(CommandBuffer):
 
 
 class Upload(DeviceGraph):
-    """Copy of an array of the host to one of the device, launched as a recorded stretch; nothing is copied that has not changed.
+    """Copy of a host array to the device, launched as a recorded stretch.
+
+    An unchanged array is not copied.
 
     Args:
         host: NumPy array, read in each run.
-        array: of the same bytes, on the device, which nothing else writes.
+        array: of the same bytes, on the device; nothing else writes to it.
     """
 
     def __init__(self, host: np.ndarray, array: wp.array[Any]) -> None:
@@ -394,11 +420,11 @@ class Upload(DeviceGraph):
 
     @property
     def has_run(self) -> bool:
-        """True: there are no kernels to load."""
+        """Return True: there are no kernels to load."""
         return True
 
     def run(self) -> None:
-        """Launch the copy, or have it wait for others; do nothing if the host's array is as it was."""
+        """Launch or queue the copy, if the host's array has changed."""
         address = self._sources[0][1]
         if self._sent and np.array_equal(
             self._buffer,
@@ -410,10 +436,10 @@ class Upload(DeviceGraph):
 
 
 def noted(device: wp.Device, event: Any) -> Any:
-    """Record an event behind what has been launched, and return it."""
+    """Record an event behind all launches so far, and return it."""
     return wp.get_stream(device).record_event(event) if device.is_cuda else None
 
 
 def host_view(pinned: wp.array[Any]) -> np.ndarray:
-    """Return memory of the host as an array that can be written."""
+    """Return a view of host memory as a writable array."""
     return np.frombuffer((ctypes.c_uint8 * pinned.size).from_address(pinned.ptr), dtype=np.uint8)

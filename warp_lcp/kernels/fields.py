@@ -1,4 +1,4 @@
-"""How an operator stores its fields while a solver works on them: flat, with ghost cells where its stencil wants them.
+"""Stored fields: flat arrays with the ghost cells that a stencil needs.
 
 A user's field has the operator's shape; a *stored* field is a flat array of `size` elements.
 Solvers see stored fields only.
@@ -19,10 +19,11 @@ import warp as wp
 from warp_lcp.kernels.log_filter import start_warp
 
 Array = Any  # a numpy array or a wp.array
-# elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
+# Elements of a flat field that a CPU thread takes: its operands stay in the L2 cache between fused
+# loops.
 CPU_CHUNK = 8192
-LARGE = 1 << 20  # elements from which a field of the CPU is looked through for what of it is in use
-# bytes that the system gives memory by, when something in them is first written
+LARGE = 1 << 20  # elements from which the part of a CPU field in use is searched for
+# Page sizes in bytes: the system allocates a page when something in it is first written.
 HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12
 
 
@@ -30,7 +31,7 @@ def checked_device(device: Any) -> wp.Device:
     """Return a Warp device; the default one if None.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: there is no device of that name.
     """
     start_warp()
     try:
@@ -45,12 +46,12 @@ def checked_device(device: Any) -> wp.Device:
 def zeros(
     n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_pages: bool = False
 ) -> wp.array[Any]:
-    """Return a field of zeros, flat or of a shape, whose memory on the CPU is taken when it is first written.
+    """Return a field of zeros, flat or of a shape; memory is allocated on first write.
 
     On the CPU it is NumPy's memory: NumPy asks for huge pages, Warp does not. At 128^3 that makes a
-    workspace in 5 instead of 20 ms, and solves 10 % faster, for a pass over many fields misses in
-    the table of small pages. `small_pages` are for fields of which so little is written, here and
-    there, that huge ones would be taken for all of it.
+    workspace in 5 instead of 20 ms, and solves 10 % faster, because kernels over many fields have
+    fewer TLB misses. `small_pages` suits fields that are written sparsely, for which huge pages
+    would take memory for all of the field.
     """
     if not device.is_cpu:
         return wp.zeros(n, dtype=dtype, device=device)
@@ -77,7 +78,10 @@ def zeros(
 
 
 def _release(host: np.ndarray, pointer: int, size: int) -> None:
-    """Do nothing: the array of the host goes with the deleter that has it."""
+    """Do nothing.
+
+    The deleter object holds the host's array, which is freed with it.
+    """
 
 
 @cache
@@ -87,7 +91,7 @@ def _width(dtype: Any) -> int:
 
 
 def nothing(dtype: Any, device: wp.Device) -> wp.array[Any]:
-    """Return the flat array of a type without elements, which all share."""
+    """Return the empty flat array of a type; it is shared."""
     return _nothing(dtype, device.alias)
 
 
@@ -102,7 +106,10 @@ def zeros_like(field: wp.array[Any]) -> wp.array[Any]:
 
 
 def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> wp.array[Any]:
-    """Return a copy of an array of the host on a device; on the CPU in NumPy's memory, as `zeros`."""
+    """Return a copy of a host array on a device.
+
+    On the CPU it is in NumPy's memory, as that of `zeros`.
+    """
     return wp.array(
         np.array(host, dtype=wp.dtype_to_numpy(dtype)),
         dtype=dtype,
@@ -112,7 +119,7 @@ def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> wp.array[Any]:
 
 
 def real_array(values: Any, name: str) -> np.ndarray:
-    """Return an array (numpy, Warp), or what makes one (a list, a data frame), as a numpy array of real numbers of any type.
+    """Return an array, or a list or data frame, as a numpy array of real numbers.
 
     Raises:
         ValueError: it holds something else, or masked entries; the message names it.
@@ -141,7 +148,10 @@ def real_array(values: Any, name: str) -> np.ndarray:
 
 
 def overwrite(to: wp.array[Any], source: wp.array[Any]) -> None:
-    """Copy an array of the CPU to another one of the same type and size, both contiguous: in a tenth of the time of `wp.copy`."""
+    """Copy a CPU array to another one of the same type and size, both contiguous.
+
+    It takes a tenth of the time of `wp.copy`.
+    """
     if source.size:
         ctypes.memmove(to.ptr, source.ptr, source.capacity)
 
@@ -150,9 +160,10 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
     """Check that values can be stored in a type.
 
     Raises:
-        ValueError: one is NaN or infinite, or becomes so.
+        ValueError: a value is NaN or infinite, or becomes so.
     """
-    largest = max(-float(values.min(initial=0.0)), float(values.max(initial=0.0)))  # NaN if one is
+    # NaN if any value is.
+    largest = max(-float(values.min(initial=0.0)), float(values.max(initial=0.0)))
     if not np.isfinite(largest):
         raise ValueError(f"{name} holds a value that is not finite")
     if largest > float(np.finfo(wp.dtype_to_numpy(dtype)).max):
@@ -163,10 +174,10 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
 
 
 def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
-    """Check that no value but 0 becomes 0 in a type.
+    """Check that no nonzero value becomes 0 in a type.
 
     Raises:
-        ValueError: one does.
+        ValueError: a value does.
     """
     lost = np.count_nonzero(values) - np.count_nonzero(values.astype(wp.dtype_to_numpy(dtype)))
     if lost:
@@ -177,10 +188,13 @@ def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
 
 
 def relative_rounding(values: np.ndarray, dtype: Any) -> float:
-    """Return the largest relative error that storing values in a type makes, 0 where it holds all of them."""
+    """Return the largest relative error of values stored in a type.
+
+    It is 0 if the type holds all of them exactly.
+    """
     if dtype is wp.float64 or values.dtype == wp.dtype_to_numpy(dtype):
         return 0.0
-    with np.errstate(invalid="ignore"):  # 0 / 0, which fmax passes over
+    with np.errstate(invalid="ignore"):  # 0 / 0 is NaN, which fmax ignores
         ratio = np.asarray(
             np.divide(values.astype(wp.dtype_to_numpy(dtype)), values, dtype=np.float64)
         )
@@ -192,12 +206,12 @@ class Layout:
     """Fields stored as they are.
 
     Attributes:
-        across: who stores the other parts of the fields, see `warp_lcp.kernels.vectors.Across`; None:
-            nobody.
+        across: communicator of a distributed problem, see `warp_lcp.kernels.vectors.Communicator`;
+            None if serial.
         chunks: (0, its elements) of each chunk of `CPU_CHUNK` elements that has ever been in use,
             (0, 0) of others, where fields are 0 and stay untouched: wp.vec2i, shape (chunks, 1);
             None: all are in use.
-        rows: what `warp_lcp.kernels.Rows.of_fields` has made of that.
+        rows: the result of `warp_lcp.kernels.Rows.of_fields` for them.
         inside: index of the part of a stored field that the operator's shape stands for.
     """
 
@@ -212,7 +226,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Elements of a stored field."""
+        """Number of elements of a stored field."""
         return math.prod(self.stored_shape)
 
     def zeros(self, dtype: Any) -> wp.array[Any]:
@@ -220,7 +234,10 @@ class Layout:
         return zeros(self.size, dtype, self.device)
 
     def holds(self, field: Array, dtype: Any) -> bool:
-        """Return whether `field` is a device array that is stored already, so that it can be used without a copy."""
+        """Return whether `field` is stored already and can be used without a copy.
+
+        It is then a device array.
+        """
         return (
             isinstance(field, wp.array)
             and field.dtype is dtype
@@ -263,28 +280,36 @@ class Layout:
         return host.shape in (self.shape, self.stored_shape, (self.size,))
 
     def target(self, stored: np.ndarray, host: np.ndarray) -> np.ndarray:
-        """Return the part of a stored field that an array which fits it fills, reshaped to that part's shape."""
+        """Return the part of a stored field that a fitting array fills, reshaped."""
         return stored[self.inside] if host.shape == self.shape else stored
 
     def places(self, like: np.ndarray | None = None) -> np.ndarray:
-        """Return where the elements of an array that fits, of the operator's shape unless one is given, are in a stored field."""
+        """Return the positions of an array's elements in a stored field.
+
+        The array has the operator's shape, or a given one that fits.
+        """
         return self.target(
             np.arange(self.size).reshape(self.stored_shape),
             np.empty(self.shape) if like is None else like,
         ).ravel()
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
-        """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""
+        """Return a stored field as a contiguous field of the operator's shape.
+
+        It is a copy unless both have the same layout.
+        """
         return stored.reshape(self.shape)
 
 
 @dataclass(frozen=True)
 class Padding:
-    """Counts of cells (nz, ny, nx) and of stored cells, which include one ghost cell on every side.
+    """Counts of cells (nz, ny, nx), and of stored cells with a ghost layer.
+
+    Stored cells include one ghost cell on every side.
 
     Args:
         counts: of cells.
-        small_pages: of what fields are made, see `zeros`.
+        small_pages: of fields' memory, see `zeros`.
     """
 
     counts: tuple[int, int, int]
@@ -302,12 +327,12 @@ class Padding:
 
     @property
     def plane(self) -> int:
-        """Elements from plane to plane."""
+        """Stride from plane to plane, in elements."""
         return self.shape[1] * self.shape[2]
 
     @property
     def row(self) -> int:
-        """Elements from row to row."""
+        """Stride from row to row, in elements."""
         return self.shape[2]
 
     @property
@@ -317,7 +342,10 @@ class Padding:
 
 
 class PaddedLayout(Layout):
-    """Grid fields (nz, ny, nx) or (ny, nx) stored with one layer of ghost cells, so that a stencil needs no bounds tests."""
+    """Grid fields stored with one layer of ghost cells.
+
+    Fields have shape (nz, ny, nx) or (ny, nx). With ghost cells a stencil needs no bounds tests.
+    """
 
     inside: ClassVar[Any] = (slice(1, -1),) * 3
 
@@ -327,11 +355,11 @@ class PaddedLayout(Layout):
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
         self.padding = Padding((nz, ny, nx))
         self.stored_shape = self.padding.shape
-        # whether so little is in use that zeros elsewhere are better not written
+        # Whether so little is in use that zeros elsewhere are better not written.
         self.sparse = False
 
     def find_use(self, used: np.ndarray) -> None:
-        """Choose how fields take their memory, from which rows are in use at first.
+        """Choose the pages of fields' memory, from the rows in use at first.
 
         Args:
             used: bool, shape (nz, ny).
@@ -340,7 +368,7 @@ class PaddedLayout(Layout):
         if self.chunks is None or not k.size:
             return
         self.sparse = 4 * int(np.count_nonzero(self.chunks.numpy()[:, 0, 1])) < 3 * len(self.chunks)
-        # bytes, of a field of four each
+        # Bytes, of a field of four bytes an element.
         begin = 4 * ((k + 1) * self.padding.plane + (j + 1) * self.padding.row)
 
         def taken(page: int) -> int:
@@ -359,7 +387,10 @@ class PaddedLayout(Layout):
         return self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
 
     def copy(self, to: wp.array[Any], source: wp.array[Any]) -> None:
-        """Copy what is in use of a stored field to another one of its type, which is 0 elsewhere."""
+        """Copy the part in use of a stored field to another one of its type.
+
+        The target is 0 elsewhere.
+        """
         if not self.sparse:
             wp.copy(to, source)
             return
@@ -368,7 +399,7 @@ class PaddedLayout(Layout):
             a[begin:end] = b[begin:end]
 
     def _runs(self) -> list[tuple[int, int]]:
-        """Return the elements that are in use, as few ranges."""
+        """Return the elements in use, as few index ranges."""
         assert self.chunks is not None
         edges = np.flatnonzero(
             np.diff(self.chunks.numpy()[:, 0, 1] > 0, prepend=False, append=False)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Waves: passes that follow each other through memory, some planes apart."""
+"""Fused kernels: stages that follow each other through memory, some planes apart."""
 
 from typing import Any
 
@@ -8,13 +8,15 @@ from warp_lcp.kernels.layout import copy_of, put
 from warp_lcp.kernels.stencil_kernel import BoundKernel, StencilKernel
 from warp_lcp.kernels.thread_pool import CELLS, SLABS, Operation, get_threads, team
 
-LARGEST = 4  # passes of a wave
-# of waves: their pieces beside each other have work to finish together
+LARGEST = 4  # most stages
+# Least size of fused kernels' slabs: adjacent slabs finish shared planes together.
 SLAB_PIECES, SLAB_PLANES = 4, 8
 
 
 def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
-    """Return into how many slabs planes are cut, and how many planes each has but the last: an even number, coarser planes stand for two.
+    """Return the number of slabs, and the planes of each but the last.
+
+    The planes of a slab are an even number, because a coarser plane stands for two.
 
     Args:
         planes: to cut, at least twice `least`.
@@ -25,17 +27,19 @@ def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
         (count, planes // count // 2 * 2)
         for count in range(2, min(planes // least, SLAB_PIECES * threads) + 1)
     ]
-    # of the thread that has the last slab, and most
+    # Planes of the thread that has the last slab, and of the busiest one.
     shares = [-(-count // threads) * each + planes - count * each for count, each in cuts]
     return max(cut for cut, share in zip(cuts, shares, strict=True) if share <= 1.1 * min(shares))
 
 
 class FusedKernel:
-    """Passes each of which follows some planes behind the one before: a CPU streams through memory once; on CUDA, launches.
+    """Fused kernels: each runs some planes behind the one before.
+
+    A CPU then streams through memory once. On CUDA they are separate launches.
 
     Args:
-        name: of the kernel, as a pass has one.
-        stages: at most four passes, each with how many planes it is behind the first.
+        name: of the kernel, as a stencil kernel has one.
+        stages: at most four kernels, each with how many planes it is behind the first.
 
     Raises:
         ValueError: there are too many, or the first is behind.
@@ -49,11 +53,11 @@ class FusedKernel:
         self.name, self.stages = name, stages
 
     def launch(self, *passes: BoundKernel | None, launch: Any = launch_now) -> None:
-        """Launch the passes, or record them; None leaves one out.
+        """Launch the stages, or record them; None leaves one out.
 
         Raises:
-            TypeError: passes are others, or in another order, than declared.
-            ValueError: threads share the rows of one out, as those of a flat field.
+            TypeError: the kernels are others, or in another order, than declared.
+            ValueError: threads share the rows of a stage otherwise, as those of a flat field.
         """
         declared = tuple(stage for stage, _ in self.stages)
         given = [
@@ -79,12 +83,12 @@ class FusedKernel:
         perform(self._operation(given), launch)
 
     def _launch_planes(self, given: list[tuple[BoundKernel, int]], launch: Launch) -> None:
-        """Launch the wave plane after plane, as `team.h` works through a slab."""
+        """Launch the stages plane by plane, in the order of `team.h` within a slab."""
         for turn in range(max(b.layout.planes for b, _ in given) + max(lag for _, lag in given)):
             for bound, lag in given:
                 L, i = bound.layout, turn - lag
-                # planes that one of a coarser level stands for, whose turn comes with the last of
-                # them
+                # Planes of the finer level that one of a coarser level stands for. The coarser
+                # plane is processed with the last of them.
                 finer = max(L.fz, 1)
                 whole = finer == 1 or (i < L.n1 and ((i + 1) % finer == 0 or i == L.n1 - 1))
                 if 0 <= (k := i // finer) < L.planes and whole:
@@ -97,10 +101,10 @@ class FusedKernel:
                     )
 
     def _operation(self, given: list[tuple[BoundKernel, int]]) -> Operation:
-        """Return the wave for the team, cut into slabs of planes."""
+        """Return the fused kernel for the thread pool, cut into slabs of planes."""
         layouts = [b.layout for b, _ in given]
         planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
-        # so that the gaps lie apart, and three planes between those that are kept
+        # Gaps between slabs must not overlap, and three planes lie between those that are kept.
         least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)
         alone = (
             get_threads() == 1

@@ -1,4 +1,4 @@
-"""Arrays that the host fills and kernels read."""
+"""Arrays that the host writes and kernels read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 
 
 class HostArray:
-    """An array filled by the host and read by kernels: one memory on the CPU, two on a GPU.
+    """An array that the host writes and kernels read.
+
+    It is one memory on the CPU, two on a GPU.
 
     Args:
         count: elements, or the shape.
@@ -20,7 +22,7 @@ class HostArray:
 
     Attributes:
         host: NumPy array to write to.
-        array: what kernels take, up to date after `send`.
+        array: argument of kernels, up to date after `send`.
     """
 
     def __init__(self, count: int | tuple[int, ...], dtype: Any, device: wp.Device) -> None:
@@ -30,7 +32,10 @@ class HostArray:
         self._upload: Any = None  # the copy as a node of CUDA graphs
 
     def send(self) -> None:
-        """Bring `array` up to date; with graphs of steps, the copy waits among recorded stretches, see `joined.py`."""
+        """Bring `array` up to date.
+
+        With graphs of steps the copy is queued among recorded stretches, see `joined_graphs.py`.
+        """
         if self._shared:
             return
         if not LaunchGraph.on_device:

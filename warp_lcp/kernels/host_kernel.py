@@ -1,4 +1,4 @@
-"""Kernels on the host's memory: NumPy arrays in, one native call, NumPy arrays out."""
+"""Kernels on host memory: NumPy arrays in, one native call, NumPy arrays out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from warp_lcp.kernels.stencil_kernel import StencilKernel
 
 
 class HostKernel(threading.local):
-    """Memory and recorded launch of a kernel for loops too small for NumPy; each Python thread has its own.
+    """Memory and recorded launch of a kernel for loops that are slow in NumPy.
+
+    Each Python thread has its own.
 
     Args:
         kernel: has `reals` (float64) and `indices` (int32) as `whole`, float64 fields of its tasks
@@ -45,10 +47,10 @@ class HostKernel(threading.local):
         """Run the kernel.
 
         Args:
-            reals: what `reals` of the kernel holds first, one array after the other.
-            indices: what `indices` holds.
+            reals: arrays that are stored in `reals` of the kernel, one after the other.
+            indices: arrays that are stored in `indices`.
             tasks: number of elements of each field in `box`, which are 0 before.
-            work: room in `reals` after what is given, which is not cleared.
+            work: additional room in `reals` behind those arrays, which is not cleared.
             places: likewise in `indices`.
             numbers: of the kernel.
 
@@ -80,7 +82,10 @@ class HostKernel(threading.local):
         self._kernel.bind(rows, **self._arrays, **self._numbers).launch()
 
     def _reserve(self, *sizes: int) -> None:
-        """Allocate at least so many reals, indices and tasks, twice those asked for."""
+        """Allocate at least so many reals, indices and tasks.
+
+        The new memory has twice the requested size.
+        """
         reals, indices, tasks = self._room = [
             max(2 * size, room, 1) for size, room in zip(sizes, self._room, strict=True)
         ]
@@ -91,13 +96,13 @@ class HostKernel(threading.local):
         }
         self._arrays |= {"reals": _warp(self._reals), "indices": _warp(self._indices)}
         self._device = wp.get_device("cpu")
-        # not before: an import must not start Warp
+        # Created here and not earlier: an import must not start Warp.
         self._rows, self._tasks = rows_memory(self._device), 0
         self._graph = LaunchGraph(self._device, self._launch)
 
 
 def _warp(values: np.ndarray) -> wp.array[Any]:
-    """Return contiguous values as Warp sees them, in the same memory."""
+    """Return contiguous values with Warp's type, in the same memory."""
     return wp.array(
         values,
         dtype=wp.float64 if values.dtype == np.float64 else wp.int32,

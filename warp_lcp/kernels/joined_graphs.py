@@ -1,13 +1,13 @@
-"""CUDA graphs of neighboring stretches of a step, joined into one graph.
+"""CUDA graphs of consecutive stretches of a step, joined into one graph.
 
-Within `joined` a recorded stretch is not launched at once. It waits, with the numbers that it reads
-in this run, until the host or Warp needs the device: for a readback, a launch or copy that is not
-recorded, the end of the step. All that wait are then launched as one graph, which is captured when
-their sequence comes for the second time. A stretch that finds the device idle, after a readback, is
-launched at once, so that the host prepares the next ones while the device works.
+Within `joined` a recorded stretch is not launched at once. It is queued, with the numbers that it
+reads in this run, until the host or Warp needs the device: for a readback, a launch or copy that is
+not recorded, the end of the step. All queued stretches are then launched as one graph, which is
+captured when their sequence comes for the second time. A stretch is launched at once if the device
+is idle, after a readback: then the host prepares the next ones while the device works.
 
 Nothing is reordered: the functions of Warp by which anything else reaches the device (`SETTLING`)
-launch first what waits. So a profile, which synchronizes at the end of each stage, still has the
+first launch the queue. So a profile, which synchronizes at the end of each stage, still has the
 time of each stage alone.
 """
 
@@ -27,10 +27,11 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 if TYPE_CHECKING:
     from warp_lcp.kernels.device_graph import DeviceGraph
 
-MOST_SEQUENCES = 64  # that are remembered
-# after these the device is idle
+MOST_SEQUENCES = 64  # sequences that are remembered
+# The device is idle after these functions.
 WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
-# Functions of Warp that give work to a device or wait for it, and where callers look them up.
+# Functions of Warp that give work to a device or wait for it, and the modules where callers look
+# them up.
 SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
     (
         wp,
@@ -63,23 +64,26 @@ SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
 
 
 class _Waiting(threading.local):
-    """Stretches of this thread that wait to be launched, in order."""
+    """Queue of this thread's stretches, in the order of launching."""
 
-    depth = 0  # of `joined`
-    idle = True  # whether the device has done all that this thread has launched
+    depth = 0  # nesting of `joined`
+    idle = True  # whether the device has finished all launches of this thread
 
     def __init__(self) -> None:
         self.programs: list[DeviceGraph] = []
 
 
 WAITING = _Waiting()
-# weak references to the stretches, and their graph once there is one
+# Weak references to the stretches, and their graph once there is one.
 _sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}
 
 
 @contextmanager
 def joined(device: wp.Device) -> Iterator[None]:
-    """Join the graphs of recorded stretches that follow each other; on the CPU, and without graphs of steps, do nothing."""
+    """Join the graphs of consecutive recorded stretches.
+
+    On the CPU, and without graphs of steps, it does nothing.
+    """
     if not (device.is_cuda and LaunchGraph.on_device):
         yield
         return
@@ -93,7 +97,10 @@ def joined(device: wp.Device) -> Iterator[None]:
 
 
 def waits(program: DeviceGraph) -> bool:
-    """Have a stretch wait, whose changed numbers are in its buffer; return False where it is to be launched now."""
+    """Queue a stretch whose changed arguments are in its buffer.
+
+    Returns False if it is to be launched now.
+    """
     if not (WAITING.depth and program.has_run) or WAITING.idle:
         WAITING.idle = False
         return False
@@ -102,7 +109,7 @@ def waits(program: DeviceGraph) -> bool:
 
 
 def settle(program: DeviceGraph | None = None) -> None:
-    """Launch what waits; with a `program`, only if that waits."""
+    """Launch the queue; with a `program`, only if that is queued."""
     programs = WAITING.programs
     if not programs or (program is not None and all(other is not program for other in programs)):
         return
@@ -118,7 +125,10 @@ def settle(program: DeviceGraph | None = None) -> None:
 
 
 def _graph_of(programs: list[DeviceGraph]) -> Any:
-    """Return the graph of a sequence of stretches; None where the sequence has come for the first time."""
+    """Return the graph of a sequence of stretches.
+
+    Returns None when the sequence comes for the first time.
+    """
     key = tuple(map(id, programs))
     references, graph = _sequences.get(key, ((), None))
     if len(references) != len(programs) or any(
@@ -138,13 +148,13 @@ def _graph_of(programs: list[DeviceGraph]) -> Any:
 
 
 def _forget(key: tuple[int, ...], reference: Any) -> None:
-    """Forget a sequence, one of whose stretches is gone."""
+    """Forget a sequence after one of its stretches was deleted."""
     _sequences.pop(key, None)
 
 
 @functools.cache
 def _settle_before_warp() -> None:
-    """Have functions of Warp launch first what waits."""
+    """Patch functions of Warp to launch the queue first."""
     for owner, names in SETTLING:
         for name in names:
             if hasattr(owner, name):
@@ -152,7 +162,10 @@ def _settle_before_warp() -> None:
 
 
 def _settling(plain: Callable[..., Any], *, idle: bool) -> Callable[..., Any]:
-    """Return a function of Warp that launches first what waits; `idle`: the device has nothing left to do after it."""
+    """Return a function of Warp that first launches the queued stretches.
+
+    `idle`: the device has finished all work after it.
+    """
 
     @functools.wraps(plain)
     def called(*args: Any, **options: Any) -> Any:

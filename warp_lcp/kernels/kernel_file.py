@@ -1,6 +1,7 @@
-"""Kernels of a header: their roles stand above their row functions, and Python takes the kernels by name.
+"""Kernels of a header file: parser of their declarations.
 
-A declaration is a comment of a description and of lines with three blanks, a role and what has it;
+The roles of a kernel's arguments stand above its row function; Python takes the kernels by name. A
+declaration is a comment of a description and of lines with three blanks, a role and its arguments;
 more blanks continue a line:
 
     // kernel cycle.sweep: a Jacobi sweep, y = x + omega (b - A x) / d, clipped to the bounds
@@ -11,12 +12,12 @@ more blanks continue a line:
     //   numbers    S omega; bool from_zero, projected
     SIMD for (int k = 0; k < n; ++k) ...
 
-Roles are the words of `StencilKernel`, except that `name?` marks an array that may be None. Fields and
-numbers stand as in C: a type, then names. A type is Warp's (`float32`, `int8`, `vec3`), `int` or
-`bool` of Python, a capital letter for the type of the arrays given, `T` for the type of
-computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python.
-`constants AXIS, ROUNDED = 0`: Python computes the first, the second has a usual value.
-`module multigrid`: compiled in one Warp module with others that have the line.
+Roles are the words of `StencilKernel`, except that `name?` marks an array that may be None. Fields
+and numbers stand as in C: a type, then names. A type is Warp's (`float32`, `int8`, `vec3`), `int`
+or `bool` of Python, a capital letter for the type of the arrays passed in, `T` for the type of
+computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python. `constants
+AXIS, ROUNDED = 0`: Python computes the first, the second has a default value. `module multigrid`:
+compiled in one Warp module with others that have the line.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class KernelFile:
         return iter(self._kernels)
 
     def __getitem__(self, name: str) -> StencilKernel:
-        """Return a kernel that leaves nothing to choose."""
+        """Return a kernel that has no choices."""
         return self.kernel(name)
 
     def kernel(
@@ -83,7 +84,7 @@ class KernelFile:
 
         Args:
             name: in the header.
-            module: of the variant, in place of what stands before the last dot of the name.
+            module: of the variant; it replaces the part before the last dot of the name.
             compute: type of computations, where the kernel leaves the choice.
             constants: those of the variant, beside those of the file.
 
@@ -101,7 +102,7 @@ class KernelFile:
 
 
 class _Declaration:
-    """A kernel's declaration: parsed, but for types and constants that Python chooses."""
+    """Parsed declaration of a kernel, before types and constants are chosen."""
 
     def __init__(self, path: Path, section: HeaderSection) -> None:
         self.path, self.name, self.line, self.where = (
@@ -115,11 +116,11 @@ class _Declaration:
         if not self._compute[0]:
             raise self._wrong("compute", "needs a type")
         self.constants = dict(self._constant(word) for word in self._words("constants"))
-        for word in self._compute:  # so that a wrong role is found, whichever type is chosen
+        for word in self._compute:  # a wrong role is reported for every choice of the type
             self._roles(self._type("compute", word))
 
     def make(self, module: str, compute: Any, constants: Mapping[str, float]) -> StencilKernel:
-        """Return the kernel, of a module, a type of computations and values of constants."""
+        """Return the kernel of a module, a type of computations and constants."""
         choices = [self._type("compute", word) for word in self._compute]
         compute = choices[0] if compute is None and len(choices) == 1 else compute
         if compute not in choices:
@@ -147,7 +148,7 @@ class _Declaration:
         )
 
     def _roles(self, compute: Any) -> dict[str, Any]:
-        """Return the roles as `StencilKernel` takes them."""
+        """Return the roles in the form of `StencilKernel`'s arguments."""
         optional: list[str] = []
         roles: dict[str, Any] = {role: self._fields(role, compute, optional) for role in FIELDS}
         roles |= {role: tuple(self._words(role)) for role in NAMES} | {
@@ -224,7 +225,7 @@ def _lines_of_roles(path: Path, section: HeaderSection) -> dict[str, tuple[int, 
     """Return the line and the content of each role.
 
     Raises:
-        ValueError: a role is unknown, stands twice, or should have a content or none.
+        ValueError: a role is unknown or repeated, lacks its content, or must not have one.
     """
     roles: dict[str, tuple[int, str]] = {}
     role = ""

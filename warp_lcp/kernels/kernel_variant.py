@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Forms of row passes: a pass whose types and constants are known, its C++ source and its kernel."""
+"""Kernel variants: C++ source and Warp kernel of a declaration with fixed types.
+
+The constants are fixed as well.
+"""
 
 import ctypes
 import functools
@@ -31,24 +34,26 @@ if TYPE_CHECKING:
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-# types of fields that quads keep in registers
+# Types of fields that quads keep in registers.
 LOADED = (wp.uint8, wp.int8, wp.int32, wp.float32, wp.float64)
 POINTERS = "const auto in_ = [](auto* q, auto first) { return q + first; };"
-Quads = tuple[Alignment, Alignment]  # of fields of passes by quads, and of those of the other level
+# Alignments of the fields of quad kernels, and of those of the other level.
+Quads = tuple[Alignment, Alignment]
 QUADS = ANYWHERE, ANYWHERE
-# threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most
+# Threads of a block, and blocks that fit on a multiprocessor: a thread has 128 registers at most.
 BLOCKS_OF_QUADS = 256, 2
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
-PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
+PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as formats of `struct`
 SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
-NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
-# stencils: with a weight an axis, with arrays of them, with a product in place
+# Bounds that are the same everywhere, infinite ones too; else "coded", "fields".
+NUMBERS = "numbers"
+# Stencils: with one weight an axis, with arrays of weights, or with a product in their place.
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"
 
 
 def words_of(quads: Quads | None) -> list[str]:
-    """Return what tells forms by quads from those by cells, and from each other."""
+    """Return the key of variants by quads, to tell them apart."""
     if quads is None:
         return []
     return [
@@ -67,19 +72,25 @@ def form_of(
     *,
     quads: Quads | None = None,
 ) -> "KernelVariant":
-    """Return the form of a pass with these types, constants, stencil and bounds, by `quads` of cells if told."""
+    """Return the variant with these types, constants, stencil and bounds.
+
+    `quads`: a thread takes four cells.
+    """
     return KernelVariant(declared, dict(letters), dict(constants), shape, bounds, quads=quads)
 
 
 TOGETHER: dict[
     str, list["StencilKernel"]
-] = {}  # passes by the Warp module in which they are compiled
+] = {}  # declarations by the Warp module in which they are compiled
 
 
 def make_kernels_of_module(
     form: "KernelVariant", letters: Any, shape: str | Pattern, bounds: str
 ) -> None:
-    """Make the kernels that belong to a form's module before Warp loads it: for one more it would compile all of them again."""
+    """Create all kernels of a variant's module before Warp loads it.
+
+    If a kernel were added later, Warp would compile all of them again.
+    """
     if not form.declared.module or form.pattern is not None:
         return
     for other in TOGETHER[form.declared.module]:
@@ -95,13 +106,13 @@ def make_kernels_of_module(
 
 
 class KernelVariant:
-    """A pass whose types and constants are known.
+    """A stencil kernel whose types and constants are known.
 
     Attributes:
-        words: what tells it from other forms.
-        joins: whether it is compiled with other passes.
+        words: the variant's key.
+        joins: whether it is compiled with other kernels.
         quads: alignments, where a thread takes four cells of a row at a time, on CUDA only; see
-            `headers/quad.h`. None: it does not.
+            `headers/quad.h`. None: a thread takes single cells.
         name: of its kernel.
         fields: struct of its arguments.
         native: that struct in C.
@@ -127,7 +138,7 @@ class KernelVariant:
         )
         self._chosen = tuple(sorted(letters.items())), tuple(constants.items()), shape, bounds
         self.pattern = pattern = shape if isinstance(shape, Pattern) else None
-        self.joins = bool(d.module) and pattern is None  # the module of other passes
+        self.joins = bool(d.module) and pattern is None  # shares a module with other kernels
         shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         self.words = d.words(letters, constants, shape, bounds) + words_of(quads)
@@ -156,7 +167,7 @@ class KernelVariant:
         variant = ".".join(
             ["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)]
         )
-        # apart from other forms, which Warp would take for overloads
+        # A module name of its own: Warp would take other variants for overloads.
         run.__module__ = area if d.box else variant
         self.name = d.name.replace(".", "_") if self.joins else last
         run.__qualname__ = f"{self.name}_rows"
@@ -166,7 +177,11 @@ class KernelVariant:
     def _source(
         self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any
     ) -> str:
-        """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
+        """Return the kernel's body in C++.
+
+        It is a loop over pieces with pointers by name, the shared functions, the row function and
+        the sums.
+        """
         d, pattern = self.declared, self.pattern
         assert not (self.quads and (pattern or not d.quads)), d.label
         into = not {*d.ring}.isdisjoint(d.writes)
@@ -287,7 +302,7 @@ class KernelVariant:
             POINTERS,
             *each,
         ]
-        # there names may be those of the pass
+        # In a block of its own, local names may be those of the declaration.
         body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]
         closed = ["}"] * bool(d.listed)
         macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
@@ -306,7 +321,10 @@ class KernelVariant:
         )
 
     def _source_of_quads(self, head: list[str], macros: dict[str, Any], of: Any) -> str:
-        """Return the body for quads: a loop over planes, in it the row function twice, for four cells and for fewer."""
+        """Return the kernel's body for quads in C++.
+
+        It is a loop over planes with the row function twice: for four cells and for fewer.
+        """
         d = self.declared
         found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
         sums = (
@@ -344,7 +362,7 @@ class KernelVariant:
             *function,
             "}",
         ]
-        # cells fewer than four: their loops are not unrolled
+        # Groups of fewer than four cells: their loops are not unrolled.
         once = ["#undef VECTORS", '#define VECTORS(WIDTH) _Pragma("unroll 1")']
         after = [
             '#line 1 "end"',
@@ -357,7 +375,10 @@ class KernelVariant:
         return "\n".join(["", *before, *whole, *once, *rest, *after])
 
     def _halves(self) -> list[list[str]]:
-        """Return C++ that begins the row function for whole quads: once for each place of rows."""
+        """Return C++ that begins the row function for whole quads.
+
+        It is there once for each alignment of rows.
+        """
         finer = self.declared.finer
         either = self.quads[finer].either
         made = []
@@ -373,7 +394,10 @@ class KernelVariant:
         return made
 
     def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
-        """Return C++ that declares the fields at a quad's first cell, by name; `kept`: in registers, as `quad.h` does."""
+        """Return C++ that declares the fields at a quad's first cell, by name.
+
+        `kept`: they are held in registers, as `quad.h` does.
+        """
         d = self.declared
         made = []
         of_other = "in_other_" if kept else "in_"
@@ -414,7 +438,10 @@ class KernelVariant:
         return made
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
-        """Return the struct of arguments as C has it: structs and arrays, which fill whole eight bytes, side by side, then numbers."""
+        """Return the C layout of the argument struct.
+
+        Structs and arrays come first, side by side, as they fill whole eight bytes; then numbers.
+        """
         parts = [] if stencil is None else [stencil.struct.__ctype__()]
         if bounds is not None:
             lower, least, upper, most, code = bounds
@@ -431,7 +458,10 @@ class KernelVariant:
         return b"".join(parts).ljust(self._size, b"\0")
 
     def struct_of(self, bound: "BoundKernel") -> Any:
-        """Return the struct of arguments for Warp, which keeps them alive; a capture on the CPU looks for the arrays by name."""
+        """Return the argument struct for Warp, which keeps the arrays alive.
+
+        A capture on the CPU finds the arrays in it by name.
+        """
         stencil, bounds = bound.kept
         members = {name: bound.given[name] for name in self.types}
         if stencil is not None:
@@ -446,9 +476,9 @@ class KernelVariant:
 
     @functools.cached_property
     def run_in_turn(self) -> Any:
-        """`run` for launches of several passes: a pass reads what one before it has written.
+        """`run` for launches of several kernels, which read each other's results.
 
-        Loads by `__ldg` may have values from before the launch.
+        `__ldg` is not used: its loads may return values from before the launch.
         """
         if not self.quads:
             return self.run
@@ -464,7 +494,7 @@ class KernelVariant:
 
     @functools.cached_property
     def kernel(self) -> Any:
-        """The kernel of the pass alone."""
+        """The kernel of a launch by itself."""
         run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
         if self.quads:
 
@@ -489,32 +519,36 @@ class KernelVariant:
         alone.__name__ = alone.__qualname__ = self.name
         if self.quads:
             return forward_kernel(module=run.module.name, launch_bounds=BLOCKS_OF_QUADS)(alone)
-        if touch is not None:  # the caller's function may need what the project's flags leave out
+        # The caller's function may need features that the project's flags leave out.
+        if touch is not None:
             return wp.kernel(enable_backward=False, module=run.module.name)(alone)
         return forward_kernel(module=run.module.name)(alone)
 
     @property
     def by_cells(self) -> "KernelVariant":
-        """The same of single cells."""
+        """The same variant by single cells."""
         return form_of(self.declared, *self._chosen)
 
     @property
     def by_quads(self) -> "KernelVariant | None":
-        """The same of quads, as CUDA launches it on grids; None where there is none."""
+        """The same variant by quads, as CUDA launches it on grids; None if impossible."""
         return self.with_quads(QUADS)
 
     def with_quads(self, quads: Quads) -> "KernelVariant | None":
-        """Return the same of quads at these alignments; None where there is none."""
+        """Return the same variant by quads at these alignments; None if impossible."""
         if not self.declared.quads or self.pattern is not None:
             return None
         return form_of(self.declared, *self._chosen, quads=quads)
 
     def dim(self, layout: Any) -> tuple[int, ...]:
-        """Return the dimensions of a launch of the kernel: by quads one, for three would be divided in 64 bits."""
+        """Return the dimensions of a launch of the kernel.
+
+        Quads use one dimension, because three would be divided in 64 bits.
+        """
         return (math.prod(threads(layout)),) if self.quads else threads(layout)
 
     def entry(self, bound: "BoundKernel") -> TableEntry:
-        """Return the kernel as the team calls it."""
+        """Return the kernel in the form of the thread pool."""
         if self._entry is None:
             self._entry = TableEntry(
                 wp.launch(
@@ -536,7 +570,10 @@ return wp::vec3i(L.begin / (L.rows*L.chunks), L.begin / L.chunks % L.rows, L.beg
 #endif
 """)
 def first_task(L: RowLayout) -> wp.vec3i:
-    """Slab, row and chunk of a range's first task; 0 on CUDA, where a thread has one of its own."""
+    """Compute slab, row and chunk of a range's first task.
+
+    They are 0 on CUDA, where a thread has a task of its own.
+    """
 
 
 @wp.func_native("""
@@ -544,4 +581,4 @@ const unsigned t = (unsigned)thread, row = t / (unsigned)L.chunks, slab = row / 
 return wp::vec3i((int)slab, (int)(row - slab*L.rows), (int)(t - row*L.chunks));
 """)
 def task_of(L: RowLayout, thread: int) -> wp.vec3i:
-    """Slab, row and chunk of a thread of a launch with one dimension."""
+    """Compute slab, row and chunk of a thread in a launch with one dimension."""

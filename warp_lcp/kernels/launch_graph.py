@@ -1,4 +1,7 @@
-"""Launches that are recorded once and run again: on the CPU by a team of threads in native code, on CUDA as a graph."""
+"""Launches that are recorded once and repeated.
+
+On the CPU a thread pool executes them in native code; on CUDA they form a graph.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ from warp_lcp.kernels.thread_pool import (
 
 
 class _Recording(threading.local):
-    """The program that takes what a thread launches; None: it is launched."""
+    """The program that records this thread's launches; None if they are executed."""
 
     program: CommandBuffer | None = None
 
@@ -41,13 +44,13 @@ RECORDING = _Recording()
 
 
 def is_recording() -> bool:
-    """Return whether what this thread launches is recorded."""
+    """Return whether this thread's launches are recorded."""
     return RECORDING.program is not None
 
 
 @contextmanager
 def recording(program: CommandBuffer) -> Iterator[None]:
-    """Record what this thread launches by `warp_lcp.kernels`, in place of launching it."""
+    """Record this thread's launches by `warp_lcp.kernels` instead of executing them."""
     before, RECORDING.program = RECORDING.program, program
     try:
         yield
@@ -56,12 +59,18 @@ def recording(program: CommandBuffer) -> Iterator[None]:
 
 
 def loops_on_device(device: wp.Device) -> bool:
-    """Return whether loops run on the device, without the host: on the CPU by the team, on CUDA from driver 12.4."""
+    """Return whether loops run on the device, without the host.
+
+    The thread pool runs them on the CPU; CUDA needs driver 12.4.
+    """
     return bool(wp.is_conditional_graph_supported()) if device.is_cuda else team() is not None
 
 
 def device_program(launch: Any = None) -> Any:
-    """Return the `DeviceGraph` that records what this thread launches; None: there is none, or `launch` records."""
+    """Return the `DeviceGraph` that records this thread's launches.
+
+    Returns None if there is none, or if `launch` records.
+    """
     program = RECORDING.program
     if (
         program is None
@@ -73,7 +82,10 @@ def device_program(launch: Any = None) -> Any:
 
 
 class Launch(Protocol):
-    """Launches a kernel now, as `wp.launch` does, or records it, as `CommandBuffer.launch` does."""
+    """Launch function: launches a kernel now, or records it.
+
+    `wp.launch` does the first, `CommandBuffer.launch` the second.
+    """
 
     def __call__(
         self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...
@@ -82,29 +94,37 @@ class Launch(Protocol):
 
 
 def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: Any) -> Any:
-    """Launch a kernel by Warp; a default argument that holds `wp.launch` itself would pass by what waits, see `joined.py`."""
+    """Launch a kernel by Warp at once.
+
+    A default argument that held `wp.launch` itself would bypass queued stretches, see
+    `joined_graphs.py`.
+    """
     return wp.launch(kernel, dim, inputs, device=device, **options)
 
 
 def launch_graph(graph: Any) -> None:
-    """Launch a captured graph by Warp; likewise."""
+    """Launch a captured graph by Warp.
+
+    As with `launch_now`, no default argument holds Warp's function.
+    """
     wp.capture_launch(graph)
 
 
 @dataclass(frozen=True)
 class Task:
-    """What the host does between launches: exchange with other processes, say.
+    """A task of the host between launches, such as a halo exchange.
 
     Args:
-        function: does it.
-        operation: makes what the team can do in its place, on the CPU; None: nothing can.
+        function: performs it.
+        operation: creates an operation of the thread pool that replaces it on the CPU; None: there
+            is no such operation.
     """
 
     function: Callable[[], object]
     operation: Callable[[], Operation] | None = None
 
     def launch(self, launch: Launch = launch_now) -> None:
-        """Do it now, or record it between the launches."""
+        """Perform the task now, or record it between the launches."""
         recorded = (
             is_recording() or isinstance(getattr(launch, "__self__", None), CommandBuffer)
         ) and team() is not None
@@ -113,30 +133,36 @@ class Task:
 
 @dataclass(frozen=True)
 class Conditional:
-    """A program that is launched if a number on the device is not 0: in a graph, or by the team, without the host."""
+    """A program that is launched if a number on the device is not 0.
+
+    A graph or the thread pool decides, without the host.
+    """
 
     condition: wp.array[Any]
     program: CommandBuffer
 
     def launch(self) -> None:
-        """Launch it, or record that in the graph that is being captured."""
+        """Launch it, or record it in the graph that is being captured."""
         wp.capture_if(self.condition, self.program._launch)
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A program that is repeated on CUDA while a number on the device is not 0, within a graph."""
+    """A CUDA program repeated in a graph while a number on the device is not 0."""
 
     condition: wp.array[Any]
     program: CommandBuffer
 
     def launch(self) -> None:
-        """Repeat it now, or record that in the graph that is being captured."""
+        """Repeat it now, or record the loop in the graph that is being captured."""
         wp.capture_while(self.condition, self.program._launch)
 
 
 def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
-    """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
+    """Call a function or run an operation of the thread pool, or record it.
+
+    It runs at once if `launch` launches at once.
+    """
     program = getattr(launch, "__self__", None)
     if not isinstance(program, CommandBuffer):
         program = RECORDING.program
@@ -150,7 +176,11 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
 
 @contextmanager
 def together(device: wp.Device) -> Iterator[Launch]:
-    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches now or records."""
+    """Yield a launch function that records one table for the thread pool.
+
+    The table runs at the end of the block. On CUDA the function launches at once or records a
+    graph.
+    """
     if device.is_cuda or team() is None:
         yield launch
         return
@@ -161,9 +191,10 @@ def together(device: wp.Device) -> Iterator[Launch]:
 
 @contextmanager
 def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
-    """Record what is launched within by `warp_lcp.kernels`; the team works through it as one table afterwards. Nothing is read within.
+    """Record the launches of a `with` block as one table for the thread pool.
 
-    On CUDA, and where fields are shared `across` ranks, launches are done at once.
+    The table runs at the end of the block. Nothing may be read from the device within. Launches run
+    at once on CUDA, and where `across` is a communicator of several ranks.
     """
     if device.is_cuda or across is not None or is_recording() or team() is None:
         yield
@@ -175,14 +206,14 @@ def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
 
 
 def run_table(table: OperationTable) -> None:
-    """Have the team work through a table."""
+    """Execute a table in the thread pool."""
     at_work = team()
     assert at_work is not None, "a table is made for a team"
     at_work.run(table)
 
 
 def _run_while(condition: Any, table: OperationTable) -> None:
-    """Have the team repeat a table, unless its condition is 0 before."""
+    """Repeat a table in the thread pool, unless its condition is 0 at the start."""
     if condition[0]:
         run_table(table)
 
@@ -200,17 +231,19 @@ def launch_ranges(
     sized: int = 0,
     extent: Any = None,
 ) -> None:
-    """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
+    """Launch or record a kernel whose first argument begins with a range of tasks.
+
+    A thread takes such a range.
 
     Args:
         kernel: with as many coordinates of a thread as `dim` has.
         dim: of the launch where there is no such range.
-        cells: what a task costs, in cells of a usual pass.
+        cells: cost of a task, in cells of a usual kernel.
         inputs: arguments; numbers may be `Scalar`.
-        device: where.
+        device: of the launch.
         launch: of a program; None: now.
         ordered: whether tasks write what others read or write.
-        first: what of the first argument recorded launches read from memory.
+        first: patches of the first argument, which recorded launches read from memory.
         sized: address of the number of tasks then; 0: that of `dim`.
         extent: memory whose `room` bounds the launch dimensions on CUDA; None: they are always
             `dim`.
@@ -245,7 +278,10 @@ def launch_ranges(
 
 
 def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]:
-    """Return what of a kernel's arguments, a struct in C, is read from memory: numbers and arrays that others replace."""
+    """Yield the kernel arguments that are read from memory in each run.
+
+    They are numbers and replaceable arrays; the arguments are a struct in C.
+    """
     for i, value in enumerate(inputs):
         if type(value) is Scalar:
             yield (getattr(native, f"p{i}").offset, *value.address(kernel.adj.args[i].type))
@@ -254,7 +290,7 @@ def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]
 
 
 def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
-    """Return the launch of a kernel on the CPU as an operation that is not cut."""
+    """Return a CPU kernel launch as an operation that is not cut."""
     entry, arguments, native = prepared(kernel, dim, [value_of(v) for v in inputs])
     return Operation(
         ALONE,
@@ -274,7 +310,10 @@ def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 
 
 
 def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
-    """Copy an array to another of the same type and size whose elements lie side by side, now or among recorded launches."""
+    """Copy an array to another one of the same type and size, now or recorded.
+
+    Both are contiguous.
+    """
     program = RECORDING.program
     if program is None:
         wp.copy(to, source)
@@ -285,7 +324,7 @@ def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
 
 
 def clear(*arrays: wp.array[Any]) -> None:
-    """Set arrays whose elements lie side by side to 0, now or among recorded launches."""
+    """Set contiguous arrays to 0, now or among recorded launches."""
     program = RECORDING.program
     for array in arrays:
         if program is None:
@@ -298,7 +337,7 @@ def clear(*arrays: wp.array[Any]) -> None:
 
 @dataclass(frozen=True)
 class DeviceCopy:
-    """Copy of an array on CUDA, or zeros: a node of a graph."""
+    """Copy or clearing of an array on CUDA: a node of a graph."""
 
     to: wp.array[Any]
     source: wp.array[Any] | None
@@ -313,17 +352,17 @@ class DeviceCopy:
 
 @dataclass(frozen=True)
 class DeviceCall:
-    """What Warp launches by a function of its own on CUDA, a sort or a scan: nodes of a graph."""
+    """Launches by a function of Warp on CUDA, as a sort or a scan: graph nodes."""
 
     function: Callable[[], object]
 
     def launch(self) -> None:
-        """Do it now, or while a graph is captured."""
+        """Call the function now, or while a graph is captured."""
         self.function()
 
 
 def call(function: Callable[[], object]) -> None:
-    """Do on CUDA what Warp launches by a function of its own, now or among recorded launches."""
+    """Call a function of Warp that launches on CUDA, now or recorded."""
     program = RECORDING.program
     function() if program is None else program.record(DeviceCall(function))
 
@@ -336,9 +375,9 @@ class CommandBuffer:
     """A sequence of kernel launches with fixed arguments.
 
     Functions that launch take `launch: Launch = launch_now`; given `program.launch`, they record
-    instead. On the CPU the team works through a table of them, on CUDA a graph is captured once the
-    first run has loaded every kernel. Where the host has tasks between launches, see `perform`,
-    there is a table or a graph for each stretch without one.
+    instead. On the CPU the thread pool executes a table of them. On CUDA a graph is captured once
+    the first run has loaded every kernel. Where the host has tasks between launches, see `perform`,
+    there is a table or a graph for each stretch between them.
 
     Args:
         device: where the kernels run.
@@ -350,9 +389,9 @@ class CommandBuffer:
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
         self._runs = 0
         self._stretches: list[Callable[[], object]] | None = None
-        # what launches their graph, by the address of their condition
+        # Launch functions of loops' graphs, by the address of the condition.
         self._loops: dict[int, Callable[[], object]] = {}
-        self._native: bool | None = None  # None: not known
+        self._native: bool | None = None  # None: not determined yet
 
     def __len__(self) -> int:
         """Return the number of launches."""
@@ -361,7 +400,10 @@ class CommandBuffer:
     def launch(
         self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
     ) -> None:
-        """Record a launch, and keep its arguments alive; numbers may be `Scalar` on the CPU."""
+        """Record a launch, and keep its arguments alive.
+
+        Numbers may be `Scalar` on the CPU.
+        """
         self._arguments.append(inputs)
         if self.device.is_cuda or team() is None:
             listed = [value_of(v) for v in inputs]
@@ -372,7 +414,10 @@ class CommandBuffer:
             self.record(_alone(kernel, dim, inputs))
 
     def record(self, what: Any) -> None:
-        """Record a recorded launch, an operation of the team, a task of the host or, where loops run on the device, a conditional."""
+        """Record a launch, an operation, a host task or a conditional.
+
+        An operation belongs to the thread pool; conditionals need loops on the device.
+        """
         if isinstance(what, Conditional) and not self.device.is_cuda:
             self._arguments.append(what)
             self._commands += [
@@ -383,24 +428,27 @@ class CommandBuffer:
         self._forget_prepared()
 
     def _forget_prepared(self) -> None:
-        """Prepare again what is run, since there are other commands."""
+        """Discard the prepared tables and graphs after new commands."""
         self._stretches = self._native = None
         self._loops.clear()
 
     @property
     def is_native(self) -> bool:
-        """Whether the team works through all of it."""
+        """Whether the thread pool executes all of it."""
         if self._native is None:
             self._native = all(isinstance(command, Operation) for command in self._commands)
         return self._native
 
     def fits(self) -> bool:
-        """Return whether its launches have room for the rows as they are now."""
+        """Return whether the launches have room for the present rows."""
         return True
 
     @property
     def has_run(self) -> bool:
-        """Whether all of its kernels are loaded: it has run, or they were loaded as they were recorded, on the CPU."""
+        """Whether all of its kernels are loaded.
+
+        They are after a run, and on the CPU after recording.
+        """
         return self._runs > 0 or not self.device.is_cuda
 
     def extend(self, other: CommandBuffer) -> None:
@@ -410,7 +458,7 @@ class CommandBuffer:
         self._forget_prepared()
 
     def run(self) -> None:
-        """Launch everything once, or record that among the launches of another program."""
+        """Launch everything once, or record it among the launches of another program."""
         if RECORDING.program is not None:
             RECORDING.program.extend(self)
             return
@@ -424,12 +472,12 @@ class CommandBuffer:
         self._runs += 1
 
     def run_while(self, condition: wp.array[Any]) -> None:
-        """Launch everything again and again while the condition is not 0; the launches update it.
+        """Repeat all launches while the condition is not 0; the launches update it.
 
-        Where loops run on the device, they do not come back to the host: on CUDA, all but the first
-        call are one graph, and return before it has ended; on the CPU, the team looks after signals
-        and the deadline. Ranks must find the same condition; they repeat the launches without the
-        host unless they have a deadline, which they look at together.
+        Where loops run on the device, control does not return to the host: on CUDA, all but the
+        first call are one graph, and return before it has ended; on the CPU, the thread pool checks
+        for signals and the deadline. Ranks must find the same condition; they repeat the launches
+        without the host unless they have a deadline, which they check together.
 
         Args:
             condition: shape (1,), wp.int32.
@@ -439,20 +487,20 @@ class CommandBuffer:
         elif self._loops_here():
             self._loop(condition)
         elif self.device.is_cuda and loops_on_device(self.device) and not self._has_tasks:
-            wp.capture_if(condition, self._run_in_time)  # launch by launch, which loads the kernels
+            wp.capture_if(condition, self._run_in_time)  # single launches, which load the kernels
             if self._runs:
                 self._loop(condition)
         else:
             wp.capture_while(condition, self._run_in_time)
 
     def _loop(self, condition: wp.array[Any]) -> None:
-        """Launch everything while the condition is not 0, without the host."""
+        """Repeat all launches on the device while the condition is not 0."""
         if condition.ptr not in self._loops:
             self._loops[condition.ptr] = self._captured_loop(condition)
         self._loops[condition.ptr]()
 
     def _loops_here(self) -> bool:
-        """Return whether `run_while` can do without the host now."""
+        """Return whether `run_while` can run without the host now."""
         if not self.device.is_cuda and team() is not None:
             return self.is_native and not is_collective()
         if self._has_tasks or not loops_on_device(self.device):
@@ -460,7 +508,10 @@ class CommandBuffer:
         return self._runs > 0  # the first run loads the kernels
 
     def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
-        """Return what launches a graph, or has the team work through a table, that repeats the launches."""
+        """Return a function that repeats the launches.
+
+        It launches a graph, or runs a table in the thread pool.
+        """
         if not self.device.is_cuda and team() is not None:
             return partial(_run_while, condition.numpy(), OperationTable(self._commands, condition))
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
@@ -476,7 +527,10 @@ class CommandBuffer:
         return any(isinstance(command, Task) for command in self._commands)
 
     def _prepared(self) -> list[Callable[[], object]]:
-        """Return a graph, a table or the launches of every stretch between tasks, and the tasks."""
+        """Return the stretches between host tasks, and the tasks.
+
+        A stretch is a graph, a table or its launches.
+        """
         made: list[Callable[[], object]] = []
         for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
             stretch = list(group)
@@ -491,7 +545,7 @@ class CommandBuffer:
         return made
 
     def _captured(self, commands: Sequence[Any]) -> Any:
-        """Return the graph of some launches."""
+        """Capture some launches and return their graph."""
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for command in commands:
                 command.launch()
@@ -502,7 +556,10 @@ class CommandBuffer:
             command.launch()
 
     def differs(self, other: CommandBuffer) -> str:
-        """Say where operations differ from another program's in more than what they read from memory; "" if nowhere."""
+        """Return where operations differ from another program's; "" if nowhere.
+
+        Arguments that are read from memory may differ.
+        """
         if len(self._commands) != len(other._commands):
             return f"{len(self._commands)} operations, {len(other._commands)} before"
         for at, (mine, its) in enumerate(zip(self._commands, other._commands, strict=True)):
@@ -516,7 +573,10 @@ class CommandBuffer:
 
 
 def _identity(argument: Any) -> Hashable:
-    """Return by what a recording knows an argument: an array by its address, unless it is replaced by others; a list by its elements."""
+    """Return the identity of an argument in a recording.
+
+    An array is known by its address, unless it is replaceable; a list by its elements.
+    """
     if isinstance(argument, wp.array):
         slot = getattr(argument, "slot", None)
         return (argument.ptr, argument.shape) if slot is None else slot.address
@@ -527,18 +587,22 @@ def _identity(argument: Any) -> Hashable:
     return getattr(argument, "identity", argument)
 
 
-MOST_RECORDED = 32  # sequences of a graph
+MOST_RECORDED = 32  # recordings of a graph
 
 
 class NotRecordable(Exception):
-    """What a graph of CUDA cannot hold: a task of the host, a copy of a replaced array."""
+    """A command that a CUDA graph cannot hold.
+
+    It is a task of the host, or a copy of a replaced array.
+    """
 
 
 class LaunchGraph:
-    """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
+    """Recorded launches of a part of a step, between two decisions of the host.
 
-    On CUDA it is one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where
-    launches must go through Warp, `record` is called in each run.
+    They are recorded in the first run; on the CPU, later runs are one native call. On CUDA it is
+    one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where launches must go
+    through Warp, `record` is called in each run.
 
     Args:
         device: where the kernels run.
@@ -548,11 +612,11 @@ class LaunchGraph:
         at_once: whether to launch in each run instead.
     """
 
-    # whether CUDA graphs are captured: not yet run on a GPU
+    # Whether CUDA graphs are captured. They have not been run on a GPU yet.
     on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
-    # makes the recording of a device: `device_graph.DeviceGraph`, set by `warp_lcp.kernels`
+    # Creates the recording of a device: `device_graph.DeviceGraph`, set by `warp_lcp.kernels`.
     device_program: ClassVar[Any]
-    # whether each run records again and compares with the first recording, for tests
+    # For tests: each run records again and compares with the first recording.
     verify: ClassVar[bool] = False
 
     def __init__(
@@ -563,11 +627,11 @@ class LaunchGraph:
         self._threads = 0
 
     def run(self, *arguments: Any, variant: Hashable = None) -> None:
-        """Launch everything, or record that among the launches of a program that is being recorded.
+        """Launch everything, or record it in the program that is being recorded.
 
         Args:
-            arguments: of `record`. Other arrays or objects are recorded for themselves.
-            variant: by what else `record` decides which of several sequences it launches; each is
+            arguments: of `record`. Other arrays or objects get recordings of their own.
+            variant: key of further decisions of `record` about what it launches; each variant is
                 recorded once.
         """
         if (
@@ -585,7 +649,7 @@ class LaunchGraph:
             if len(self._programs) >= MOST_RECORDED:
                 self._programs.clear()
             program = self._recorded(arguments)
-            if program is None:  # on CUDA
+            if program is None:  # a CUDA graph cannot hold it
                 self.at_once = True
                 self._record(*arguments)
                 return
@@ -598,11 +662,14 @@ class LaunchGraph:
         program.run()
 
     def forget(self) -> None:
-        """Record again in the next run, since arrays have been replaced."""
+        """Record again in the next run, because arrays have been replaced."""
         self._programs = {}
 
     def _recorded(self, arguments: tuple[Any, ...]) -> CommandBuffer | None:
-        """Return the program of some arguments; None where a graph of CUDA cannot hold it, so that it is launched in each run."""
+        """Return the program of some arguments.
+
+        Returns None where a CUDA graph cannot hold it, so that it is launched in each run.
+        """
         if not self.device.is_cuda:
             program = CommandBuffer(self.device)
             with recording(program):

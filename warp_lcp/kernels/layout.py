@@ -1,8 +1,8 @@
-"""Where rows lie, and the structs that hand stencils and bounds to kernels.
+"""Row layout, and the structs that pass stencils and bounds to kernels.
 
 A Warp kernel with one thread a cell reaches 3 % of a CPU's memory bandwidth; one thread for a
 *grain* of contiguous elements with a native inner loop reaches nearly all of it. clang vectorizes
-such a loop only if it is told that the arrays do not alias and if conditionals are written as
+such a loop only if the arrays are declared not to alias and if conditionals are written as
 selections of values that are computed anyway.
 """
 
@@ -19,26 +19,27 @@ import warp as wp
 from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
-BY_QUADS = os.environ.get("WARP_LCP_QUADS") != "0"  # else a cell: to compare the two on a GPU
-CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
-# planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory
-# than the rest of a method
+# Otherwise single cells, to compare both on a GPU.
+BY_QUADS = os.environ.get("WARP_LCP_QUADS") != "0"
+CUDA_THREADS = 1 << 16  # threads of a flat reduction, several times those of a large GPU
+# Planes that a thread sums over. On CUDA, partial sums of every cell would take more memory than
+# the rest of a method.
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
-# planes that a thread of a pass without sums takes on CUDA, where cells are more than enough for
-# all threads: .8 of the time on an H200
+# Planes that a thread of a kernel without sums takes on CUDA, where there are more than enough
+# cells for all threads: .8 of the time on an H200.
 UNSUMMED_PLANES, MANY_CELLS = 4, 1 << 21
-# fewer cells: threads that take quads sum over as few planes, or they are too few to hide
-# latencies; as computed
+# With fewer cells, threads that take quads sum over as few planes; otherwise they are too few to
+# hide latencies. The number is computed, not measured.
 SUMMED_CELLS = 1 << 24
 
 
-# cells of a grid from which quads are loaded in blocks of 16 bytes: smaller grids are held by
-# latencies, and kernels of their alignments would have to be compiled for them
+# Cells of a grid from which quads are loaded in blocks of 16 bytes. Smaller grids are limited by
+# latencies, and kernels for their alignments would have to be compiled.
 MANY_CELLS_OF_BLOCKS = 1 << 18
 
 
 class Alignment(NamedTuple):
-    """Where the rows of a grid's fields begin.
+    """Alignment of the rows of a grid's fields.
 
     Attributes:
         first: elements between a multiple of four and the first cell of a row; -1: any number.
@@ -50,7 +51,7 @@ class Alignment(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Name in kernels; empty where rows begin anywhere."""
+        """Part of a kernel's name; empty where rows begin anywhere."""
         return (
             ""
             if self.first < 0
@@ -65,49 +66,54 @@ ANYWHERE = Alignment()
 
 @wp.struct
 class RowLayout:
-    """Where the rows lie, and how threads share them: a thread takes a chunk of a row in a slab of planes."""
+    """Position of the rows in memory, and how threads share them.
 
-    # of the tasks that a team's thread takes, see `warp_lcp.kernels.thread_pool`: the first, one past the
-    # last; 0: one task a thread
+    A thread takes a chunk of a row in a slab of planes.
+    """
+
+    # Range of tasks of a thread of the pool, see `warp_lcp.kernels.thread_pool`: the first, one
+    # past the last; 0: one task a thread.
     begin: int
     end: int
     base: wp.int64  # element of the first cell
     s1: wp.int64  # elements from plane to plane
     s2: wp.int64  # elements from row to row
     nx: int  # cells of a row
-    rows: int  # of a plane
+    rows: int  # rows of a plane
     planes: int
     grain: int  # cells that a thread takes
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
-    # fields of three planes: planes before the first that they keep, too, that of ghosts, or none
+    # For fields of three planes: planes before the first that they keep as well, that of ghosts, or
+    # none.
     turn: int
-    lift: int  # the plane at which they begin, counted from the first
-    # planes of a slab of such fields, each with three planes of its own but beside the next
+    lift: int  # first of those planes, counted from the first plane
+    # For such fields: planes of a slab. Each slab has three planes of its own, apart from the next
+    # slab's.
     cut: int
-    slabs: int  # their number
+    slabs: int  # number of slabs
     apart: int  # planes on either side of a cut that keep a place of their own
-    # first (even, for `pairs`) and one past the last cell of each row (k, j) with unknowns; null:
-    # all
+    # First cell (even, for `pairs`) and one past the last of each row (k, j) with unknowns; null:
+    # all.
     spans: wp.array2d(dtype=wp.vec2i)
-    # (plane, row) and (first, one past the last) cell of each piece of a box in part; null: all of
-    # it
+    # (plane, row) and (first, one past the last) cell of each row segment of a box in part; null:
+    # the whole box.
     pieces: wp.array2d(dtype=wp.vec2i)
-    # the other level of a transfer: element of its first cell, elements from plane to plane and
-    # from row to row
+    # Other level of a transfer: element of its first cell, elements from plane to plane and from
+    # row to row.
     o0: wp.int64
     o1: wp.int64
     o2: wp.int64
-    n1: int  # its planes, its rows
+    n1: int  # planes and rows of the other level
     n2: int
-    fx: int  # cells of it that one of ours stands for; below 0: of ours that one of its stands for
+    fx: int  # its cells for each cell of ours; negative: our cells for each of its cells
     fy: int
     fz: int
 
 
 @wp.struct
 class BoundFields:
-    """Bounds of x as `warp_lcp.problem.bounds.Bounds.operands` has them."""
+    """Bounds of x, with the operands of `warp_lcp.problem.bounds.Bounds.operands`."""
 
     lower: wp.array(dtype=wp.float64)
     upper: wp.array(dtype=wp.float64)
@@ -121,16 +127,16 @@ NO_ARRAY = bytes(wp.array(dtype=wp.uint8).__ctype__())
 
 
 def grain(n: int, device: wp.Device) -> int:
-    """Return how many cells of a row of n cells one thread takes."""
+    """Return the number of cells that a thread takes of a row of n cells."""
     return 1 if device.is_cuda else n
 
 
 def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> None:
-    """Check what kernels are to have the address of.
+    """Check an array before its address is passed to kernels.
 
     Raises:
         TypeError: it is no array of this type.
-        ValueError: it has another shape, or elements that do not lie side by side.
+        ValueError: it has another shape, or is not contiguous.
     """
     if not isinstance(array, wp.array) or array.dtype is not dtype:
         found = array.dtype if isinstance(array, wp.array) else type(array)
@@ -143,7 +149,10 @@ def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> N
 
 
 def put(struct: Any, members: Mapping[str, Any]) -> Any:
-    """Set members of a Warp struct whose types have been checked, and return it: in a third of the time that attributes take."""
+    """Set members of a Warp struct and return it, without checking their types.
+
+    It takes a third of the time of setting attributes.
+    """
     native = struct.__ctype__()
     for name, value in members.items():
         kind = type(value)
@@ -159,12 +168,15 @@ def put(struct: Any, members: Mapping[str, Any]) -> Any:
                 if hasattr(value, "__ctype__")
                 else getattr(value, "value", value),
             )
-    struct.__dict__.update(members)  # keeps the memory
+    struct.__dict__.update(members)  # keeps the arrays alive
     return struct
 
 
 def copy_of(struct: Any) -> Any:
-    """Return a copy of a Warp struct, in a fraction of the time that it takes to make one with others in it."""
+    """Return a copy of a Warp struct.
+
+    It takes a fraction of the time of constructing one with nested structs.
+    """
     native = struct.__ctype__()
     made = object.__new__(type(struct))
     made.__dict__.update(struct.__dict__, _ctype=type(native).from_buffer_copy(native))
@@ -172,17 +184,17 @@ def copy_of(struct: Any) -> Any:
 
 
 def packed(arrays: Sequence[Any]) -> list[Any]:
-    """Return arrays as C has them, one that is None as a null array."""
+    """Return arrays as C structs; None becomes a null array."""
     return [NO_ARRAY if a is None else a.__ctype__() for a in arrays]
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Which neighbors the rows of a compact stencil have, and how their weights are had.
+    """Pattern of a compact stencil: its neighbors and the source of its weights.
 
     Attributes:
-        offsets: (x, y, z), each -1, 0 or 1, of the neighbors; of a `symmetric` one of those before
-            a cell, whose weights are those of the ones after it, too.
+        offsets: (x, y, z), each -1, 0 or 1, of the neighbors. A `symmetric` pattern has those
+            before a cell; the weights serve those after it, too.
         symmetric: whether a weight serves both its cells.
         kind: "numbers", one an offset; "arrays"; or "functions", Warp functions (k, j, i) of the
             cell.
@@ -207,12 +219,18 @@ class Pattern:
 
     @functools.cached_property
     def word(self) -> str:
-        """What tells its kernels from others."""
+        """Key of its kernels."""
         mask = sum(1 << (x + 1 + 3 * (y + 1) + 9 * (z + 1)) for x, y, z in self.offsets)
-        return f"compact_{'symmetric_' * self.symmetric}{self.kind}{_number_of(self.functions)}_{mask:x}"
+        return (
+            f"compact_{'symmetric_' * self.symmetric}{self.kind}"
+            f"{_number_of(self.functions)}_{mask:x}"
+        )
 
     def source(self) -> list[str]:
-        """Return C++ that `stencil.h` needs: a function of the piece's cell for each weight, and a macro that visits all of them."""
+        """Return C++ for `stencil.h`: weight functions and a macro that visits them.
+
+        There is one function of the piece's cell for each weight.
+        """
         made = [
             f"const auto weight{i} = [&](long long k) -> T {{ return (T)({self._expression(i)}); "
             f"}};"
@@ -240,7 +258,10 @@ class Pattern:
 
     @functools.cached_property
     def touch(self) -> Any:
-        """A Warp function that calls all of them, so that whatever calls it has their code; None of others."""
+        """A Warp function that calls all weight functions; None if there are none.
+
+        A kernel that calls it contains their code.
+        """
         touch = None
         for function in self.functions:
             touch = touch if isinstance(function, float) else _touching(function, touch)
@@ -249,7 +270,7 @@ class Pattern:
 
 @functools.cache
 def _number_of(functions: tuple[Any, ...]) -> str:
-    """Return what tells functions from others, of the same names too."""
+    """Return a key of functions that also distinguishes those of equal names."""
     return f"_{_number_of.cache_info().misses}" if functions else ""
 
 
@@ -271,7 +292,10 @@ def _touching(function: Any, before: Any) -> Any:
 
 @functools.cache
 def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
-    """Return the struct of a stencil whose diagonal and weights have these types: a 7-point one, unless it has a pattern."""
+    """Return the struct of a stencil with these types of diagonal and weights.
+
+    It is a 7-point stencil, unless there is a pattern.
+    """
     fields, numbers = (
         (("wx", "wy", "wz"), ("cx", "cy", "cz"))
         if pattern is None
@@ -287,7 +311,9 @@ def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
 
 @dataclass(frozen=True)
 class PrecomputedProduct:
-    """What a pass takes in place of a stencil where the product has been computed: on matrices.
+    """A precomputed product A x + b, passed to a kernel in place of a stencil.
+
+    Matrices use it.
 
     Args:
         d: diagonal in units of `unit`, stored; 0 where there is no unknown.
@@ -302,7 +328,7 @@ class PrecomputedProduct:
 
     @functools.cached_property
     def struct(self) -> Any:
-        """What passes take of it."""
+        """Arguments of kernels."""
         check_memory("a known product", self.y, wp.float64, (self.d.size,))
         return put(
             copy_of(_blank_stencil(self.d.dtype)),
@@ -316,7 +342,10 @@ def _blank_stencil(d: Any) -> Any:
 
 
 def make_struct(name: str, members: dict[str, Any]) -> Any:
-    """Return a Warp struct with these members. Make one once: annotations of arrays do not compare equal."""
+    """Return a Warp struct with these members.
+
+    Make each struct once: annotations of arrays do not compare equal.
+    """
     return wp.struct(
         type(name, (), {"__annotations__": members, "__module__": __name__, "__qualname__": name})
     )
@@ -324,20 +353,20 @@ def make_struct(name: str, members: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows that a pass visits.
+    """The rows that a kernel visits.
 
     Attributes:
-        summed: their layout for a pass that sums.
+        summed: their layout for a kernel that sums.
         single: their layout for one that does not: a plane a thread.
         size: elements of a field.
         other_size: elements of a field of the other level of a transfer; 0: there is none.
         device: where the fields are.
         place: first stored cell of a box.
         ends: one past the last stored cell (k, j, i) of a box.
-        weight: cells of a usual pass that one costs as much as.
-        memory: a `warp_lcp.kernels.memory.RowsMemory` that recorded launches read in each run; None:
-            rows are always these.
-        quads: their layout for a pass on CUDA that does not sum and whose threads take quads of
+        weight: cost of a cell, in cells of a usual kernel.
+        memory: a `warp_lcp.kernels.memory.RowsMemory` that recorded launches read in each run;
+            None: the rows never change.
+        quads: their layout for a kernel on CUDA that does not sum and whose threads take quads of
             cells; threads that sum take as many there. None: threads take cells.
         alignments: where rows of fields begin, and those of the other level.
     """
@@ -363,7 +392,10 @@ class Rows:
         whole: bool = False,
         more: int = 0,
     ) -> "Rows":
-        """Return the rows of a padded grid and `more` beyond, or what their spans have of them; a thread takes a `whole` one."""
+        """Return the rows of a padded grid and `more` beyond, or those of its spans.
+
+        `whole`: a thread takes a whole row.
+        """
         steps, counts = (
             (padding.plane + padding.row + 1, padding.plane, padding.row),
             tuple(n + more for n in padding.counts),
@@ -382,7 +414,10 @@ class Rows:
     def part(
         padding: Padding, device: wp.Device, low: Sequence[int], high: Sequence[int]
     ) -> "Rows":
-        """Return the cells low <= (k, j, i) < high of a padded grid, from -1 and up to one more than there are for ghosts; whole rows."""
+        """Return the cells low <= (k, j, i) < high of a padded grid.
+
+        Ghost cells have the indices -1 and n. A thread takes whole rows.
+        """
         strides, counts = (
             (padding.plane, padding.row, 1),
             tuple(end - begin for begin, end in zip(low, high, strict=True)),
@@ -394,7 +429,10 @@ class Rows:
 
     @staticmethod
     def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
-        """Return the ghost cells beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z."""
+        """Return the ghost cells beyond a side of the grid.
+
+        The axis is 0, 1, 2 for x, y, z; the end is 0 for the lower and 1 for the upper side.
+        """
         low, high = [0, 0, 0], list(padding.counts)
         low[2 - axis], high[2 - axis] = (
             (padding.counts[2 - axis], padding.counts[2 - axis] + 1) if end else (-1, 0)
@@ -403,7 +441,7 @@ class Rows:
 
     @staticmethod
     def stored(padding: Padding, device: wp.Device) -> "Rows":
-        """Return all stored cells of a padded grid, ghosts too."""
+        """Return all stored cells of a padded grid, with ghost cells."""
         counts = tuple(n + 2 for n in padding.counts)
         made = Rows.strided(
             padding.size, device, (0, padding.plane, padding.row), counts, quads=True
@@ -411,11 +449,11 @@ class Rows:
         return made._changed(lift=1)
 
     def after_ghosts(self) -> "Rows":
-        """Return the same rows for passes whose fields of three planes begin with one of ghosts.
+        """Return the same rows for three-plane fields that begin with a ghost plane.
 
         Raises:
-            ValueError: there are fewer than two: with ghost cells, a field has no room for three
-                planes and what is below them.
+            ValueError: there are fewer than two planes: with ghost cells, a field has no room for
+                three planes and those below them.
         """
         if self.single.planes < 2:
             raise ValueError(
@@ -431,18 +469,27 @@ class Rows:
 
     @staticmethod
     def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":
-        """Return the first stored cells along axis 0, 1, 2 for x, y, z, those of its edges too."""
+        """Return the first stored cells along an axis, with the edges.
+
+        The axis is 0, 1, 2 for x, y, z.
+        """
         counts = [1 if 2 - axis == a else n + 2 for a, n in enumerate(padding.counts)]
         return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(counts))
 
     @staticmethod
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
-        """Return a flat field as one row, on CUDA as rows as long as there are threads that sum; `serial`: one row for one thread."""
+        """Return a flat field as one row; on CUDA, as rows for the threads that sum.
+
+        `serial`: one row for one thread.
+        """
         return _flat(size, device.alias, serial)
 
     @staticmethod
     def of_fields(layout: Layout) -> "Rows":
-        """Return a layout's stored fields as one row, without the chunks of it that have never been in use; sums have the same order."""
+        """Return a layout's stored fields as one row, without unused chunks.
+
+        Chunks that were never in use are skipped. Sums have the same order.
+        """
         if layout.rows is None:
             layout.rows = Rows.flat(layout.size, layout.device)
             if layout.chunks is not None:
@@ -467,7 +514,9 @@ class Rows:
         cells: int | None = None,
         slab: int | None = None,
     ) -> "Rows":
-        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells`, of `slab` planes if it sums.
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid.
+
+        A thread takes some `cells`, of `slab` planes if it sums.
 
         Raises:
             ValueError: low is not between 0 and high.
@@ -480,12 +529,12 @@ class Rows:
 
     @staticmethod
     def in_part(pieces: wp.array[Any], cells: int, ends: tuple[int, int, int]) -> "Rows":
-        """Return pieces of the rows of a grid, a thread takes one.
+        """Return row segments of a grid; a thread takes one.
 
         Args:
             pieces: (k, j) and (first, one past the last i) of each, vec2i, shape (n, 2).
-            cells: how many there are in all.
-            ends: what they end before, (k, j, i).
+            cells: number of cells of all segments.
+            ends: bounds of the segments (k, j, i), exclusive.
         """
         check_memory("pieces", pieces, wp.vec2i, (len(pieces), 2))
         made = Rows.box((0, 0, 0), (1, 1, len(pieces)), pieces.device, cells=1)
@@ -502,21 +551,27 @@ class Rows:
     def entries(
         count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1
     ) -> "Rows":
-        """Return a list's entries as the row of a box; a thread takes some `cells` of them, which cost as much as `weight` of a grid."""
+        """Return a list's entries as the row of a box.
+
+        A thread takes some `cells` of them. An entry costs as much as `weight` cells of a grid.
+        """
         return replace(Rows.box((0, 0, 0), (1, 1, count), device, cells=cells), weight=weight)
 
     @staticmethod
     def listed(
         count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1
     ) -> "Rows":
-        """Return the same for a pass without a box: of arrays as a whole."""
+        """Return the same for a kernel without a box, over whole arrays."""
         return replace(
             Rows.strided(0, device, (0, 0, 0), (1, 1, count), cells=cells), weight=weight
         )
 
     @staticmethod
     def by_turns(size: int, device: wp.Device, width: int, *, quads: bool = False) -> "Rows":
-        """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
+        """Return a flat field as rows of a width.
+
+        A thread of a kernel that sums takes the same position of each row, its neighbor the next.
+        """
         planes = -(-size // width)
         ends = np.full((planes, 1, 2), (0, width))
         ends[-1:, 0, 1] -= planes * width - size
@@ -544,9 +599,11 @@ class Rows:
         *,
         quads: bool = False,
     ) -> "Rows":
-        """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells.
+        """Return rows by strides and counts.
 
-        Threads on CUDA take some `cells` each, or four where `quads` and a pass has it so.
+        The arguments are the first cell's element, the steps from plane to plane and row to row,
+        and counts of planes, rows, cells. Threads on CUDA take some `cells` each, or four where
+        `quads` is set and the kernel allows it.
 
         Raises:
             TypeError: spans are of another type.
@@ -592,8 +649,8 @@ class Rows:
 
         Args:
             other: the rows of that level.
-            factors: cells of it along x, y, z that one of ours stands for; below 0: of ours that
-                one of its stands for.
+            factors: its cells along x, y, z for each cell of these rows; negative: cells of these
+                rows for each cell of that level.
         """
         made = self._pairs.get((id(other), factors))
         if made is None:
@@ -602,7 +659,10 @@ class Rows:
 
     @functools.cached_property
     def _pairs(self) -> dict[tuple[int, Any], tuple["Rows", "Rows"]]:
-        """Rows with another level's beside them: of each level and factors that have been asked for, and which that is."""
+        """Cache of rows paired with those of another level.
+
+        The key is the other level and the factors between both.
+        """
         return {}
 
     def _beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
@@ -621,7 +681,7 @@ class Rows:
             else put(copy_of(self.quads), members)
         )
         summed = None if self.summed is L else put(copy_of(self.summed), members)
-        # a thread takes the cells of one of the other level's
+        # A thread takes the cells of one of the other level's threads.
         if not self.device.is_cpu and factors[0] < 0:
             members |= {"grain": -factors[0], "chunks": -(L.nx // factors[0])}
         single = put(copy_of(L), members)
@@ -631,18 +691,18 @@ class Rows:
 
     @functools.cached_property
     def count(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return int(self.single.planes * self.single.rows)
 
     @functools.cached_property
     def places(self) -> int:
-        """How many sums a pass makes of each kind, one a thread."""
+        """Number of partial sums of each kind, one a thread."""
         planes, rows, chunks = threads(self.summed)
         return planes * rows * chunks
 
 
 def _alignment(layout: Any) -> Alignment:
-    """Return where rows begin, as far as reading fields in blocks needs it."""
+    """Return the alignment of rows, for reading fields in blocks."""
     first, plane, row = layout.base % 4, layout.s1 % 4, layout.s2 % 4
     if layout.planes * layout.rows * layout.nx < MANY_CELLS_OF_BLOCKS:
         return ANYWHERE
@@ -662,5 +722,5 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
 
 
 def threads(layout: Any) -> tuple[int, int, int]:
-    """Return the threads of a launch."""
+    """Return the number of threads of a launch, by dimension."""
     return -(-layout.planes // layout.slab), layout.rows, layout.chunks

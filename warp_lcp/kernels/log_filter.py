@@ -1,4 +1,7 @@
-"""What a user hears of Warp: one line when kernels are compiled, instead of a banner and a line for every module."""
+"""Log filter for Warp: one line when kernels are compiled.
+
+It replaces Warp's banner and its line for every module.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,23 @@ from typing import TextIO
 
 import warp as wp
 
-# whose modules of kernels are not worth a line each
+# Modules whose kernels are not reported one by one.
 OURS = ("warp_lcp", "fluids", "granular", "benchmarks", "warp")
 BANNER = re.compile(r"Warp \S+ initialized:")
 LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+ ms +\((\w+)\)")
 
 
 class KernelMessages:
-    """A logger for Warp that says once for each device that kernels are being compiled, when the first of them has been.
+    """A logger for Warp that reports once for each device that kernels are compiled.
 
-    It drops Warp's banner and what Warp says of each module of this library; all else goes where it
-    went. `wp.config.log_level` has its usual meaning: above `wp.LOG_INFO` there is no line either,
-    at `wp.LOG_DEBUG` Warp says all that it says without this library, and so it does after
-    `wp.set_logger(None)`.
+    The line appears when the first kernel has been compiled. The logger drops Warp's banner and its
+    messages about modules of this library; all else passes through. `wp.config.log_level` has its
+    usual meaning: above `wp.LOG_INFO` there is no line either. At `wp.LOG_DEBUG`, and after
+    `wp.set_logger(None)`, all messages of Warp appear.
 
     Args:
         logger: takes the rest.
-        stream: takes the line; the error stream as it is then unless given.
+        stream: takes the line; default: the error stream at the time of the line.
     """
 
     def __init__(self, logger: wp.Logger, stream: TextIO | None = None) -> None:
@@ -37,7 +40,7 @@ class KernelMessages:
         self.debug, self.error = logger.debug, logger.error
 
     def info(self, message: str) -> None:
-        """Pass a message on, unless it is of the banner or a module of ours."""
+        """Pass a message on, unless it is the banner or is about a module of this library."""
         found = LOADED.match(message)
         hidden = (found is not None and found[1] in OURS) or BANNER.match(message)
         if not hidden or wp.config.log_level <= wp.LOG_DEBUG:
@@ -54,15 +57,16 @@ class KernelMessages:
     def warning(
         self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
     ) -> None:
-        """Pass a warning on, at its caller's place."""
+        """Pass a warning on, with its caller's place."""
         self._logger.warning(message, category, stacklevel=stacklevel + 1)
 
 
 @functools.cache
 def start_warp() -> None:
-    """Start Warp if nothing has, without what its native code writes of a CUDA driver that is not there: no setting of Warp's drops that.
+    """Start Warp, without its native message about a missing CUDA driver.
 
-    At `wp.LOG_DEBUG` it is written. What Warp says in Python, its logger drops.
+    No setting of Warp drops that message. At `wp.LOG_DEBUG` it is written. Warp's messages from
+    Python go to its logger. Does nothing if Warp has started.
 
     Raises:
         OSError: there is no place for compiled kernels.
@@ -76,7 +80,7 @@ def start_warp() -> None:
 
 @contextmanager
 def _native_messages_dropped() -> Iterator[None]:
-    """Keep what native code writes to the error stream off it, where there is one."""
+    """Redirect the native error stream within a `with` block, if there is one."""
     try:
         kept = os.dup(2)
     except OSError:  # the stream is closed
@@ -93,7 +97,10 @@ def _native_messages_dropped() -> Iterator[None]:
 
 
 def install_log_filter() -> None:
-    """Put `KernelMessages` in the place of Warp's own logger; one that a program has set stays."""
+    """Install the log filter in place of Warp's own logger.
+
+    A logger that a program has set stays.
+    """
     logger = wp.get_logger()
     if type(logger).__module__.startswith("warp."):
         wp.set_logger(KernelMessages(logger))

@@ -1,8 +1,8 @@
-"""Memory that recorded launches read when they run: numbers, windows, lists, and where arrays lie.
+"""Memory that recorded launches read in each run.
 
-A launch that is recorded once holds its arguments as bytes. What changes from run to run stands in
-memory of its owner, and a patch of the launch, (offset in the arguments, address, bytes), has it
-copied into them each time.
+It holds numbers, windows, lists, and addresses of arrays. A launch that is recorded once holds its
+arguments as bytes. What changes from run to run stands in memory of its owner. A patch of the
+launch, (offset in the arguments, address, bytes), copies it into the arguments before each run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LAYOUT = type(_BLANK.__ctype__())
 LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
 _ARRAY: Any = type(wp.array(dtype=wp.uint8).__ctype__())
 ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), _ARRAY.shape.offset
-# members of a RowLayout from `nx` to `slab`; first (k, j, i)
+# Members of a RowLayout from `nx` to `slab`; first (k, j, i).
 BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")
 FORMATS: dict[Any, Any] = {
     wp.float32: ctypes.c_float,
@@ -37,14 +37,14 @@ FORMATS: dict[Any, Any] = {
 class Scalar:
     """A number that changes between the runs of recorded launches.
 
-    Pass it where a kernel takes a number: a launch that is recorded reads `value` each time it
-    runs, another takes it as it is.
+    Pass it where a kernel takes a number. A recorded launch reads `value` in each run; any other
+    launch uses the value at the time of the call.
     """
 
     __slots__ = ("_cells", "_scaled", "_value")
 
     def __init__(self, value: float = 0) -> None:
-        self._cells: dict[Any, Any] = {}  # the number in each type that kernels take it in
+        self._cells: dict[Any, Any] = {}  # the number in each type that kernels use
         self._scaled: dict[float, Scalar] = {}
         self._value = value
 
@@ -62,13 +62,13 @@ class Scalar:
             product.value = value * factor
 
     def scaled(self, factor: float) -> Scalar:
-        """Return the number times a factor, which goes along with it."""
+        """Return the number times a factor, updated with it."""
         if factor not in self._scaled:
             self._scaled[factor] = Scalar(self._value * factor)
         return self._scaled[factor]
 
     def address(self, kind: Any) -> tuple[int, int]:
-        """Return the address of the number in one of Warp's types, and its bytes."""
+        """Return the address and the bytes of the number in one of Warp's types."""
         kind = FORMATS[kind]
         if kind not in self._cells:
             self._cells[kind] = kind(self._value)
@@ -81,12 +81,15 @@ def scaled(number: float | Scalar, factor: float) -> Any:
 
 
 def value_of(number: Any) -> Any:
-    """Return a number, or what a `Scalar` holds now."""
+    """Return a number, or the present value of a `Scalar`."""
     return number.value if type(number) is Scalar else number
 
 
 class Slot:
-    """Address of an array that other arrays replace between runs; the current array has it as attribute `slot`."""
+    """Address of an array that is replaced between runs.
+
+    The current array has it as attribute `slot`.
+    """
 
     __slots__ = ("_held", "_length", "_memory", "address")
 
@@ -94,16 +97,16 @@ class Slot:
         self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
         self.address = ctypes.addressof(self._memory)
         self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
-        self._held: Any = None  # the store that `point_to_first` has been given last
+        self._held: Any = None  # the last store passed to `point_to_first`
 
     def point_to(self, array: wp.array[Any]) -> None:
-        """Have recorded launches use this array from now on."""
+        """Make recorded launches use this array from now on."""
         self._held = None
         ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
         array.slot = self
 
     def point_to_first(self, count: int, store: wp.array[Any]) -> None:
-        """Have recorded launches use the first elements of an array of one axis from now on."""
+        """Make recorded launches use the first elements of a flat array from now on."""
         if self._held is not store:
             ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
             self._held = store
@@ -111,12 +114,12 @@ class Slot:
 
 
 class RowsMemory:
-    """Rows that change between runs: their layout, the first cell of a box, and the number of tasks.
+    """Rows that change between runs: layout, first cell of a box, number of tasks.
 
     Attributes:
         layout: native struct of the layout.
         place: first (k, j, i) of a box.
-        tasks: of a pass over the rows.
+        tasks: number of tasks of a kernel over the rows.
     """
 
     __slots__ = ("layout", "place", "tasks")
@@ -126,7 +129,10 @@ class RowsMemory:
         self.place, self.tasks = (ctypes.c_int32 * 3)(), ctypes.c_int64()
 
     def patches(self, place: int | None) -> list[tuple[int, int, int]]:
-        """Return what a launch reads; `place`: offset of `k0` in its arguments, None: it has none."""
+        """Return the patches of a launch.
+
+        `place`: offset of `k0` in its arguments; None: it has none.
+        """
         found = [(0, ctypes.addressof(self.layout), LAYOUT_BYTES)]
         return (
             found
@@ -142,20 +148,23 @@ class RowsMemory:
     def take_box(
         self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]
     ) -> None:
-        """Take whole rows of a box over, see `RowLayout`."""
+        """Set the rows to whole rows of a box, see `RowLayout`."""
         ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
         BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
         PLACE.pack_into(self.place, 0, *place)
         self.tasks.value = planes * rows * chunks
 
     def take_entries(self, count: int, cells: int) -> int:
-        """Take the entries of a list over on the CPU, as `Rows.entries` with so many `cells` a task; return the number of tasks."""
+        """Set the rows to the entries of a list, on the CPU; return the tasks.
+
+        The layout is that of `Rows.entries` with so many `cells` a task.
+        """
         chunks = -(-count // cells)
         self.take_box(count, 1, 1, cells, chunks, (0, 0, 0))
         return chunks
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
-        """Take rows over.
+        """Set the rows.
 
         Args:
             layout: a RowLayout.
@@ -169,26 +178,29 @@ class RowsMemory:
 
 
 class DeviceRows(RowsMemory):
-    """Rows that change between runs, on CUDA: with the launch dimensions that they take, and those that a graph is captured with.
+    """Rows that change between runs, on CUDA, with their launch dimensions.
 
     Attributes:
         extent: threads of a launch (slabs, rows, chunks) now.
-        room: those of a captured launch: the largest that have been asked for, those beyond the
-            rows return at once.
+        room: those of a captured launch: the largest requested so far. Threads beyond the rows
+            return at once.
         places: number of threads, of which each has a place for its sums.
     """
 
     __slots__ = ("extent", "places", "room", "spare")
 
     def __init__(self, spare: float = 1.0) -> None:
-        """Begin with one thread; where `room` must grow, it does so by the factor `spare` more."""
+        """Begin with one thread.
+
+        Where `room` must grow, it grows by the factor `spare` more.
+        """
         super().__init__()
         self.extent: tuple[int, ...] = (1, 1, 1)
         self.room: tuple[int, ...] = (1, 1, 1)
         self.places, self.spare = Scalar(), spare
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
-        """Take rows over."""
+        """Set the rows and their launch dimensions."""
         super().take(layout, place)
         self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
         self.room = larger(self.room, self.extent, self.spare)
@@ -196,10 +208,16 @@ class DeviceRows(RowsMemory):
 
 
 def rows_memory(device: wp.Device, spare: float = 1.0) -> RowsMemory:
-    """Return memory of rows for recorded launches of a device; `spare` as of `DeviceRows`."""
+    """Return memory of rows for recorded launches.
+
+    `spare` as of `DeviceRows`.
+    """
     return DeviceRows(spare) if device.is_cuda else RowsMemory()
 
 
 def larger(room: tuple[int, ...], extent: tuple[int, ...], spare: float = 1.0) -> tuple[int, ...]:
-    """Return launch dimensions that hold others, too: where they must grow, by a factor more."""
+    """Return launch dimensions that contain both arguments.
+
+    Those that must grow do so by the factor `spare` more.
+    """
     return tuple(r if r >= e else int(spare * e) for r, e in zip(room, extent, strict=True))

@@ -1,9 +1,10 @@
-"""C++ of headers as text: so Warp sees changes, which it does not through `#include`, and errors name file and line.
+"""C++ headers as text with resolved includes.
 
+Warp sees changes of the text, which it does not through `#include`, and errors name file and line.
 A header of an area has sections: kernels, which `kernel_file.py` reads, and snippets that several
-of them include. A section begins with a line `// kernel NAME: description` or
-`// snippet NAME: description` and ends where the next one begins. `#include "NAME"` stands for the
-body of a section of the same file, `#include "FILE.h:NAME"` for one of a file beside it or in
+of them include. A section begins with a line `// kernel NAME: description` or `// snippet NAME:
+description` and ends where the next one begins. `#include "NAME"` stands for the body of a section
+of the same file, `#include "FILE.h:NAME"` for one of a file beside it or in
 `warp_lcp/kernels/headers`, `#include "FILE.h"` for the whole file.
 """
 
@@ -71,7 +72,7 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
                 f"{path}:{start + 1}: {name} is declared in line {found[name].line}, too"
             )
         begin = start + 1
-        # more of the description
+        # A continued description.
         while kind == "kernel" and begin < end and re.match("// [^ ]", lines[begin]):
             begin += 1
         while kind == "kernel" and begin < end and lines[begin].startswith("//   "):
@@ -85,7 +86,7 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
 
 
 def text(path: Path, name: str = "") -> str:
-    """Return a section of a header, or the whole of it, with what it includes.
+    """Return a section of a header, or the whole of it, with includes resolved.
 
     Raises:
         ValueError: there is no such section, or an included one is missing.
@@ -104,7 +105,10 @@ def text(path: Path, name: str = "") -> str:
 
 
 def _included(path: Path, number: int, line: str) -> str | None:
-    """Return what a line includes; None if it is none that includes, or one for the compiler."""
+    """Return the target of an include line.
+
+    Returns None for any other line, and for includes that the compiler resolves.
+    """
     found = _INCLUDE.fullmatch(line)
     if not found:
         return None
@@ -120,5 +124,5 @@ def _included(path: Path, number: int, line: str) -> str | None:
 
 @functools.cache
 def shared(name: str) -> str:
-    """Return a header of the layer's own."""
+    """Return a header of this package."""
     return text(HEADERS / name)

@@ -1,9 +1,10 @@
 # mypy: ignore-errors
-"""Passes one after another in one launch on CUDA; on the CPU, launches.
+"""Persistent kernels: several kernels in one launch on CUDA.
 
-A block of threads takes them, or a cluster of blocks. All threads meet at a barrier after each
-pass. A cluster (compute capability 9.0 on) is a few blocks on neighboring multiprocessors that have
-a barrier in hardware. It is taken where a pass has more tasks than a block has threads.
+On the CPU they are separate launches. A block of threads or a cluster of blocks executes them. All
+threads meet at a barrier after each kernel. A cluster (compute capability 9.0 on) is a few blocks
+on neighboring multiprocessors that have a barrier in hardware. It is used where a kernel has more
+tasks than a block has threads.
 """
 
 import functools
@@ -19,39 +20,44 @@ from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
 from warp_lcp.kernels.layout import RowLayout, make_struct, threads
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 
-CUDA_THREADS = 512  # of a block that inverts a matrix
-THREADS = 256  # of a block that works through passes: with 512 they spill registers
-BLOCKS = 8  # of a cluster: as many as every GPU with clusters has
-CLUSTERED = 90  # the least architecture that has them
-MOST = 5  # forms
+CUDA_THREADS = 512  # threads of a block that inverts a matrix
+THREADS = 256  # threads of a block that executes kernels: with 512 they spill registers
+BLOCKS = 8  # blocks of a cluster: every GPU with clusters has as many
+CLUSTERED = 90  # least architecture with clusters
+MOST = 5  # most variants
 
 
 @wp.struct
 class EmptyArguments:
-    """Fields of a form that a sequence does not have; of eight bytes, as all structs of arguments are."""
+    """Arguments of an unused kernel variant of a persistent kernel.
+
+    Eight bytes, as all structs of arguments are multiples of that.
+    """
 
     unused: wp.int64
 
 
 @wp.func
 def nothing(L: RowLayout, F: EmptyArguments, slab: int, row: int, chunk: int, count: int):
-    """Stand for a form that a sequence does not have."""
+    """Do nothing, in place of an unused variant."""
 
 
 class PersistentKernel:
-    """A table of passes on the device, which one launch works through: grids of 16^3 cells take less time than launches.
+    """A table of kernels on the device that one launch executes.
+
+    Grids of 16^3 cells take less time than launches.
 
     Args:
-        name: of the kernel, as a pass has one.
-        stages: the passes in order, of five forms at most, without sums. Those that are the same
-            object are kept once.
+        name: of the kernel, as a stencil kernel has one.
+        stages: the kernels in order, of five variants at most, without sums. Those that are the
+            same object are stored once.
 
     Attributes:
-        tasks: the most of a pass.
+        tasks: the largest number of tasks of a kernel.
         threads: of the launch.
 
     Raises:
-        ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
+        ValueError: no kernel, too many variants, a kernel that sums, or kernels on several devices.
     """
 
     def __init__(self, name: str, stages: list[BoundKernel]) -> None:
@@ -79,7 +85,7 @@ class PersistentKernel:
 
     @functools.cached_property
     def tables(self) -> Any:
-        """The passes, those of each form in a table, and the order in which they follow."""
+        """Tables of the kernels by variant, and the order of execution."""
         places = dict[int, tuple[int, int]]()
         kept: list[list[bytes]] = [[] for _ in self._forms]
         for bound in {id(stage): stage for stage in self._stages}.values():
@@ -93,18 +99,19 @@ class PersistentKernel:
         for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):
             stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
             typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
-            # a recorded launch keeps the tables alone, and they what they have the addresses of
+            # A recorded launch holds the tables alone, so the tables must hold the arrays whose
+            # addresses they have.
             typed.kept = stored, self._stages
             setattr(made, table, typed)
         return made
 
     def launch(self, launch: Launch = launch_now) -> None:
-        """Launch all passes, or record their launch."""
+        """Launch all kernels, or record their launch."""
         if self.device.is_cuda:
             inputs = [self.tables, 0, len(self._stages), self.threads]
             launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
             return
-        made: dict[int, Any] = {}  # what the team does of a pass that comes again
+        made: dict[int, Any] = {}  # operations of the thread pool for repeated kernels
         for stage in self._stages:
             key = id(stage)
             if key not in made:
@@ -140,7 +147,7 @@ __syncthreads();
 """
 )
 def meet_in_cluster():
-    """Wait for all threads of the cluster, and see what they have written."""
+    """Wait for all threads of the cluster, and make their writes visible."""
 
 
 def has_clusters(device: wp.Device) -> bool:
@@ -150,7 +157,10 @@ def has_clusters(device: wp.Device) -> bool:
 
 @functools.cache
 def _shared(form: KernelVariant | None) -> Any:
-    """Return the struct of a pass with its arguments, and the function by which threads share its rows."""
+    """Return the struct of a kernel with its arguments, and its sharing function.
+
+    The function distributes the kernel's rows over threads.
+    """
     run, Fields = (form.run_in_turn, form.fields) if form else (nothing, EmptyArguments)
     Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
     pieces = wp.array(dtype=Piece)
@@ -168,6 +178,7 @@ def _shared(form: KernelVariant | None) -> Any:
 
 @functools.cache
 def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: bool) -> Any:
+    # Warp needs a branch for each variant; unused ones have empty arguments and do nothing.
     (One, first), (Two, second), (Three, third), (Four, fourth), (Five, fifth) = (
         _shared(form) for form in (*forms, *(None,) * (MOST - len(forms)))
     )
@@ -185,7 +196,10 @@ def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: boo
     Tables = make_struct(f"{name.replace('.', '_')}_{variant.replace('.', '_')}", members)
 
     def sequence(T: Tables, begin: int, end: int, threads: int):
-        """Every thread passes every barrier: the bounds of the loop are the same for all."""
+        """Execute the kernels from `begin` to `end`, with a barrier after each.
+
+        Every thread reaches every barrier: the bounds of the loop are the same for all.
+        """
         t = wp.tid()
         for s in range(begin, end):
             at = T.order[s]
@@ -204,6 +218,7 @@ def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: boo
     sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
     options = {"cluster_dim": BLOCKS} if clustered else {}
     module = f"warp_lcp.{name}.{variant}"
-    # without the least number of blocks, 1, ptxas keeps to 128 registers and spills
+    # The least number of blocks, 1, must be given: without it ptxas uses at most 128 registers and
+    # spills.
     kernel = forward_kernel(module=module, launch_bounds=(THREADS, 1), **options)(sequence)
     return kernel, Tables, structs

@@ -1,4 +1,7 @@
-"""Numbers that kernels leave on a device for the host, which waits for the device whenever it reads: those of a device come together."""
+"""Small results on a device that the host reads in one copy.
+
+The host waits for the device whenever it reads, so the numbers of a device are copied together.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +14,24 @@ import warp as wp
 
 from warp_lcp.kernels.fields import zeros
 
-BYTES = 1 << 15  # of a board: as long under way as eight
-LINE = 64  # bytes that no two readings share
+BYTES = 1 << 15  # of a buffer: its transfer takes as long as that of eight bytes
+LINE = 64  # bytes of a cache line, which no two readings share
 
 
 class DeviceScalar:
     """An array of a few numbers, written by kernels and read by the host.
 
-    Whoever has launched what writes to `array` says so by `changed`; `numpy` then waits for the
-    device, once for all readings of it.
+    Call `changed` after every launch that writes to `array`. `numpy` then waits for the device; one
+    copy serves all readings of it.
 
     Args:
-        device: where it is.
-        count: numbers.
+        device: of the array.
+        count: of numbers.
         dtype: of them.
     """
 
     _board: ReadbackBuffer | None
-    _view: np.ndarray  # of an array that the host reads as it is
+    _view: np.ndarray  # view of an array in host memory
 
     def __init__(self, device: wp.Device, count: int = 1, dtype: Any = wp.float64) -> None:
         self.array: wp.array[Any]
@@ -47,43 +50,43 @@ class DeviceScalar:
         weakref.finalize(self, self._board.give_back, place, size)
 
     def changed(self) -> None:
-        """Say that launches have written to it."""
+        """Mark the numbers as changed by launches."""
         if self._board is not None:
             self._change = self._board.note()
 
     def numpy(self) -> np.ndarray:
-        """Return the numbers as they are after all that has been launched, not to be written to."""
+        """Return the numbers after all launches so far; they are read-only."""
         if self._board is None:
             return self._view
         return self._board.fetched(self._change)[self._slice].view(self._kind)
 
 
 class ReadbackBuffer:
-    """Memory of a device for its readings.
+    """Device buffer of all small results, copied to the host as a whole.
 
     Args:
-        device: where it is.
+        device: of the buffer.
         size: of it, in bytes.
     """
 
     def __init__(self, device: wp.Device, size: int = BYTES) -> None:
         self.memory = wp.zeros(-(-size // LINE) * LINE, dtype=wp.uint8, device=device)
         self._host, self._end, self._changes, self._known = np.zeros(0, dtype=np.uint8), 0, 0, 0
-        self._free: dict[int, list[int]] = {}  # places by their size
+        self._free: dict[int, list[int]] = {}  # free places by their size
 
     def take(self, size: int) -> int | None:
-        """Return a place of so many bytes, None if there is none."""
+        """Allocate so many bytes and return their place; None if there is no room."""
         size = -(-size // LINE) * LINE
         if free := self._free.get(size):
             return free.pop()
         if self._end + size > self.memory.size:
             return None
         self._end += size
-        self._known = -1  # what has been fetched is too short
+        self._known = -1  # the fetched copy is too short
         return self._end - size
 
     def give_back(self, place: int, size: int) -> None:
-        """Take a place back."""
+        """Free a place."""
         self._free.setdefault(-(-size // LINE) * LINE, []).append(place)
 
     def note(self) -> int:
@@ -98,17 +101,17 @@ class ReadbackBuffer:
         return self._host
 
 
-_boards: dict[str, ReadbackBuffer] = {}  # the newest of each device
+_boards: dict[str, ReadbackBuffer] = {}  # the newest buffer of each device
 
 
 def place_of(device: wp.Device, size: int) -> tuple[ReadbackBuffer, int]:
-    """Return a board of a device that has so many bytes free, and their place on it."""
+    """Return a buffer of a device with so many bytes free, and their place in it."""
     board = _boards.get(device.alias) or _boards.setdefault(device.alias, ReadbackBuffer(device))
     place = board.take(size)
     if place is None:
-        gc.collect()  # readings that only a circle of references still holds
+        gc.collect()  # frees readings that only reference cycles hold
         place = board.take(size)
-    if place is None:  # the old one stays as long as its readings do
+    if place is None:  # the old buffer lives as long as its readings
         board = _boards[device.alias] = ReadbackBuffer(device, max(size, BYTES))
         place = board.take(size)
         assert place is not None

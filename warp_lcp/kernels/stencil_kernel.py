@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""Row passes: declared by fields with roles and a C++ row function, launched by name, composed to waves.
+"""Stencil kernels: fields with roles and a C++ row function, launched by name.
 
-A row function sees a piece: pointers to its first cell, the number n of its cells, the offsets ym,
-yp, zm, zp of the rows beside it.
+They can be composed to fused kernels. A row function sees a piece: pointers to its first cell, the
+number n of its cells, the offsets ym, yp, zm, zp of the rows beside it.
 """
 
 import functools
@@ -34,10 +34,10 @@ from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar
 from warp_lcp.kernels.native import sections
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 
-BLOCK_BYTES = 16  # that a thread loads at a time
-# fields of one element a row that row functions only set, or find it set
+BLOCK_BYTES = 16  # bytes that a thread loads at a time
+# Fields of one element a row that row functions only set, or find set: several threads may do so.
 FLAGGED = ("changed", "away")
-# names of the layer's own
+# Names that this package uses itself.
 OWN = frozenset(
     (
         "self",
@@ -62,22 +62,22 @@ OWN = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class StencilKernel:
-    """What is done to the cells of a row.
+    """Declaration of a kernel over the cells of rows.
 
-    Types of fields are Warp's, or letters: a letter stands for one type, that of the arrays given,
-    and is the name of it in the row function. `T` there is the type of computations.
+    Types of fields are Warp's, or letters: a letter stands for one type, that of the arrays passed
+    in, and is its name in the row function. `T` there is the type of computations.
 
     Args:
         name: of the kernel, with the area before it: `projected_multigrid.assess`.
         header: C++ row function, or the header of an area in which it is `declared`.
-        compute: what T stands for.
+        compute: type that T stands for.
         stencil: types of the diagonal and the weights of `stencil.h`, if it has one. `affine` there
-            is A x + b: of the stencil, or known.
+            is A x + b: of the stencil, or precomputed.
         bounds: whether it has those of `bounds.h`.
         reads: fields, pointers to the piece's first cell.
         writes: likewise, written.
-        ring: which of those keep three planes only; the pointer is to its place there, `down` and
-            `up` lead to the planes around it.
+        ring: those of the fields that keep three planes only; the pointer is to its plane there,
+            `down` and `up` are the offsets to the planes around it.
         other: fields of the other level of a transfer, pointers to the element that belongs to the
             first cell. Cells belong together in `pairs` along x or not; `deep` planes and `wide`
             rows of a finer level belong to one of ours.
@@ -87,31 +87,31 @@ class StencilKernel:
         box: fields of all cells of a grid, of `Rows.box`: pointers to the first stored cell of row
             j of plane k, null where there is none; of one that has layers, in its first. The piece
             is first <= i < last; the planes of the first field are s1 elements apart, its rows s2.
-            Such a pass has no letters and one form, in the Warp module that its name begins with.
-            Lists, too, are fields.
+            Such a kernel has no letters and one variant, in the Warp module that its name begins
+            with. Lists count as fields, too.
         listed: int32 array of `whole` with the flat indices of the cells that are visited; the box
             is then that of the list's entries.
-        optional: which arrays may be None, or empty: their pointers are null then.
-        numbers: given by the host.
-        sums: variables of the row function that are summed over the cells. Those of a pass over a
+        optional: arrays that may be None, or empty: their pointers are null then.
+        numbers: passed by the host.
+        sums: variables of the row function that are summed over the cells. Those of a kernel over a
             box are doubles, and 0 before a piece.
-        largest: likewise, of which the largest counts; after the sums.
+        largest: likewise, reduced by the maximum; after the sums.
         ordered: whether tasks write what others read or write: on the CPU one thread takes them, in
             order.
-        by_cell: whether a thread takes one cell on CUDA, not four of a row: what it does of one is
+        by_cell: whether a thread takes one cell on CUDA, not four of a row: its work on one is
             long, or reaches what others write.
-        constants: numbers that are known when the kernel is made, with their usual values; those
-            that are given are integers, and macros.
+        constants: numbers that are known when the kernel is made, with their default values; those
+            that are passed in are integers, and macros.
         declared: the kernel's name in the header, see `kernel_file.py`; empty: the header is the
             row function alone.
-        module: Warp module of passes that are used together. They are compiled at once for each set
-            of types: a module of its own costs 0.04 s before its first kernel. Not for a pass over
-            a box, whose module its name begins with.
+        module: Warp module of kernels that are used together. They are compiled at once for each
+            set of types: a module of its own costs 0.04 s before its first kernel. Not for a kernel
+            over a box, whose module its name begins with.
 
     Raises:
-        ValueError: a name cannot be one in C++, is the layer's own, or stands for two things; a
-            role or a letter is of no array.
-        TypeError: a number is of a type that cannot be given.
+        ValueError: a name cannot be one in C++, is used by this package, or stands for two things;
+            a role or a letter is of no array.
+        TypeError: a number is of a type that cannot be passed.
     """
 
     name: str
@@ -139,7 +139,10 @@ class StencilKernel:
     module: str = ""
 
     def __post_init__(self) -> None:
-        """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
+        """Check names, and create the variant of a box at once.
+
+        Otherwise a Warp module that is loaded already would be compiled again with it.
+        """
         self._check_names()
         if self.module:
             TOGETHER.setdefault(self.module, []).append(self)
@@ -148,7 +151,10 @@ class StencilKernel:
             assert form_of(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
 
     def _check_names(self) -> None:
-        """Check the declaration, in whose place a compiler would complain, or nobody."""
+        """Check the declaration.
+
+        A compiler would report some errors later, others not at all.
+        """
         numbers = {n: kind for n, kind in self.numbers.items() if not (self.box and n in PLACE)}
         fields = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box})
         groups = (
@@ -194,7 +200,7 @@ class StencilKernel:
 
     @functools.cached_property
     def label(self) -> str:
-        """The name and where it is declared, for messages."""
+        """Name and place of the declaration, for messages."""
         return f"{self.name} ({self.source})" if self.declared else self.name
 
     @functools.cached_property
@@ -206,18 +212,24 @@ class StencilKernel:
 
     @functools.cached_property
     def found(self) -> tuple[str, ...]:
-        """What is summed, and what the largest is taken of."""
+        """Names of the sums, then of the maxima."""
         return (*self.sums, *self.largest)
 
     @functools.cached_property
     def quads(self) -> bool:
-        """Whether a thread can take four cells of a row at a time on CUDA: of passes over the rows of grids."""
+        """Whether a thread can take four cells of a row at a time on CUDA.
+
+        Only kernels over the rows of grids can.
+        """
         elsewhere = self.box or self.ring or {*self.by_row} - {*FLAGGED}
         return not (elsewhere or self.ordered or self.by_cell)
 
     @functools.cached_property
     def arrays(self) -> dict[str, Any]:
-        """Types of all arrays by name; `out` receives what is found, a column each."""
+        """Types of all arrays by name.
+
+        `out` receives the sums and maxima, a column each.
+        """
         out = {"out": wp.float64} if self.found else {}
         return {
             **self.reads,
@@ -237,16 +249,16 @@ class StencilKernel:
         bounds: list[Any] | None = None,
         **given: Any,
     ) -> "BoundKernel":
-        """Check and take what a launch needs.
+        """Check the arguments of a launch and bind them.
 
         Args:
-            rows: which rows.
+            rows: the rows to visit.
             structs: dataclasses whose members have the names of arguments; the kernel takes those
                 that it declares.
-            stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `PrecomputedProduct` product in
-                place of one.
+            stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `PrecomputedProduct`
+                in place of one.
             bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
-            given: arrays, numbers, and constants that are not as usual, by name; they override
+            given: arrays, numbers, and constants other than their defaults, by name; they override
                 members of structs.
 
         Raises:
@@ -265,7 +277,10 @@ class StencilKernel:
         stencil: Any = None,
         bounds: list[Any] | None = None,
     ) -> "BoundKernel":
-        """Bind as `bind` does, for functions that hand on the structs and keywords of their callers; `given` changes."""
+        """Bind as `bind` does, with structs and keywords as containers.
+
+        It serves functions that pass on the arguments of their callers. `given` is modified.
+        """
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
             raise TypeError(
@@ -349,7 +364,7 @@ class StencilKernel:
         return BoundKernel(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
 
     def _with_members(self, structs: tuple[Any, ...], given: dict[str, Any]) -> dict[str, Any]:
-        """Return the members of structs that are arguments, and what is given."""
+        """Return the arguments among the structs' members, and those of `given`."""
         kinds = tuple([type(s) for s in structs])
         plan = self._members.get(kinds)
         if plan is None:
@@ -364,7 +379,10 @@ class StencilKernel:
         return {**dict(zip(names, values, strict=True)), **given}
 
     def _plan(self, kinds: tuple[type, ...]) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-        """Return the arguments that structs of these classes have, and for each class what gets them, or None."""
+        """Return the arguments that structs of these classes have.
+
+        For each class: a function that gets them, or None.
+        """
         if others := [kind.__name__ for kind in kinds if not is_dataclass(kind)]:
             raise TypeError(f"{self.label}: {others[0]} is not a dataclass")
         shares = [[f.name for f in fields(kind) if f.name in self._wanted] for kind in kinds]
@@ -379,7 +397,11 @@ class StencilKernel:
     def words(
         self, letters: dict[str, Any], constants: Mapping[str, float], shape: str, bounds: str
     ) -> list[str]:
-        """Return what tells a form from others: kinds of stencil and bounds, types, constants that differ from the usual ones."""
+        """Return the key of a kernel variant.
+
+        It holds the kinds of stencil and bounds, the types, and the constants that differ from
+        their defaults.
+        """
         differing = [
             f"{name.lower()}{value}"
             for name, value in constants.items()
@@ -397,7 +419,7 @@ class StencilKernel:
 
     @functools.cached_property
     def _members(self) -> dict[tuple[type, ...], Any]:
-        """Plans of `_with_members` by the classes of structs."""
+        """Cached results of `_with_members`, by the classes of structs."""
         return {}
 
     @functools.cached_property
@@ -406,11 +428,11 @@ class StencilKernel:
 
     @functools.cached_property
     def _forms(self) -> dict[Any, KernelVariant]:
-        """Forms by what is given, so that types are checked once."""
+        """Cached variants by types and constants, so that types are checked once."""
         return {}
 
     def _letters(self, stencil: Any, given: dict[str, Any]) -> dict[str, Any]:
-        """Find what the letters stand for, and check the types of all arrays."""
+        """Resolve the letters, and check the types of all arrays."""
         letters: dict[str, Any] = {}
         seen: dict[str, str] = {}
         pairs = [(name, kind, given[name]) for name, kind in self.arrays.items()]
@@ -439,12 +461,15 @@ class StencilKernel:
             raise TypeError(
                 f"{self.label}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}"
             )
-        # of what is absent
+        # Letters of absent arrays.
         return letters | dict.fromkeys(self.letters - letters.keys(), wp.float32)
 
     @functools.cached_property
     def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
-        """Names of the arrays of each length, with the attribute of rows that it is; None: of any."""
+        """Names of the arrays of each length.
+
+        The key is the attribute of rows with that length; None: any length.
+        """
         sized = (
             ("size", {**self.reads, **self.writes}),
             ("other_size", self.other),
@@ -464,8 +489,7 @@ class StencilKernel:
                 value = given[name]
                 found = 0 if value is None else value.size
                 if not found and name in self.optional and getattr(value, "slot", None) is None:
-                    # a slice of nothing has an address; of a list that grows it is read when it
-                    # runs
+                    # An empty slice has an address. A list that grows is read when the launch runs.
                     given[name] = None
                 if found != expected is not None and (found or name not in self.optional):
                     raise ValueError(f"{self.label}: {name} has {found} elements, not {expected}")
@@ -488,7 +512,7 @@ class StencilKernel:
                 f"{self.label}: fields have the shapes {', '.join(map(str, sorted(shapes)))}"
             )
         for shape in shapes:
-            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
+            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # a list has one dimension
             if not self.listed and (rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i):
                 raise ValueError(
                     f"{self.label}: fields have the shape {shape}, the box ends at {rows.ends}"
@@ -496,14 +520,20 @@ class StencilKernel:
 
 
 def _getter(names: list[str]) -> Any:
-    """Return a function from a struct to its members of these names; None if there are none."""
+    """Return a function from a struct to its members of these names.
+
+    Returns None if there are no names.
+    """
     if len(names) == 1:
         return lambda s, name=names[0]: (getattr(s, name),)
     return attrgetter(*names) if names else None
 
 
 def in_blocks(fields: list[Any]) -> bool:
-    """Return whether the memory of all fields begins with a block of 16 bytes, and stays where it is."""
+    """Return whether all fields begin with an aligned block of 16 bytes.
+
+    Their memory must not be replaced later.
+    """
     arrays = [value for value in fields if isinstance(value, wp.array) and value.size]
     return all(
         value.ptr % BLOCK_BYTES == 0 and getattr(value, "slot", None) is None for value in arrays
@@ -511,14 +541,14 @@ def in_blocks(fields: list[Any]) -> bool:
 
 
 class BoundKernel(NamedTuple):
-    """A pass with its arguments.
+    """A stencil kernel with its arguments.
 
     Attributes:
-        form: the pass.
-        rows: which it visits.
+        form: the variant.
+        rows: that it visits.
         arguments: struct of its arguments, as bytes.
         given: arrays and numbers by name.
-        kept: what else has memory in it: the stencil, the operands of bounds.
+        kept: other owners of memory in it: the stencil, the operands of bounds.
     """
 
     form: KernelVariant
@@ -529,12 +559,12 @@ class BoundKernel(NamedTuple):
 
     @property
     def fields(self) -> Any:
-        """The struct of arguments for Warp, which keeps their memory."""
+        """The struct of arguments for Warp, which holds references to their memory."""
         return self.form.struct_of(self)
 
     @property
     def layout(self) -> Any:
-        """Where the rows are, for a pass that sums or one that does not."""
+        """Layout of the rows, for a kernel that sums or one that does not."""
         return (
             self.rows.summed
             if self.form.declared.found
@@ -544,7 +574,7 @@ class BoundKernel(NamedTuple):
         )
 
     def launch(self, launch: Launch | None = None) -> None:
-        """Launch the pass, or record it."""
+        """Launch the kernel, or record it."""
         if self.rows.device.is_cuda and (program := device_program(launch)) is not None:
             program.record_pass(self)
         elif self.rows.device.is_cuda or team() is None:
@@ -558,7 +588,10 @@ class BoundKernel(NamedTuple):
             perform(made, launch)
 
     def operation(self) -> Operation | None:
-        """Return the pass for the team, cut into ranges of tasks; None where it has no task, or is not for the team."""
+        """Return the kernel for the thread pool, cut into ranges of tasks.
+
+        Returns None where it has no task, or does not suit the pool.
+        """
         recorded = self.rows.memory is not None and is_recording()
         if (
             self.rows.device.is_cuda
@@ -573,7 +606,10 @@ class BoundKernel(NamedTuple):
         return ranges(self.stage(), cost, ordered=self.form.declared.ordered, sized=sized)
 
     def patches(self) -> list[Patch]:
-        """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
+        """Return the patches of a recorded launch, which it reads from memory.
+
+        They are rows, numbers, and replaceable arrays.
+        """
         d, native, patches = self.form.declared, self.form.native, []
         if self.rows.memory is not None:
             patches += self.rows.memory.patches(LAYOUT_BYTES + native.k0.offset if d.box else None)
@@ -589,7 +625,10 @@ class BoundKernel(NamedTuple):
         return patches
 
     def stage(self, lag: int = 0, **members: int) -> OperationKind:
-        """Return the pass for the team, as a stage of a wave whose layout has these members."""
+        """Return the kernel as a stage of a fused kernel, for the thread pool.
+
+        Its layout has these members.
+        """
         L = put(copy_of(self.layout), members) if members else self.layout
         patches = self.patches() if is_recording() else ()
         return OperationKind(

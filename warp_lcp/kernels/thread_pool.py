@@ -1,9 +1,9 @@
 # mypy: ignore-errors
-"""A team of threads that runs tables of CPU launches in native code: all cores of a machine in one process, with the bits of one.
+"""A thread pool that executes tables of CPU launches in native code.
 
-A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes
-the next: `headers/team.h` says how. What is computed depends neither on who does it nor on how it
-is cut.
+One process uses all cores of a machine, with the bits of one thread. A kernel is cut into ranges of
+tasks, a fused kernel into slabs of planes, and an idle thread takes the next one, see
+`headers/team.h`. The results depend neither on the thread nor on the cuts.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.native import shared
 
 VARIABLE = "WARP_LCP_THREADS"
-# where launchers of ranks tell how many are on this machine
+# Environment variables in which MPI launchers give the number of ranks on this machine.
 RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")
 MOST_THREADS = 1024
-# nanoseconds in native code after which the interpreter is asked whether there is a signal
+# Nanoseconds in native code after which the interpreter is asked for signals.
 PATIENCE = 50_000_000
-# of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+# Least cells of a usual kernel in a piece: a microsecond or more; to take a piece costs 0.1.
 CELLS = 4096
-PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
-# of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
+# Pieces of a thread's share of a kernel: more of them shorten the wait for the last thread.
+PIECES = 12
+# Spins of an idle thread before it yields its core, 25 ns each: with a core of its own, without.
 SPINS = 10000, 2000
-COPIED = 1 << 18  # bytes that a thread copies at least
-ROOM = 4096  # bytes of the arguments of what can be cut
-RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
+COPIED = 1 << 18  # least bytes that a thread copies
+ROOM = 4096  # most bytes of the arguments of a kernel that is cut
+RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like the constants below
 ALONE, TASKS, SLABS, COPY = range(4)
 DONE_ALONE, SHARED, RESUMED = 0, 1, 2
 TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
@@ -53,9 +54,9 @@ TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = (
     8,
 )
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
-WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
-MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are kept
-# of `struct`
+WITHIN, BETWEEN = 1, 2  # state of an unfinished table: within a run, between two
+MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are cached
+# Formats of `struct`.
 FORMATS = {
     wp.float32: "f",
     wp.float64: "d",
@@ -66,7 +67,8 @@ FORMATS = {
     wp.bool: "?",
     bool: "?",
 }
-MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
+# Words of the objects that these functions initialize.
+MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}
 LOCKS = (
     "pthread_mutex_lock",
     "pthread_mutex_unlock",
@@ -80,16 +82,16 @@ SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
 def work_through(
     team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share: int, limit_: wp.int64
 ):
-    """Do what `mode` asks of thread `me`."""
+    """Perform the action `mode` of thread `me`."""
 
 
 @forward_kernel(module="warp_lcp.team")
 def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: int, limit: wp.int64):
-    """Do what `mode` asks of thread `me`; one thread."""
+    """Perform the action `mode` of thread `me`; one thread."""
     work_through(team, table, mode, me, share, limit)
 
 
-# a part of a kernel's arguments that is read from memory: offset in them, address, bytes
+# A part of a kernel's arguments that is read from memory: offset in them, address, bytes.
 Patch = tuple[int, int, int]
 
 
@@ -107,7 +109,7 @@ class Arguments(ctypes.Structure):
 
 
 class TableEntry:
-    """A kernel on the CPU: what C calls, and the bounds of a launch.
+    """A CPU kernel: the function for C, and the bounds of a launch.
 
     Args:
         launch: a recorded launch of it.
@@ -115,7 +117,7 @@ class TableEntry:
 
     def __init__(self, launch: Any) -> None:
         self.kernel, self.function = launch.kernel, launch.hooks.forward
-        # the module stays loaded; the launch would keep arrays
+        # The module stays loaded. The launch itself is not stored, as it would hold arrays.
         self._kept = launch.module_exec, launch.bounds
         self.call = ctypes.cast(self.function, ctypes.c_void_p).value
         self.bounds = ctypes.addressof(launch.bounds)
@@ -127,10 +129,10 @@ class OperationKind:
     Args:
         entry: the kernel.
         arguments: their bytes, which begin with the range of tasks if it can be cut.
-        kept: what must live as long.
+        kept: objects that must live as long.
         plane_tasks: tasks of a plane.
-        planes: how many there are.
-        lag: planes that it is behind the first stage of a wave.
+        planes: number of planes.
+        lag: planes that it is behind the first stage of a fused kernel.
         finer: planes of the finer level that one of its planes stands for.
         finer_planes: their number.
         patches: parts of the arguments that are read from memory in each run: offset, address,
@@ -178,7 +180,11 @@ class OperationKind:
         )
 
     def content(self) -> tuple[Any, ...]:
-        """Return what it does: the kernel, its arguments but for what is patched, and the patches; of a copy, its words."""
+        """Return the content of the operation, to compare recordings.
+
+        It is the kernel, its arguments without the patched ones, and the patches; of a copy, its
+        words.
+        """
         if not isinstance(self.kept, tuple) or not isinstance(self.kept[0], TableEntry):
             return self.words
         memory = bytearray(self.kept[1])
@@ -188,20 +194,20 @@ class OperationKind:
 
 
 class Operation:
-    """Stages that are done together: a launch, or a wave of them.
+    """Stages that are executed together: a launch, or a fused kernel.
 
     Attributes:
-        check: raises what has failed in it, once the table is done; None: nothing can.
+        check: raises the error of the operation, once the table is done; None: it cannot fail.
         condition: address of an int32 number; the operation is skipped where it is 0. 0: it is
             never skipped.
 
     Args:
-        kind: ALONE for a launch as it is; TASKS, SLABS for what is cut; COPY for memory.
-        stages: what is launched.
-        chunks: into how many pieces it is cut.
+        kind: ALONE for a launch as it is; TASKS, SLABS for one that is cut; COPY for memory.
+        stages: the launches.
+        chunks: number of pieces into which it is cut.
         each: tasks, or planes, of a piece.
         everything: tasks, or planes, in all.
-        margin: planes that the last stage of a wave is behind the first.
+        margin: planes that the last stage of a fused kernel is behind the first.
         sized: address of the number of tasks, which may differ from run to run; 0: it is
             `everything`.
     """
@@ -236,7 +242,7 @@ class Operation:
         )
 
     def content(self) -> tuple[Any, ...]:
-        """Return what it does, but for what it reads from memory in each run."""
+        """Return the operation's content, without values read from memory in each run."""
         return (
             self.words[0],
             self.sized,
@@ -263,8 +269,8 @@ def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: in
     """Return a stage cut into ranges of its tasks.
 
     Args:
-        stage: what is launched.
-        cells: what a task costs, in cells of a usual pass.
+        stage: the launch.
+        cells: cost of a task, in cells of a usual kernel.
         ordered: whether tasks write what others read or write: then it is not cut.
         sized: address of the number of tasks in each run; 0: it is the stage's.
     """
@@ -280,7 +286,7 @@ def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: in
         )
     if threads > 1:
         count = max(min(PIECES * threads, stage.tasks * cells // CELLS), 1)
-        # as many for each thread: 5 equal pieces take two threads as long as 6
+        # Every thread gets as many pieces: 5 equal pieces take two threads as long as 6.
         count -= count % threads if count > threads else 0
         each = -(-stage.tasks // count)
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
@@ -293,7 +299,7 @@ def copied(to: int, source: int, size: int, kept: Any) -> Operation:
         to: address.
         source: address; 0: zeros.
         size: bytes.
-        kept: what must live as long.
+        kept: objects that must live as long.
     """
     stage = object.__new__(OperationKind)
     stage.kept, stage.tasks, stage.planes, stage.patches = kept, 1, 1, ()
@@ -303,10 +309,10 @@ def copied(to: int, source: int, size: int, kept: Any) -> Operation:
 
 
 class OperationTable:
-    """Operations one after another, as C works through them.
+    """Operations one after another, as a table for C.
 
     Attributes:
-        checks: raise what has failed, after all of it.
+        checks: raise the errors of the operations, after all of the table.
 
     Args:
         operations: in order.
@@ -318,7 +324,7 @@ class OperationTable:
         self._kept = tuple(operations)
         self.checks = {operation.check for operation in self._kept} - {None}
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
-        # what is left, and the cuts
+        # The remaining pieces, and the cuts.
         sizes = [
             LANE_WORDS * n + operation.chunks
             for n, operation in zip(lanes, self._kept, strict=True)
@@ -332,7 +338,7 @@ class OperationTable:
             places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
             made += [total, *operation.words, count, *places, operation.sized, operation.condition]
             at += size
-        # of the same length, so it stays where it is
+        # A slice of the same length, so the array stays at its address.
         self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = (
             len(self._kept),
@@ -341,11 +347,11 @@ class OperationTable:
         )
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
-        self.asked: Arguments | None = None  # of the last team of one thread
+        self.asked: Arguments | None = None  # arguments of the last pool of one thread
 
 
 class ThreadPool:
-    """Threads that help the caller; the bits are those of one.
+    """Worker threads that help the caller; the bits are those of one thread.
 
     Args:
         size: threads, the caller among them.
@@ -364,7 +370,7 @@ class ThreadPool:
         self.words[IDLE_SPINS] = SPINS[size > available_threads()]
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
-        self.shared_time = 0.0  # seconds that callers have spent in what the team shared
+        self.shared_time = 0.0  # seconds of calls that the worker threads took part in
         self._workers = [
             threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)
         ]
@@ -372,7 +378,10 @@ class ThreadPool:
             worker.start()
 
     def run(self, table: OperationTable) -> None:
-        """Work through a table: with the others if nobody else uses them."""
+        """Execute a table.
+
+        The workers take part if no other thread uses them.
+        """
         if self.size == 1 and table.again is None:
             self._run_alone(table)
             return
@@ -385,10 +394,10 @@ class ThreadPool:
         asked = Arguments(self.address, table.address, RUN, 0, share, patience(table))
         try:
             self._do(asked)
-            while unfinished := table.words[UNFINISHED]:  # the interpreter has looked after signals
+            while unfinished := table.words[UNFINISHED]:  # the interpreter has handled signals
                 if table.again is not None:
                     check_time()
-                    for check in table.checks:  # what has failed may keep the loop from ending
+                    for check in table.checks:  # a failure may keep the loop from ending
                         check()
                 asked.share = share + (RESUMED if unfinished == WITHIN else 0)
                 asked.limit = patience(table)
@@ -405,15 +414,15 @@ class ThreadPool:
             check()
 
     def _run_alone(self, table: OperationTable) -> None:
-        """Work through a table with the caller's thread."""
+        """Execute a table on the caller's thread."""
         asked = table.asked
-        if asked is None or asked.team != self.address:  # of another team, which is gone
+        if asked is None or asked.team != self.address:  # of another pool, which was freed
             asked = table.asked = Arguments(
                 self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE
             )
         try:
             self._do(asked)
-            while table.words[UNFINISHED]:  # the interpreter has looked after signals
+            while table.words[UNFINISHED]:  # the interpreter has handled signals
                 self._do(Arguments(self.address, table.address, RUN, 0, RESUMED, PATIENCE))
         except BaseException:
             self._do(Arguments(self.address, table.address, CANCEL))
@@ -422,14 +431,20 @@ class ThreadPool:
             check()
 
     def stop(self) -> None:
-        """Send the others home; what is called later is done by the caller."""
+        """Stop the worker threads.
+
+        Later calls run on the caller's thread.
+        """
         self._do(Arguments(self.address, 0, QUIT))
         for worker in self._workers:
             worker.join()
         self.size = 1
 
     def _retire(self, words: Any) -> None:
-        """Keep the words before as long as a thread that came late may read them: what they tell of is done, and may go."""
+        """Keep the former words while a late thread may still read them.
+
+        The operations that they describe are done and may be freed.
+        """
         seen = {self.words[THREADS + 8 * me] for me in range(1, self.size)}
         self._retired = [old for old in self._retired if old.buffer_info()[0] in seen]
         if self._posted is not None:
@@ -444,12 +459,15 @@ class ThreadPool:
 
 
 def patience(table: OperationTable) -> int:
-    """Return after how many nanoseconds the interpreter looks after signals, and after the deadline of a loop."""
+    """Return the time between returns to the interpreter [ns].
+
+    The interpreter then handles signals, and the deadline of a loop.
+    """
     return PATIENCE if table.again is None else int(min(PATIENCE, 1e9 * seconds_left()))
 
 
 def arguments_of(launch: Any) -> Any:
-    """Return the memory of a recorded launch's arguments, as C has them."""
+    """Return the memory of a recorded launch's arguments, in C's layout."""
     params = launch.params[1:]
     return _arguments(*map(type, params))(*params)
 
@@ -467,7 +485,9 @@ ALIGNED = {1: "B", 2: "H", 4: "I", 8: "Q"}  # formats of `struct` by their align
 
 
 class Signature:
-    """Types of a Warp kernel's arguments: packs them as C has them, in a tenth of the time that Warp takes to record a launch.
+    """Types of a Warp kernel's arguments, to pack them as C structs.
+
+    Packing takes a tenth of the time that Warp takes to record a launch.
 
     Attributes:
         entries: by launch dimensions: the kernel as C calls it, and the struct of its arguments.
@@ -485,13 +505,16 @@ class Signature:
         self._structs = {kind: type(kind()) for kind in structs} if self._packing else {}
 
     def check(self, inputs: Sequence[Any], memory: Any) -> None:
-        """Leave all to Warp from now on if it has packed arguments in another way."""
+        """Leave all packing to Warp from now on if Warp packs arguments differently."""
         mine = self.pack(inputs)
         if mine is not None and mine[: ctypes.sizeof(memory)] != bytes(memory):
             self._packing = None
 
     def pack(self, inputs: Sequence[Any]) -> bytes | None:
-        """Return arguments as C has them; None where Warp should convert or refuse one."""
+        """Return arguments packed as in C.
+
+        Returns None where Warp should convert or reject one.
+        """
         if self._packing is None:
             return None
         values = []
@@ -522,14 +545,17 @@ class Signature:
 
 
 def _format(kind: Any) -> str:
-    """Return how `struct` packs an argument of a type, aligned as in C; "" for one that it does not."""
+    """Return the `struct` format of an argument type, aligned as in C.
+
+    It is "" for a type that cannot be packed.
+    """
     if kind in FORMATS:
         return FORMATS[kind]
     if isinstance(kind, wp.array):
         return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
     if isinstance(getattr(kind, "ctype", None), type):  # a struct
         return f"0{ALIGNED[ctypes.alignment(kind.ctype)]}{ctypes.sizeof(kind.ctype)}s"
-    # a vector's or a matrix's numbers
+    # Elements of a vector or a matrix.
     of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None
     of = getattr(of, "_type_", "")
     return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
@@ -542,7 +568,7 @@ def signature_of(kernel: Any) -> Signature:
 
 
 def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, bytes, Any]:
-    """Return a Warp kernel on the CPU as C calls it, its arguments, and the struct of them."""
+    """Return the table entry of a CPU kernel, its arguments, and their struct."""
     signature = signature_of(kernel)
     if (known := signature.entries.get(dim)) is not None and (
         arguments := signature.pack(inputs)
@@ -558,7 +584,10 @@ def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, 
 
 
 def launched_alone(launch: Any, kept: Any = None) -> Operation:
-    """Return a recorded launch as an operation that is not cut; `kept` must live as long."""
+    """Return a recorded launch as an operation that is not cut.
+
+    `kept` must live as long.
+    """
     return Operation(
         ALONE, [OperationKind(TableEntry(launch), bytes(arguments_of(launch)), (launch, kept))]
     )
@@ -566,7 +595,10 @@ def launched_alone(launch: Any, kept: Any = None) -> Operation:
 
 @functools.cache
 def _system() -> list[int]:
-    """Return the addresses of what the team needs of the system, and the number of its clock; [] where there is no such thing."""
+    """Return the addresses of system functions, and the number of the clock.
+
+    Returns [] where the system does not have them.
+    """
     try:
         library = ctypes.CDLL(None)
         addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM]
@@ -577,14 +609,17 @@ def _system() -> list[int]:
 
 @forward_kernel(module="warp_lcp.team")
 def trial_kernel(a: wp.array(dtype=wp.float32), first: int, value: float):
-    """a[first + i] = value + i."""
+    """Set a[first + i] = value + i."""
     i = wp.tid()
     a[first + i] = value + float(i)
 
 
 @functools.cache
 def _entry() -> TableEntry | None:
-    """Return the executor, tried on a launch whose result is known; None, with a notice, where this Warp's launches are not as expected."""
+    """Return the executor, after a test launch with a known result.
+
+    Returns None, with a notice, if this Warp's launches do not work as expected.
+    """
     try:
         made = TableEntry(
             wp.launch(team_kernel, 1, [0, 0, 0, 0, 0, 0], device="cpu", record_cmd=True)
@@ -605,7 +640,7 @@ def _entry() -> TableEntry | None:
 
 
 def available_threads() -> int:
-    """Return the cores that this process may use, shared among the ranks on this machine."""
+    """Return the cores that this process may use, shared among ranks of a machine."""
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -633,7 +668,7 @@ def _checked(value: Any, name: str) -> int:
 
 
 class State:
-    """How many threads there are to be, and the team once it is needed."""
+    """Number of threads to use, and the pool once it is needed."""
 
     def __init__(self) -> None:
         self.threads: int | None = None
@@ -647,7 +682,7 @@ STATE = State()
 def get_threads() -> int:
     """Return the number of threads on the CPU.
 
-    The number of `set_threads`, else WARP_LCP_THREADS, else the number of cores.
+    It is the number of `set_threads`, else WARP_LCP_THREADS, else the number of cores.
 
     Raises:
         ValueError: WARP_LCP_THREADS is no such number.
@@ -663,7 +698,7 @@ def set_threads(count: int | None) -> None:
     Results have the same bits for any number.
 
     Args:
-        count: from 1 to 1024; None: as many as at the start.
+        count: from 1 to 1024; None: the number at the start.
 
     Raises:
         ValueError: it is no such number.
@@ -677,7 +712,10 @@ def set_threads(count: int | None) -> None:
 
 
 def team() -> ThreadPool | None:
-    """Return the team, made at its first use; None where launches must go through Warp."""
+    """Return the thread pool, created at its first use.
+
+    Returns None where launches must go through Warp.
+    """
     if STATE.team is None:
         entry = _entry()
         if entry is None:
@@ -689,17 +727,17 @@ def team() -> ThreadPool | None:
 
 
 def shared_seconds() -> float:
-    """Return how long callers have worked together with the rest of the team, since it was made."""
+    """Return the time that callers have worked together with the pool's threads."""
     return 0.0 if STATE.team is None else STATE.team.shared_time
 
 
 def _forget() -> None:
-    """Have no team in a forked child: its threads are the parent's."""
+    """Drop the pool in a forked child: its threads belong to the parent."""
     STATE.team, STATE.lock = None, threading.Lock()
 
 
 def _leave() -> None:
-    """Send the threads home before the interpreter goes."""
+    """Stop the worker threads before the interpreter ends."""
     if STATE.team is not None:
         STATE.team.stop()
 

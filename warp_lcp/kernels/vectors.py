@@ -1,7 +1,7 @@
-"""Flat fields: conversions, inner products, deterministic sums. The only vector primitives that the solvers use.
+"""Flat fields: conversions, inner products, deterministic sums.
 
-Every operator stores its fields as flat arrays (see `warp_lcp.kernels.fields`), so that these serve
-all of them.
+They are the only vector primitives that the solvers use. Every operator stores its fields as flat
+arrays (see `warp_lcp.kernels.fields`), so that these serve all of them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 CUDA_BLOCK = 256  # threads that add up partial sums
-CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
+CUDA_SEGMENTS = 256  # blocks of the first stage of a sum of very many numbers
 KERNELS = KernelFile(Path(__file__).parent / "headers/vectors.h")
 DOT = KERNELS["vectors.dot"]
 ADD = KERNELS["vectors.add"]
@@ -41,7 +41,7 @@ CONVERT = KERNELS["vectors.convert"]
 def add_up_span(
     partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int
 ) -> wp.float64:
-    """The sum of every stride-th of the partial sums from `offset` + `start` on."""
+    """Sum every stride-th partial sum, from `offset` + `start` on."""
 
 
 @no_type_check
@@ -55,11 +55,11 @@ def add_up_kernel(
     out: wp.array(dtype=wp.float64),
     slot: int,
 ):
-    """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
+    """Sum every `segments`-th block of a column of n partial sums.
 
-    Columns are counted from the one after `before` others.
-
-    The order of the additions does not change from run to run.
+    out[slot + column * segments + segment] is the sum of blocks segment, segment + segments, ... of
+    the column, computed by one block of threads. Columns are counted from the one after `before`
+    others. The order of the additions does not change from run to run.
     """
     t = wp.tid()
     block = t // threads
@@ -88,7 +88,7 @@ def largest_kernel(
     out: wp.array(dtype=wp.float64),
     slot: int,
 ):
-    """The same for the largest of them."""
+    """Return the largest partial result, like the function for sums."""
     t = wp.tid()
     block = t // threads
     column = block // segments
@@ -102,26 +102,35 @@ def largest_kernel(
 
 
 class Communicator(Protocol):
-    """Who else has a part of the unknowns: the ranks of a distributed problem. All methods are collective, with one answer for all."""
+    """Communicator of a distributed problem: the ranks that share the unknowns.
+
+    All methods are collective and return the same on all ranks.
+    """
 
     def sum(self, values: Any) -> Any:
         """Return sums over all parts, entry by entry."""
 
     def adding(self, sums: np.ndarray) -> Operation:
-        """Return what replaces float64 sums by those over all parts, in place, as an operation of the team."""
+        """Return an operation that replaces float64 sums by those over all ranks.
+
+        It works in place and runs in the thread pool.
+        """
 
     def max(self, values: Any) -> Any:
         """Return the largest over all parts, entry by entry."""
 
     def any(self, condition: bool) -> bool:
-        """Return whether it holds in some part."""
+        """Return whether a condition holds in some part."""
 
     def join(self, key: bytes) -> bytes:
-        """Return a key that stands for the keys of all parts."""
+        """Return a common key made of the keys of all parts."""
 
 
 def segments_of(n: int) -> int:
-    """Return how many blocks of a GPU add up a column first: one would take long over very many partial sums."""
+    """Return how many GPU blocks add up a column first.
+
+    One block would take long for very many partial sums.
+    """
     return CUDA_SEGMENTS if n > CUDA_SEGMENTS * CUDA_BLOCK else 1
 
 
@@ -137,10 +146,12 @@ def fold(
     most: int | None = None,
     before: int = 0,
 ) -> None:
-    """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
+    """Reduce columns of n partial results on CUDA, by a sum or a maximum.
+
+    The results of the columns go to out[slot], out[slot + 1], ...
 
     Args:
-        kernel: one of the two.
+        kernel: `add_up_kernel` or `largest_kernel`.
         partials: of one column after another.
         n: of each.
         columns: how many.
@@ -148,8 +159,8 @@ def fold(
         slot: of the first.
         between: memory of columns * segments_of(n) numbers, where these are more than the columns.
         launch: of a program.
-        most: of n, where that is a `Scalar`.
-        before: columns before the first that is taken.
+        most: upper bound of n, where n is a `Scalar`.
+        before: columns before the first that is reduced.
     """
     device, segments = partials.device, segments_of(n if most is None else most)
     launch = launch_recorded if is_recording() and not hasattr(launch, "__self__") else launch
@@ -173,15 +184,15 @@ def fold(
 
 
 class Reduction:
-    """Sums over flat fields of n elements; the same bits on every run.
+    """Sums over flat fields of n elements; the same bits in every run.
 
     Args:
         n: elements of a field.
-        device: where they live.
+        device: of the fields.
         scalars: device array that receives the sums, shape (slots,), float64.
-        columns: the most sums that one pass makes.
-        threads: threads of that pass; those of a flat kernel unless given.
-        across: who has the other parts of the fields; None: nobody.
+        columns: the most sums that one kernel makes.
+        threads: threads of that kernel; default: those of a flat kernel.
+        across: communicator of the other parts of the fields; None if serial.
     """
 
     def __init__(
@@ -202,9 +213,9 @@ class Reduction:
         )
 
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = launch_now) -> None:
-        """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
+        """Sum the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         device = self.partials.device
-        if device.is_cpu:  # Warp's tiles are not for several threads at a time
+        if device.is_cpu:  # Warp's tiles do not support several CPU threads
             rows = Rows.flat(columns, device)
             ADD_UP.bind(
                 rows, partials=self.partials, count=self.threads, scalars=self.scalars, slot=slot
@@ -232,19 +243,19 @@ class Reduction:
         rows: Rows | None = None,
         launch: Launch = launch_now,
     ) -> None:
-        """Write the inner product a.b, over some rows if told, to scalars[slot]."""
+        """Write the inner product a.b to scalars[slot], over some rows if passed."""
         DOT.bind(rows or rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
 
 
 class Sums(Reduction):
-    """Sums that passes over the same rows make, read back by the host.
+    """Sums of kernels over the same rows, read back by the host.
 
     Args:
-        rows: of the passes.
+        rows: of the kernels.
         columns: the most sums that one of them makes.
         slots: of `scalars`, if more than that.
-        across: who has the other parts of the fields; None: nobody.
+        across: communicator of the other parts of the fields; None if serial.
     """
 
     def __init__(
@@ -263,7 +274,10 @@ class Sums(Reduction):
     def of(
         self, declared: StencilKernel, *structs: DataclassInstance, slot: int = 0, **given: Any
     ) -> np.ndarray:
-        """Launch a pass, bound as by `StencilKernel.bind`; return its sums, which are in `scalars` from a slot on."""
+        """Launch a kernel, bound as by `StencilKernel.bind`; return its sums.
+
+        They are in `scalars` from a slot on.
+        """
         with as_one_table(self.rows.device, self._across):
             self._launch(declared, structs, given, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
@@ -276,7 +290,7 @@ class Sums(Reduction):
         launch: Launch = launch_now,
         **given: Any,
     ) -> None:
-        """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
+        """Launch a kernel, or record it; `reading` then has its sums from a slot on."""
         self._launch(declared, structs, given, slot, launch)
 
     def _launch(
@@ -295,12 +309,14 @@ class Sums(Reduction):
 
 
 class Tally:
-    """What a pass finds in the rows that it is given each time: sums, and the largest of something; the same bits on every run.
+    """Sums and a maximum of a kernel over rows that change.
+
+    They have the same bits in every run.
 
     Args:
-        declared: the pass.
-        device: where.
-        places: of the most rows that it is given, else memory is made when they come.
+        declared: the kernel.
+        device: of the fields.
+        places: of the most rows that are visited; more memory is allocated if larger rows come.
     """
 
     def __init__(self, declared: StencilKernel, device: wp.Device, places: int = 0) -> None:
@@ -314,7 +330,7 @@ class Tally:
 
     @property
     def found(self) -> wp.array[Any] | None:
-        """What is found, a number a column, where it is on a GPU; None on the CPU."""
+        """The results on a GPU, a number a column; None on the CPU."""
         return None if self._reading is None else self._reading.array
 
     def take(
@@ -325,7 +341,10 @@ class Tally:
         bounds: list[Any] | None = None,
         **given: Any,
     ) -> None:
-        """Launch the pass, bound as by `StencilKernel.bind`, over rows; what it finds replaces what was found."""
+        """Launch the kernel over rows, bound as by `StencilKernel.bind`.
+
+        Its results replace the former ones.
+        """
         self.launch(rows, structs, given, stencil, bounds)
 
     def launch(
@@ -336,7 +355,7 @@ class Tally:
         stencil: Any = None,
         bounds: list[Any] | None = None,
     ) -> None:
-        """Do what `take` does, with arguments as of `StencilKernel.bind_arguments`."""
+        """Launch as `take` does, with arguments as of `StencilKernel.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if is_recording() and device.is_cuda:
             self._record(rows, structs, given, stencil, bounds)
@@ -381,7 +400,7 @@ class Tally:
         stencil: Any,
         bounds: Any,
     ) -> None:
-        """Record the pass on CUDA, for as many places as the rows have in a run."""
+        """Record the kernel on CUDA, for as many places as the rows have in a run."""
         assert self._reading is not None
         memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
         most = self._places if memory is None else math.prod(memory.room)
@@ -405,16 +424,16 @@ class Tally:
                 )
 
     def changed(self) -> None:
-        """Say that a recorded `take` has run."""
+        """Note that a recorded `take` has run."""
         if self._reading is not None:
             self._reading.changed()
 
     def read(self, arrange: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
-        """Return what was found, a number a column.
+        """Return the results, a number a column.
 
         Args:
-            arrange: gives what threads have found, shape (columns, threads), the shape in which the
-                host adds it up, columns first.
+            arrange: reshapes the threads' results, shape (columns, threads), to the order in which
+                the host adds them up, columns first.
         """
         if self._reading is not None:
             return self._reading.numpy()
@@ -436,12 +455,12 @@ def add_across(
     launch: Launch = launch_now,
     condition: wp.array[wp.int32] | None = None,
 ) -> None:
-    """Add what the others have summed, now or among the launches of a program.
+    """Add the sums of the other processes, now or among the launches of a program.
 
     Args:
-        across: the others.
+        across: communicator.
         scalars: sums of this process, which are replaced.
-        slots: of them, those that are added up.
+        slots: those that are added up.
         launch: of a program.
         condition: number, shape (1,), the same in all processes; where it is 0 nothing is done.
             None: always.
@@ -473,12 +492,15 @@ def _add_across(
 
 
 def rows_of(field: wp.array[Any]) -> Rows:
-    """Return the rows of passes over flat fields like this one."""
+    """Return the rows of kernels over flat fields like this one."""
     return Rows.flat(field.size, field.device)
 
 
 def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = launch_now) -> None:
-    """b = a, between float types; types that differ may be recorded by `launch`."""
+    """Convert b = a between float types.
+
+    Between different types it may be recorded by `launch`.
+    """
     if a.dtype is b.dtype:
         copy(b, a)
     else:

@@ -1,4 +1,7 @@
-"""Projected multigrid cycles on the aggregates of a sparse matrix: a cold start that finds most of the active set at once."""
+"""Monotone multigrid on aggregates of a sparse matrix, with projected cycles.
+
+It is a cold start that finds most of the active set at once.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,16 @@ def restrict_kernel(
     high: f64,
     e: f64,
 ):
-    """Sum y over an aggregate; bound its correction by the narrowest of the members' gaps over `factor`, and begin it at 0."""
+    """Restrict the residual and the bounds to an aggregate j.
+
+    With the members i of the aggregate and the over-correction `factor`:
+
+        b_j = sum of y_i
+        low_j = max of (lower_i - x_i) / factor,   high_j = min of (upper_i - x_i) / factor
+        e_j = 0
+
+    Rounding must not move low_j above 0 or high_j below it.
+    """
     j = wp.tid()
     total, least, most = wp.float64(0.0), wp.float64(-wp.inf), wp.float64(wp.inf)
     for k in range(first[j], first[j + 1]):
@@ -54,7 +66,10 @@ def restrict_kernel(
 @no_type_check
 @forward_kernel(module="warp_lcp.aggregates")
 def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f64, x: f64):
-    """Add `factor` times its aggregate's correction to each unknown, projected; unknowns of none stay."""
+    """Correct each unknown: x_i <- clip(x_i + factor e_j, lower_i, upper_i).
+
+    j is the aggregate of i. Unknowns of no aggregate keep their values.
+    """
     i = wp.tid()
     j = owner[i]
     if j >= 0:
@@ -75,7 +90,14 @@ def settle_kernel(
     enough: wp.float64,
     x: f64,
 ):
-    """Sweep a small level forth and back by one thread, until the largest change is small beside the first one."""
+    """Solve a small problem with bounds by projected Gauss-Seidel, with one thread.
+
+    Sweeps go forward and backward over the unknowns:
+
+        x_i <- clip(x_i - (A x + b)_i / a_ii, lower_i, upper_i)
+
+    They stop when the largest change of a pair is at most `enough` times that of the first pair.
+    """
     n = x.shape[0]
     first, change = wp.float64(0.0), wp.float64(1.0)
     for sweep in range(sweeps):
@@ -95,28 +117,29 @@ def settle_kernel(
                 first = change
 
 
-# of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2
-# cells, Newton's steps after 4 cycles
-# over-correction of plain aggregates' corrections, which are too small where x is smooth
+# Over-correction of plain aggregates' corrections, which are too small where x is smooth. It is the
+# best of 1, 1.4 and 1.8 with 2 and 3 coarse cycles, for obstacles under diffusion and convection on
+# 257^2 cells, by Newton's steps after 4 cycles.
 ALPHA = wp.float64(1.4)
-GAMMA = 3  # coarse cycles a level: aggregates of 5 to 9 unknowns leave room for them
-# unknowns of the coarsest level, and the largest share of unknowns that a level may keep
+GAMMA = 3  # coarse cycles a level: they are cheap, as aggregates have 5 to 9 unknowns
+# Unknowns of the coarsest level, and the largest share of unknowns that a level may keep.
 COARSEST, STALL = 64, 0.7
-# the most pairs of sweeps of the coarsest level, and the part of the first change at which they end
+# The most pairs of sweeps of the coarsest level, and the part of the first change at which they
+# end.
 SWEEPS, ENOUGH = 20, 1e-2
 STRENGTH = 1e-3  # entries below this share of sqrt(a_ii a_jj) do not aggregate
-# share of rows that must be diagonally dominant for multigrid to serve an unsymmetric matrix
+# Share of rows that must be diagonally dominant for multigrid to suit an unsymmetric matrix.
 DOMINANT = 0.9
 POSITIVE = 0.1  # share of the off-diagonal entries' magnitude that may be positive there
 
 
 @dataclass(frozen=True)
 class Aggregation:
-    """Which unknowns make up a coarse one, on the device.
+    """Aggregates of unknowns, on the device.
 
     Attributes:
         owner: the aggregate of each unknown, shape (n,), wp.int32; -1 for none.
-        first: where each aggregate's members begin, shape (m + 1,), wp.int32.
+        first: index of each aggregate's first member, shape (m + 1,), wp.int32.
         members: the unknowns, by aggregates, wp.int32.
     """
 
@@ -126,7 +149,10 @@ class Aggregation:
 
     @classmethod
     def of(cls, aggregates: scipy.sparse.csr_array, device: wp.Device) -> Aggregation:
-        """Take a matrix with a 1 in row i and column j where unknown i is in aggregate j."""
+        """Set the aggregates from a 0-1 matrix.
+
+        Row i has a 1 in column j where unknown i is in aggregate j.
+        """
         owner = np.full(aggregates.shape[0], -1)
         owner[np.diff(aggregates.indptr) > 0] = aggregates.indices
         turned = aggregates.T.tocsr()
@@ -166,7 +192,10 @@ class AggregateLevel:
     def descend(
         self, coarse: AggregateLevel, *, projected: bool, from_zero: bool
     ) -> list[CycleStage]:
-        """Return steps 1 to 3 of a cycle: a projected Gauss-Seidel sweep; sums and bounds of aggregates, from x_c = 0."""
+        """Return steps 1 to 3 of a cycle.
+
+        A projected Gauss-Seidel sweep; sums and bounds of the aggregates; x_c = 0.
+        """
         assert self.aggregation is not None, "not the coarsest level"
         if "down" not in self._legs:
             parts, bounds = self.aggregation, [self.x, self.lower, self.upper]
@@ -190,11 +219,14 @@ class AggregateLevel:
         return self._legs["down"]
 
     def coarsen_bounds(self, coarse: AggregateLevel) -> tuple[()]:
-        """Return nothing: `descend` coarsens bounds in the kernel that restricts."""
+        """Return no stages: `descend` coarsens bounds in the kernel that restricts."""
         return ()
 
     def ascend(self, coarse: AggregateLevel, *, projected: bool) -> list[CycleStage]:
-        """Return steps 5 and 6: the sweep goes backward, so that the cycle is symmetric if A is."""
+        """Return steps 5 and 6 of a cycle.
+
+        The sweep goes backward, so that the cycle is symmetric if A is.
+        """
         assert self.aggregation is not None, "not the coarsest level"
         if "up" not in self._legs:
             inputs = [self.aggregation.owner, coarse.x, ALPHA, self.lower, self.upper, self.x]
@@ -205,7 +237,10 @@ class AggregateLevel:
         return self._legs["up"]
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
-        """Return the stages of a `CoarsestSolver`: projected Gauss-Seidel by one thread, until it converges."""
+        """Return the stages of a `CoarsestSolver`.
+
+        One thread makes projected Gauss-Seidel sweeps until they converge.
+        """
         A, last = self.A, wp.float64(ENOUGH)
         inputs = [
             A.indptr,
@@ -231,12 +266,13 @@ class AggregateLevel:
 
 
 class MonotoneAggregation:
-    """Projected W-cycles: sweeps within the bounds, and corrections of whole aggregates within their members' gaps (Kornhuber 1994).
+    """Projected W-cycles: sweeps, and corrections of aggregates (Kornhuber 1994).
 
-    A coarse unknown may move by what its most confined member may, so that no bound is overstepped
-    and nothing need be projected afterwards: an obstacle problem's energy falls in every cycle.
-    That frees or holds whole aggregates at once, where a Newton step moves the boundary of the
-    active set by about one row. Aggregates are those of A's symmetric part, coarse matrices P'A P.
+    Sweeps stay within the bounds, corrections within the narrowest gap of an aggregate's members.
+    So no bound is violated and nothing need be projected afterwards: the energy of an obstacle
+    problem falls in every cycle. That frees or holds whole aggregates at once, where a Newton step
+    moves the boundary of the active set by about one row. Aggregates are those of A's symmetric
+    part, coarse matrices P'A P.
 
     Args:
         A: the matrix, with a positive diagonal.
@@ -248,7 +284,10 @@ class MonotoneAggregation:
         self._fields: tuple[Any, ...] = ()
 
     def refresh(self) -> bool:
-        """Coarsen A as it is now, if it has changed since; return whether it is a matrix for this (`suits_multigrid`)."""
+        """Coarsen A if it has changed; return whether the method suits it.
+
+        See `suits_multigrid`.
+        """
         if self._version == self.A.version:
             return len(self._levels) > 1
         self._version, device = self.A.version, self.A.device
@@ -277,7 +316,10 @@ class MonotoneAggregation:
     def cycle(
         self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
     ) -> None:
-        """Move x (float64, within its bounds) by one cycle. It is recorded, and recorded anew where a field is another."""
+        """Apply one cycle to x (float64, within its bounds).
+
+        The cycle is recorded, and recorded again when a field is replaced.
+        """
         fields = tuple(field.ptr for field in (x, b, lower, upper))
         if self._program is None or self._fields != fields:
             finest = replace(self._levels[0], x=x, b=b, lower=lower, upper=upper)
@@ -290,7 +332,7 @@ class MonotoneAggregation:
 
 
 def _aggregates(host: scipy.sparse.csr_array) -> scipy.sparse.csr_array | None:
-    """Return which unknowns belong together, None where too few do."""
+    """Return the aggregation matrix; None where too few unknowns are aggregated."""
     found = aggregated(
         symmetric_strength_of_connection(symmetric_part(host), theta=STRENGTH), STALL
     )
@@ -305,13 +347,16 @@ def symmetric_part(host: scipy.sparse.csr_array) -> scipy.sparse.csr_matrix:
 
 
 def aggregated(strength: scipy.sparse.csr_matrix, stall: float) -> Any:
-    """Return which unknowns belong together, None where that leaves more than a share `stall` of them."""
+    """Return the aggregate of each unknown.
+
+    Returns None if more than a share `stall` of the unknowns remain.
+    """
     found, _ = standard_aggregation(strength)
     return None if found.nnz == 0 or found.shape[1] > stall * strength.shape[0] else found
 
 
 def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
-    """Return whether a matrix is near enough to a diagonally dominant M-matrix."""
+    """Return whether a matrix is close to a diagonally dominant M-matrix."""
     d = host.diagonal()
     if not (d > 0).all():
         return False
@@ -324,16 +369,16 @@ def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
 
 
 STRONG = 0.25  # entries from this share of a row's largest on are strong: PyAMG's own choice
-LEAST = 4  # fine unknowns a coarse one: two splits of a five-point stencil leave an eighth
+LEAST = 4  # fine unknowns for a coarse one: two splits of a five-point stencil leave an eighth
 SPLIT_KEEPS = 0.9  # the largest share of the unknowns that a split may keep
 
 
 def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
-    """Return P, P'A P and the points, for a scipy.sparse matrix A that is nearly an M-matrix; None where it does not get smaller.
+    """Return P, P'A P and the points of a nearly M-matrix A.
 
-    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the
-    bounds of the coarse problem are those of unknowns, where those of aggregates would have to be
-    averaged.
+    A is a scipy.sparse matrix. Returns None where the coarse matrix is not smaller. A coarse
+    unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the bounds of the
+    coarse problem are those of unknowns, where those of aggregates would have to be averaged.
     """
     A, P, points = scipy.sparse.csr_matrix(host), None, np.arange(host.shape[0])
     while len(points) * LEAST > host.shape[0]:

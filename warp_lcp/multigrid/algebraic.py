@@ -1,8 +1,8 @@
-"""Algebraic multigrid for the principal systems of a sparse matrix: PyAMG's aggregates, cycled and coarsened anew on the device.
+"""Algebraic multigrid for the principal systems of a sparse matrix.
 
-Which unknowns make up a coarse one is decided once, on A. When the free set or the shift changes,
-only numbers are computed again: the Galerkin products P' M P go into patterns that are known, by
-lists of places made once.
+PyAMG forms the aggregates; cycles and coarsening run on the device. The aggregation is computed
+once, on A. When the free set or the shift changes, only numbers are recomputed: the Galerkin
+products P' M P go into known patterns, by lists of positions made once.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ MULTIPLY = KERNELS["algebraic.multiply"]
 INVERSE = KERNELS["algebraic.inverse"]
 SMOOTH = KERNELS["algebraic.smooth"]
 REMAINDER = KERNELS["algebraic.remainder"]
-WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
+WIDEST = np.iinfo(np.uint16).max  # most entries of a row whose positions are stored
 Matrix = Any  # a scipy.sparse.csr_array
 
 
 class DeviceMatrix:
-    """A sparse matrix in compressed rows on the device, any shape."""
+    """A sparse matrix of any shape in compressed rows on the device."""
 
     def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
         self.shape, self.device = host.shape, device
@@ -66,12 +66,12 @@ class DeviceMatrix:
 def product_pass(
     left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]
 ) -> BoundKernel:
-    """Return what computes A B into a known pattern.
+    """Return the launch that computes A B into a known pattern.
 
     Args:
         left: A.
         right: B.
-        out: where the product goes; its pattern holds that of A B.
+        out: receives the product; its pattern holds that of A B.
         hosts: the patterns of A, B and A B.
     """
     A, B, C = hosts
@@ -96,17 +96,19 @@ def product_pass(
 
 
 class AlgebraicLevel:
-    """One level, see `CycleLevel`: its matrix, the smoother's scale, and the way to the next level.
+    """One level, see `CycleLevel`: matrix, smoother's scale and transfer.
+
+    The transfer leads to the next coarser level.
 
     Args:
         host: the matrix.
         real: type of the fields.
-        device: where they are.
+        device: of the fields.
         weights: relaxation factors of a pair of sweeps.
         visits: cycles on this level in each of the next finer one.
 
     Attributes:
-        x, b, t: iterate, right-hand side and what lies between two sweeps.
+        x, b, t: iterate, right-hand side and the value between two sweeps.
     """
 
     def __init__(
@@ -119,7 +121,10 @@ class AlgebraicLevel:
         self.P: DeviceMatrix | None = None
 
     def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
-        """Take the prolongation from a coarser level; `hosts` are A, P, R = P', the patterns of A P and of the coarse matrix."""
+        """Set the prolongation from a coarser level.
+
+        `hosts` are A, P, R = P', and the patterns of A P and of the coarse matrix.
+        """
         device, (host, P, R, AP, coarse_host) = self.device, hosts
         turn = (
             scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape)
@@ -138,7 +143,10 @@ class AlgebraicLevel:
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False
     ) -> BoundKernel:
-        """Return the sweep y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
+        """Return the sweep y = x + omega (b - A x), scaled by the rows' l1 norms.
+
+        x is taken as 0 if from_zero.
+        """
         A = self.A
         return SMOOTH.bind(
             A.rows,
@@ -161,7 +169,10 @@ class AlgebraicLevel:
     def descend(
         self, coarse: AlgebraicLevel, *, projected: bool, from_zero: bool
     ) -> list[CycleStage]:
-        """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and b_c = P'(b - A x)."""
+        """Return steps 1 and 2 of a cycle.
+
+        A pair of Chebyshev-Jacobi sweeps, and b_c = P'(b - A x).
+        """
         assert not projected, "smoothed aggregates know no bounds"
         key = "down", from_zero
         if key not in self._legs:
@@ -174,11 +185,11 @@ class AlgebraicLevel:
         return self._legs[key]
 
     def coarsen_bounds(self, coarse: AlgebraicLevel) -> tuple[()]:
-        """Return nothing: there are no bounds."""
+        """Return no stages: there are no bounds."""
         return ()
 
     def ascend(self, coarse: AlgebraicLevel, *, projected: bool) -> list[CycleStage]:
-        """Return steps 5 and 6: x + P x_c, and the pair in reverse order."""
+        """Return steps 5 and 6 of a cycle: x + P x_c, and the pair in reverse order."""
         key = "up", projected
         if key not in self._legs:
             assert self.P is not None, "not the coarsest level"
@@ -192,18 +203,18 @@ class AlgebraicLevel:
 class AlgebraicHierarchy:
     """Multigrid for M e = r, M = P A P + P D P, with a sparse A.
 
-    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value that the row's own
-    equation asks for, and are 0 off the free set: a coarse correction then leaves stiff unknowns
-    alone, whatever D's size. On an unsymmetric A the aggregates are those of its symmetric part,
-    smoothed where that part rules, and the coarse matrices are P' M P with M as it is.
+    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value from the row's own
+    equation, and are 0 off the free set: a coarse correction then hardly changes stiff unknowns,
+    whatever D's size. On an unsymmetric A the aggregates are those of its symmetric part, smoothed
+    where that part dominates, and the coarse matrices are P' M P with M as it is.
 
     Args:
         A: the matrix.
         real: type of the corrections.
-        settings: how it is built and cycled.
+        settings: of the hierarchy and its cycles.
 
     Attributes:
-        r: the right-hand side, field of A's shape; z: what a cycle makes of it.
+        r: the right-hand side, field of A's shape; z: the result of a cycle.
         weight: one over the diagonal of M, field like r; 1 where that is 0, 0 off the free set.
     """
 
@@ -231,7 +242,10 @@ class AlgebraicHierarchy:
         self.r, self.z = self.levels[0].b, self.levels[0].x
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
+        """Set the free set and the shift D >= 0, and coarsen.
+
+        The set is a uint8 field, the shift a float64 field; None: 0.
+        """
         finest, A = self.levels[0], self.source
         FILL.bind(
             finest.A.rows,
@@ -249,16 +263,19 @@ class AlgebraicHierarchy:
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
-        """q = M p, on the finest level."""
+        """Compute q = M p on the finest level."""
         self.levels[0].A.multiplying(p, q).launch(launch)
 
     @cached_property
     def program(self) -> CommandBuffer:
-        """One cycle: z = an approximation of M^-1 r, symmetric positive (semi-)definite if M is."""
+        """Program of one cycle: z approximates M^-1 r.
+
+        The approximate inverse is symmetric positive (semi-)definite if M is.
+        """
         return recorded(self.device, Cycle(self.levels, self._solve).stages())
 
     def apply(self) -> None:
-        """Cycle once: run `program`."""
+        """Run one cycle: `program`."""
         self.program.run()
 
     @cached_property
@@ -268,6 +285,8 @@ class AlgebraicHierarchy:
         for depth, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
             P = fine.P
             assert P is not None
+            # The finest P has the rows s_i p_i with s_i = a_ii / (a_ii + D_i), 0 off the free set;
+            # R = P' has the same entries in another order.
             if depth == 0:
                 SCALE_ROWS.bind(
                     P.rows, ptr=P.indptr, a=fine.plain, scale=self.scale, scaled=P.values
@@ -276,11 +295,14 @@ class AlgebraicHierarchy:
                 GATHER.bind(turned, source=P.values, order=fine.turn, taken=fine.R.values).launch(
                     launch
                 )
+            # Galerkin product: first A P, then P' (A P).
             for product in fine.products:
                 product.launch(launch)
+            # Scale of the coarse smoother.
             INVERSE.bind(
                 coarse.A.rows, ptr=coarse.A.indptr, a=coarse.A.values, inverse=coarse.inverse
             ).launch(launch)
+        # The coarsest matrix is expanded, factored and inverted.
         if self.inverts:
             last = self.levels[-1]
             launch(
@@ -296,9 +318,12 @@ class AlgebraicHierarchy:
         return program
 
     def _solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
-        """Return the stages of a `CoarsestSolver`: multiply by the inverse, or sweep where the level is too large for that."""
+        """Return the stages of a `CoarsestSolver`.
+
+        They multiply by the inverse, or sweep where the level is too large for that.
+        """
         last, weights = self.levels[-1], self.settings.weights
-        if not self.inverts:  # forth and back, so that the whole is symmetric
+        if not self.inverts:  # forward and backward, so that the solver is symmetric
             pairs = range(self.settings.last_sweeps)
             return [
                 s
@@ -321,7 +346,10 @@ class AlgebraicHierarchy:
         return self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
 
     def _find_entries(self, host: Matrix, pattern: Matrix) -> wp.array[Any]:
-        """Return which entry of A each entry of the pattern is, -1 for none; empty if the patterns are one."""
+        """Return the index in A of each entry of the pattern, -1 if A lacks it.
+
+        Empty if both patterns are equal.
+        """
         if _alike(host, pattern):
             return wp.empty(0, dtype=wp.int32, device=self.device)
         order = np.full(pattern.nnz, -1, dtype=np.int32)
@@ -337,7 +365,11 @@ def _coarsen(
     settings: AlgebraicSettings,
     most: int,
 ) -> list[AlgebraicLevel]:
-    """Return the levels of a matrix, `A` on the host, whose entries are stored in `pattern`; nodes aggregate where there are blocks."""
+    """Return the levels of a matrix.
+
+    `A` is on the host; its entries are stored in `pattern`. Nodes are aggregated where there are
+    blocks.
+    """
     device, B, block = source.device, source.near_null_space, source.block
     values = np.zeros(pattern.nnz)
     values[_places(A, pattern)] = A.data
@@ -355,8 +387,8 @@ def _coarsen(
             break
         T, candidates = fit_candidates(aggregates, candidates)
         block = candidates.shape[1]
-        # local weights are sums of magnitudes; spectral ones start from random vectors, so runs
-        # would differ
+        # Local weights are sums of magnitudes. Spectral weights start from random vectors, so runs
+        # would differ.
         P = T
         if _skewness(current, entries) <= settings.skew:
             P = jacobi_prolongation_smoother(
@@ -367,7 +399,7 @@ def _coarsen(
         R = P.T.tocsr()
         AP = _pattern_product(current, P)
         coarse = _pattern_product(R, AP)
-        # wide rows, which coarsening fills
+        # Coarsening fills wide rows.
         if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:
             break
         levels.append(AlgebraicLevel(coarse, real, device, *cycles))
@@ -382,7 +414,10 @@ def _coarsen(
 
 
 def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
-    """Return the pattern of A B, sorted. SciPy drops entries that cancel; those of positive numbers do not."""
+    """Return the pattern of A B, sorted.
+
+    The product is that of positive numbers: SciPy drops entries that cancel, and these do not.
+    """
     product = (_ones(A) @ _ones(B)).tocsr()
     product.sort_indices()
     return product
@@ -395,12 +430,15 @@ def _skewness(A: Matrix, symmetric: Matrix) -> float:
 
 
 def _alike(A: Matrix, B: Matrix) -> bool:
-    """Return whether two matrices have one pattern."""
+    """Return whether two matrices have the same pattern."""
     return np.array_equal(A.indptr, B.indptr) and np.array_equal(A.indices, B.indices)
 
 
 def _places(A: Matrix, pattern: Matrix) -> np.ndarray:
-    """Return where each entry of A is in a sorted pattern that has them all; SciPy's sum of both would drop zeros."""
+    """Return the position of each entry of A in a sorted pattern that has them all.
+
+    SciPy's sum of both would drop zeros.
+    """
     if _alike(A, pattern):
         return np.arange(A.nnz)
     n = np.int64(A.shape[0])
@@ -420,7 +458,7 @@ def _union(matrix: Matrix) -> Matrix:
 
 
 def _with_diagonal(matrix: Matrix) -> Matrix:
-    """Return the pattern of a matrix with a whole diagonal."""
+    """Return the pattern of a matrix with a full diagonal."""
     pattern = _ones(matrix)
     pattern = (pattern + scipy.sparse.eye_array(matrix.shape[0], dtype=np.float32)).tocsr()
     pattern.sort_indices()

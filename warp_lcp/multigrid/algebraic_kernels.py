@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Kernels of the algebraic hierarchy that are no passes over rows: places of products, and the inverse of the coarsest level."""
+"""Kernels of the algebraic hierarchy that do not run over rows.
+
+They find positions of products and the inverse of the coarsest level.
+"""
 
 from typing import Any
 
@@ -22,7 +25,10 @@ def places_kernel(
     place: wp.array(dtype=wp.uint16),
     n: int,
 ):
-    """Where in its row of the product each product of two entries belongs; by one thread, once a pattern. `at` is memory for a row."""
+    """Find the position of each product of two entries in its row of the product.
+
+    One thread does it, once a pattern. `at` is memory for a row.
+    """
     c = wp.int64(0)
     for i in range(n):
         for q in range(out_ptr[i], out_ptr[i + 1]):
@@ -35,7 +41,7 @@ def places_kernel(
 
 @forward_kernel(module="warp_lcp.algebraic")
 def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATRIX):
-    """A row a thread as a dense one."""
+    """Expand a sparse row to a dense one, one thread a row."""
     i = wp.tid()
     for j in range(out.shape[1]):
         out[i, j] = wp.float64(0.0)
@@ -45,10 +51,15 @@ def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATR
 
 @forward_kernel(module="warp_lcp.algebraic")
 def factor_kernel(matrix: MATRIX, rounding: wp.float64):
-    """L U in place without pivoting, by one thread.
+    """Factor L U in place without pivoting, by one thread.
 
-    A pivot whose magnitude is below `rounding` times its diagonal is what rounding left of a
-    singular component, or a row of zeros: its unknown is taken out, and its pivot is 0.
+    Step c computes row c of U and column c of L, which has a unit diagonal. With s < c:
+
+        u_cr = a_cr - sum_s l_cs u_sr
+        l_rc = (a_rc - sum_s l_rs u_sc) / u_cc
+
+    A pivot is zero, or rounding error of a singular component, if its magnitude is at most
+    `rounding` times its diagonal. Its unknown is then eliminated, and its pivot set to 0.
     """
     n = matrix.shape[0]
     for c in range(n):
@@ -75,7 +86,11 @@ def factor_kernel(matrix: MATRIX, rounding: wp.float64):
 
 @forward_kernel(module="warp_lcp.algebraic")
 def invert_kernel(factors: MATRIX, inverse: MATRIX):
-    """Column c of the inverse from the factors, a column a thread; rows and columns of unknowns that were taken out are 0."""
+    """Compute column c of the inverse from the factors, one thread a column.
+
+    Forward substitution solves L v = e_c, back substitution U x = v. Rows and columns of eliminated
+    unknowns are 0.
+    """
     c = wp.tid()
     n = factors.shape[0]
     for r in range(n):
@@ -98,7 +113,7 @@ def invert_kernel(factors: MATRIX, inverse: MATRIX):
 
 @forward_kernel(module="warp_lcp.algebraic")
 def solve_kernel(inverse: MATRIX, b: wp.array(dtype=Any), x: wp.array(dtype=Any)):
-    """x = the inverse times b."""
+    """Multiply by the inverse: x = A^-1 b."""
     i = wp.tid()
     s = wp.float64(0.0)
     for j in range(inverse.shape[1]):

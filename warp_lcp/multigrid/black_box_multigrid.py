@@ -1,12 +1,13 @@
-"""Multigrid for compact stencils in 2-D that point sweeps do not smooth: operator-dependent transfers, relaxation of lines.
+"""Black-box multigrid for compact stencils in 2-D (Dendy).
 
-Coarse cells are every second one along an axis. A cell between two of them shares in each by its
-row's weights (Dendy's black-box multigrid): the prolongation by those of (A + A')/2, the
-restriction by those of A' (as de Zeeuw has it), so that coarse matrices R A P of convection keep
-the wind's direction. They are compact again. Rows of one color after those of the other are solved
-for as tridiagonal systems, then columns; on the way up in the reverse order. With W-cycles a Krylov
-method takes about ten iterations from 128 to 1024 cells a side, for winds at Peclet numbers up to
-1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
+It serves stencils that point sweeps do not smooth, by operator-dependent transfers and line
+relaxation. Coarse cells are every second one along an axis. A cell between two of them interpolates
+from each by its row's weights: the prolongation by those of (A + A')/2, the restriction by those of
+A' (as de Zeeuw has it), so that coarse matrices R A P of convection keep the wind's direction. They
+are compact again. Rows of one color after those of the other are solved for as tridiagonal systems,
+then columns; on the way up in the reverse order. With W-cycles a Krylov method takes about ten
+iterations from 128 to 1024 cells a side, for winds at Peclet numbers up to 1e4 that turn, for
+anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
 """
 
 from __future__ import annotations
@@ -41,16 +42,16 @@ RESIDUAL = KERNELS["lines.residual"]
 DOWN = KERNELS["lines.down"]
 UP = KERNELS["lines.up"]
 ZERO = KERNELS["lines.zero"]
-SHORT = 3  # cells of an axis that is not coarsened any more
-# that one thread of a CPU solves for together: their cells of a row are vectors, and the rows stay
-# in its cache
+SHORT = 3  # cells of an axis that is not coarsened further
+# Columns that one thread of a CPU solves together: their cells of a row are vectors, and the rows
+# stay in its cache.
 COLUMNS = 256
 EVEN = 0.5  # least ratio of weights along the two axes for point sweeps
 
 
 @dataclass(frozen=True, slots=True)
 class LineFields:
-    """Fields of a level as the kernels of line multigrid take them.
+    """Fields of a level, as arguments of the kernels of line multigrid.
 
     Attributes:
         x: iterate.
@@ -72,7 +73,7 @@ class LineFields:
 
 
 class LineLevel:
-    """One grid, see `CycleLevel`: its stored stencil, factors of its lines, and shares in the next coarser one.
+    """One level, see `CycleLevel`: stencil, line factors and transfer weights.
 
     Args:
         padding: counts of cells and of stored cells.
@@ -96,7 +97,7 @@ class LineLevel:
         self.restricts = self.shares if symmetric else make(4)
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))
         self.fields = LineFields(self.x, self.b, self.t, self.d, self.weights, n, padding.counts[2])
-        # one over pivots and multiples, along x and along y
+        # Reciprocal pivots and multipliers of the tridiagonal systems along x and along y.
         self.lines = [(make(1), make(1)) for _ in range(2)]
         each = tuple(self.weights[i * n : (i + 1) * n] for i in range(8))
         self.stencil = PaddedStencil(padding, self.d, each, (), pattern=AROUND)
@@ -110,7 +111,7 @@ class LineLevel:
         )
 
     def transferring(self) -> list[BoundKernel]:
-        """Return the passes that make shares."""
+        """Return the kernels that compute the transfer weights."""
         fx, fy = self.factors
         same = int(self.restricts is self.shares)
         passes = []
@@ -132,7 +133,7 @@ class LineLevel:
         return passes
 
     def factoring(self) -> list[BoundKernel]:
-        """Return the passes that eliminate along lines."""
+        """Return the kernels that factor the lines' tridiagonal systems."""
         _, ny, nx = self.padding.counts
         made = []
         for rows, (pivots, multiples), step, count in zip(
@@ -153,7 +154,7 @@ class LineLevel:
         return made
 
     def coarsening(self, coarse: LineLevel) -> BoundKernel:
-        """Return the pass that makes the next level's matrix."""
+        """Return the kernel that computes the next level's matrix."""
         fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
         return GALERKIN.bind(
@@ -172,7 +173,7 @@ class LineLevel:
 
     @cached_property
     def _zebras(self) -> tuple[list[BoundKernel], list[BoundKernel]]:
-        """Sweeps of rows and of columns, each of both colors."""
+        """Line relaxation: sweeps of rows and of columns, each of both colors."""
         (px, mx), (py, my) = self.lines
         fields, s, step, count = self.fields, self.stencil, self.padding.row, self.padding.counts[1]
         across = [
@@ -195,12 +196,12 @@ class LineLevel:
         return across, along
 
     def smoothing(self, *, up: bool) -> list[BoundKernel]:
-        """Return the sweeps on the way down, rows first, or up."""
+        """Return the sweeps on the way down, rows first, or on the way up."""
         sweeps = [sweep for axis in self._zebras for sweep in axis]
         return sweeps[::-1] if up else sweeps
 
     def descend(self, coarse: LineLevel, *, projected: bool, from_zero: bool) -> list[CycleStage]:
-        """Return steps 1 and 2 of a cycle: sweeps of lines, and the residual on the next level."""
+        """Return steps 1 and 2 of a cycle: line sweeps, and the restricted residual."""
         assert not projected, "sweeps of lines know no bounds"
         key = "down", from_zero
         if key not in self._legs:
@@ -209,25 +210,25 @@ class LineLevel:
         return self._legs[key]
 
     def restricting(self, coarse: LineLevel) -> list[BoundKernel]:
-        """Return what hands the residual on."""
+        """Return the kernel that restricts the residual."""
         return [
             RESIDUAL.bind(self.rows, self.fields, stencil=self.stencil),
             self.handing_down(coarse),
         ]
 
     def coarsen_bounds(self, coarse: LineLevel) -> tuple[()]:
-        """Return nothing: there are no bounds."""
+        """Return no stages: there are no bounds."""
         return ()
 
     def ascend(self, coarse: LineLevel, *, projected: bool) -> list[CycleStage]:
-        """Return steps 5 and 6."""
+        """Return steps 5 and 6 of a cycle: the correction and line sweeps."""
         key = "up", projected
         if key not in self._legs:
             self._legs[key] = [self.correcting(coarse), *self.smoothing(up=True)]
         return self._legs[key]
 
     def handing_down(self, coarse: LineLevel) -> BoundKernel:
-        """Return what makes t the coarse right-hand side."""
+        """Return the kernel that restricts the residual to the coarse right-hand side."""
         fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
         return DOWN.bind(
@@ -240,7 +241,7 @@ class LineLevel:
         )
 
     def correcting(self, coarse: LineLevel, *, add: bool = True) -> BoundKernel:
-        """Return what adds the coarse correction, or takes it."""
+        """Return the kernel that adds the coarse correction, or sets x to it."""
         rows = self.rows.beside(coarse.rows, (-self.factors[0], -self.factors[1], -1))
         return UP.bind(rows, self.fields, coarse=coarse.x, shares=self.shares, add=add)
 
@@ -248,13 +249,13 @@ class LineLevel:
 class BlackBoxMultigrid:
     """Multigrid for (P A P + P D P) e = r of a compact stencil in 2-D.
 
-    `restrict` takes the free set and the shift, `cycle` makes the finest level's x from its b.
+    `restrict` sets the free set and the shift, `cycle` computes the finest level's x from its b.
 
     Args:
         stencil: the operator's, with a pattern; no axis is periodic.
         real: type of the corrections.
         symmetric: whether A is.
-        settings: how cycles go: `gamma`, and the size of the coarsest level.
+        settings: of the cycles: `gamma`, and the size of the coarsest level.
     """
 
     def __init__(
@@ -297,12 +298,16 @@ class BlackBoxMultigrid:
         shift: wp.array[Any] | None = None,
         weight: wp.array[Any] | None = None,
     ) -> None:
-        """Take another free set (stored uint8 field) and shift (float64), write one over the diagonal to `weight`, and coarsen."""
+        """Set the free set and the shift, and coarsen.
+
+        The set is a stored uint8 field, the shift float64. One over the diagonal is written to
+        `weight`.
+        """
         self._fill(free, shift, weight)
         self._building.run()
 
     def take_all(self, free: wp.array[Any]) -> None:
-        """Take a free set for transfers between the two finest levels only."""
+        """Set a free set for transfers between the two finest levels only."""
         self._fill(free, None, None)
         for made in self.finest.transferring():
             made.launch()
@@ -332,19 +337,23 @@ class BlackBoxMultigrid:
 
     @cached_property
     def cycle(self) -> CommandBuffer:
-        """One cycle from x = 0."""
+        """Program of one cycle from x = 0."""
         return recorded(self.device, Cycle(self.levels, self._dense.solve).stages())
 
 
 def takes_points(A: Operator) -> TypeGuard[HasStencil]:
-    """Return whether an operator's systems are a `Hierarchy`'s: it has a stencil, is symmetric, and needs no lines."""
+    """Return whether a `Hierarchy` suits an operator.
+
+    It must have a stencil, be symmetric, and need no line relaxation.
+    """
     return has(A, HasStencil) and A.symmetric and not needs_lines(A)
 
 
 def needs_lines(A: HasStencil) -> bool:
-    """Return whether an operator's stencil is one of these: compact and in 2-D, and not what point sweeps on aggregates solve as fast.
+    """Return whether black-box multigrid suits an operator.
 
-    Those are symmetric with weights >= 0, alike along both axes.
+    Its stencil must be compact and in 2-D, and not of the kind that point sweeps on aggregates
+    solve as fast: symmetric with weights >= 0, alike along both axes.
     """
     s = A.stencil
     if s.pattern is None or s.padding.counts[0] > 1 or any(s.periodic):

@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Kernels that assemble the coarsest level's matrix and factor or invert it.
 
-A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is
-pinned at 0. Positive semi-definite matrices need no other order of the pivots.
+A pivot below `rounding` times its diagonal is rounding error of a singular component: its unknown
+is fixed at 0. Positive semi-definite matrices need no pivoting.
 """
 
 import functools
@@ -16,14 +16,14 @@ from warp_lcp.kernels.layout import RowLayout, stencil_struct
 from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, meet
 
 square = wp.array2d(dtype=wp.float64)
-# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a
-# margin
+# Threshold relative to the coarsest level's diagonal: rounding error of a singular component's last
+# pivot, with a margin.
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
 
 
 @wp.func
 def none_changed(changed: wp.array2d(dtype=wp.uint8)):
-    """Whether no row has changed."""
+    """Return whether no row has changed."""
     found = int(0)
     for k in range(changed.shape[0]):
         for j in range(changed.shape[1]):
@@ -34,7 +34,7 @@ def none_changed(changed: wp.array2d(dtype=wp.uint8)):
 
 @wp.func
 def element(L: RowLayout, r: int):
-    """Element of a stored field that holds cell r."""
+    """Return the element of a stored field for cell r."""
     return (
         L.base
         + wp.int64(r // (L.rows * L.nx)) * L.s1
@@ -45,7 +45,10 @@ def element(L: RowLayout, r: int):
 
 @wp.func
 def beside(L: RowLayout, periodic: wp.vec3i, r: int, axis: int, way: int):
-    """Cell before (way = -1) or after (1) cell r along an axis; -1 where there is none."""
+    """Return the cell before (way = -1) or after (1) cell r along an axis.
+
+    -1 where there is none.
+    """
     step = int(1)
     n = L.nx
     if axis == 1:
@@ -65,13 +68,16 @@ def beside(L: RowLayout, periodic: wp.vec3i, r: int, axis: int, way: int):
 
 @functools.cache
 def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
-    """Return `factor`, L D L' by one thread, and `invert`, by one block, each in a module of its own: they take long to compile."""
+    """Return the kernels `factor` and `invert`, each in a module of its own.
+
+    `factor` computes L D L' by one thread, `invert` works by one block. Each takes long to compile.
+    """
     name = f"{'variable' if variable else 'uniform'}_{d_type.__name__}_{real.__name__}"
     Stencil = stencil_struct(d_type, real if variable else wp.float32)
 
     @wp.func
     def weight(S: Stencil, axis: int, at: wp.int64):
-        """Weight of a cell's lower face."""
+        """Return the weight of a cell's lower face."""
         w = S.cx
         if axis == 1:
             w = S.cy
@@ -88,13 +94,17 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def assemble(S: Stencil, L: RowLayout, periodic: wp.vec3i, r: int, matrix: square):
-        """Write row r; a periodic axis of two cells has two faces between them."""
+        """Assemble row r of the dense matrix: a_rr = unit d_r, a_rq = -w for each face.
+
+        w is the weight of the face between the unknowns r and q. A periodic axis of two cells has
+        two faces between them, whose weights add up.
+        """
         for c in range(matrix.shape[0]):
             matrix[r, c] = wp.float64(0.0)
         at = element(L, r)
         if S.d[at] != d_type(0):
             matrix[r, r] = S.unit * wp.float64(S.d[at])
-            axes = int(3)  # no constant, for which Warp would write the loop out
+            axes = int(3)  # no constant: Warp would unroll the loop
             for axis in range(axes):
                 below = beside(L, periodic, r, axis, -1)
                 if below >= 0:
@@ -115,7 +125,15 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         changed: wp.array2d(dtype=wp.uint8),
         matrix: square,
     ):
-        """Assemble and factor in place; nothing to do if none of the rows of cells has changed."""
+        """Assemble and factor the matrix in place, if any row of cells has changed.
+
+        Column by column, in the lower triangle, with s < c:
+
+            d_c = a_cc - sum_s l_cs^2 d_s
+            l_rc = (a_rc - sum_s l_rs l_cs d_s) / d_c
+
+        The diagonal holds D.
+        """
         if none_changed(changed):
             return
         m = matrix.shape[0]
@@ -139,7 +157,15 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func
     def eliminate(least: wp.float64, c: int, t: int, threads: int, old: square, new: square):
-        """One step of Gauss-Jordan from `old` to `new`, so that no thread reads what another has written since the last barrier."""
+        """Make step c of Gauss-Jordan elimination from `old` to `new`.
+
+        With the pivot p = a_cc:
+
+            a_cc <- 1 / p,   a_cj <- a_cj / p,   a_ic <- -a_ic / p,   a_ij <- a_ij - a_ic a_cj / p
+
+        After all steps the matrix is the inverse. Row and column of a pinned unknown become 0. With
+        two arrays no thread reads what another has written since the last barrier.
+        """
         m = old.shape[0]
         pivot = old[c, c]
         pinned = pivot <= least
@@ -172,11 +198,14 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         other: square,
         inverse: square,
     ):
-        """Assemble and invert; every thread of the block passes every barrier."""
+        """Assemble and invert the matrix.
+
+        Every thread of the block reaches every barrier.
+        """
         t = wp.tid()
         m = inverse.shape[0]
         for r in range(t, m, threads):
-            if m % 2 == 0:  # after m steps to and fro the result is to lie in `inverse`
+            if m % 2 == 0:  # after m steps back and forth the result must be in `inverse`
                 assemble(S, L, periodic, r, inverse)
             else:
                 assemble(S, L, periodic, r, other)

@@ -1,4 +1,7 @@
-"""Levels of a hierarchy whose stencils are compact: patterns of aggregates, and memory of the weights."""
+"""Hierarchy levels with compact stencils.
+
+Patterns of aggregates, and memory of the weights.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,11 @@ Counts = tuple[int, int, int]
 
 
 def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
-    """Return the neighbors of aggregates of so many cells along x, y, z: those of cells, and theirs along axes that are aggregated."""
+    """Return the offsets of neighbors of aggregates.
+
+    An aggregate has so many cells along x, y, z. Its neighbors are those of its cells, and theirs
+    along axes that are aggregated.
+    """
     found = set()
     for offset in pattern.offsets:
         steps = [
@@ -33,12 +40,18 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
 def weights_block(
     pattern: Pattern, padding: Padding, real: Any, device: wp.Device
 ) -> tuple[wp.array[Any], tuple[wp.array[Any], ...]]:
-    """Return memory for a pattern's weights, one field after another, and each of them."""
+    """Return memory for a pattern's weights, and its field for each weight.
+
+    The fields lie one after another.
+    """
     n, count = padding.size, len(pattern.offsets)
     block = zeros(count * n, real, device)
     return block, tuple(block[i * n : (i + 1) * n] for i in range(count))
 
 
 def mask(pattern: Pattern) -> int:
-    """Return the offsets of a pattern's stored weights as bits, (z + 1, y + 1, x + 1) in the base of 3."""
+    """Return the offsets of a pattern's stored weights as bits.
+
+    Bits are numbered by (z + 1, y + 1, x + 1) in the base of 3.
+    """
     return sum(1 << (x + 1 + 3 * (y + 1) + 9 * (z + 1)) for x, y, z in pattern.offsets)

@@ -1,19 +1,18 @@
-"""Multigrid: one cycle for all kinds of levels, for linear systems and for problems with bounds.
+"""Multigrid cycle for all kinds of levels, for linear systems and for bounds.
 
 Every level holds the same problem on fewer unknowns. If A is symmetric positive definite, it is
 
     minimize  x'Ax / 2 - b'x   over   lower <= x <= upper,                                (1)
 
-without bounds A x = b. `Cycle` knows no matrix, grid or device: it takes the stages of Algorithm 1
-from the levels, in order. They are recorded once, in one `CommandBuffer`. With bounds the method is
-monotone multigrid (Kornhuber 1994): no iterate leaves its bounds.
+without bounds A x = b. `Cycle` does not depend on the matrix, grid or device: it takes the stages
+of Algorithm 1 from the levels, in order. They are recorded once, in one `CommandBuffer`. With
+bounds the method is monotone multigrid (Kornhuber 1994): no iterate leaves its bounds.
 
 Algorithm 1, one cycle on level l; P maps coarse to fine vectors, alpha is the over-correction.
-    1  smooth          x <- clip(x + omega D^-1 (b - A x)), or sweeps over lines or faces
-    2  restrict        b_c = P'(b - A x),  x_c = 0
-    3  coarsen bounds  lower_c = max of (lower - x) / alpha over an aggregate; upper_c = min ...
-    4  recurse         visits of level l + 1: gamma, or 1; on the coarsest level, solve for x
-    5  correct         x <- x + alpha P x_c
+    1  smooth          x <- clip(x + omega D^-1 (b - A x)), or sweeps over lines or faces 2
+        restrict        b_c = P'(b - A x),  x_c = 0 3  coarsen bounds  lower_c = max of (lower - x)
+        / alpha over an aggregate; upper_c = min ... 4  recurse         visits of level l + 1:
+        gamma, or 1; on the coarsest level, solve for x 5  correct         x <- x + alpha P x_c
     6  smooth          as step 1, in reverse order: the cycle is symmetric
 """
 
@@ -31,42 +30,54 @@ from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 
 
 class CycleStage(Protocol):
-    """Launches of a cycle, now or recorded: a bound kernel, a wave of them, an exchange."""
+    """Stage of a cycle: a bound kernel, a fused kernel or an exchange.
+
+    Its launches are executed now or recorded.
+    """
 
     def launch(self, launch: Launch = ...) -> None:
-        """Launch now, or record by `CommandBuffer.launch`."""
+        """Launch the stage now, or record it by `CommandBuffer.launch`."""
 
 
 class CycleLevel(Protocol):
     """Problem (1) on one level, and its transfers from and to the next coarser one.
 
-    Smoothing and transfer come together, since a CPU passes through memory once for both.
+    Smoothing and transfer are one stage, because a CPU then streams through memory once for both.
     """
 
     @property
     def visits(self) -> int:
-        """Cycles on this level in each cycle on the next finer one; see `CoarsestSolver` for the coarsest."""
+        """Cycles on this level in each cycle on the next finer one.
+
+        See `CoarsestSolver` for the coarsest level.
+        """
 
     def descend(self, coarse: Any, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
-        """Return steps 1 and 2; x is taken for 0 if `from_zero`."""
+        """Return steps 1 and 2; x is taken as 0 if `from_zero`."""
 
     def coarsen_bounds(self, coarse: Any) -> Iterable[CycleStage]:
-        """Return step 3, if it is no part of step 2."""
+        """Return step 3, unless it is part of step 2."""
 
     def ascend(self, coarse: Any, *, projected: bool) -> Iterable[CycleStage]:
         """Return steps 5 and 6."""
 
 
 class CoarsestSolver(Protocol):
-    """Step 4 on the coarsest level: a dense inverse, sweeps, or a hierarchy of its own."""
+    """Solver of step 4 on the coarsest level.
+
+    It is a dense inverse, sweeps, or a hierarchy of its own.
+    """
 
     def __call__(self, visits: int, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
-        """Return what solves for x; what only approximates the solution does so `visits` times."""
+        """Return the stages that solve for x.
+
+        Approximate solvers repeat them `visits` times.
+        """
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """Algorithm 1.
+    """Multigrid cycle, Algorithm 1.
 
     Args:
         levels: from the finest to the coarsest.
@@ -83,23 +94,26 @@ class Cycle:
     ) -> Iterator[CycleStage]:
         """Yield consecutive cycles on level `depth`; the numbers are steps of Algorithm 1."""
         if depth == len(self.levels) - 1:
-            # 4, coarsest level
+            # Step 4 on the coarsest level.
             yield from self.solve(visits, projected=self.projected, from_zero=from_zero)
             return
         fine, coarse = self.levels[depth], self.levels[depth + 1]
         for visit in range(visits):
-            # 1, 2
+            # Steps 1 and 2.
             yield from fine.descend(
                 coarse, projected=self.projected, from_zero=from_zero and visit == 0
             )
             if self.projected:
-                yield from fine.coarsen_bounds(coarse)  # 3
-            yield from self.stages(depth + 1, visits=coarse.visits)  # 4
-            yield from fine.ascend(coarse, projected=self.projected)  # 5, 6
+                yield from fine.coarsen_bounds(coarse)  # step 3
+            yield from self.stages(depth + 1, visits=coarse.visits)  # step 4
+            yield from fine.ascend(coarse, projected=self.projected)  # steps 5, 6
 
 
 def recorded(device: wp.Device, stages: Iterable[CycleStage]) -> CommandBuffer:
-    """Return the launches of stages; one that comes again, as in a W-cycle, is prepared once."""
+    """Return the launches of stages.
+
+    A repeated stage, as in a W-cycle, is prepared once.
+    """
     program, prepared = CommandBuffer(device), dict[int, tuple[CycleStage, CommandBuffer]]()
     for stage in stages:
         known = prepared.get(id(stage))
@@ -112,10 +126,10 @@ def recorded(device: wp.Device, stages: Iterable[CycleStage]) -> CommandBuffer:
 
 @dataclass(frozen=True)
 class Leg:
-    """Steps 1 and 2, or 5 and 6, in one pass through memory.
+    """Steps 1 and 2, or 5 and 6, as one fused kernel that streams memory once.
 
     Attributes:
-        wave: of the kernels.
+        wave: the fused kernel.
         passes: its bound kernels.
     """
 
@@ -123,13 +137,13 @@ class Leg:
     passes: tuple[BoundKernel, ...]
 
     def launch(self, launch: Launch = launch_now) -> None:
-        """Launch the wave, or record it."""
+        """Launch the fused kernel, or record it."""
         self.wave.launch(*self.passes, launch=launch)
 
 
 @dataclass(frozen=True)
 class Launches:
-    """What a function launches, given `launch=`, as a stage of a cycle."""
+    """Launches of a function with an argument `launch=`, as a stage of a cycle."""
 
     function: Callable[..., object]
 
@@ -139,7 +153,7 @@ class Launches:
         return cls(partial(_launch_kernel, kernel, dim, inputs, device))
 
     def launch(self, launch: Launch = launch_now) -> None:
-        """Launch it now, or record it."""
+        """Launch the stage now, or record it."""
         self.function(launch=launch)
 
 
@@ -151,9 +165,10 @@ def _launch_kernel(
 
 @dataclass(frozen=True)
 class GatheredLevel:
-    """Coarsest solver on ranks: gather the problem on every rank, cycle there, take the own part.
+    """Coarsest solver on ranks: gather the problem, and cycle on every rank.
 
-    The level has so few cells that exchanges would take longer than all ranks doing the same.
+    Each rank then takes its own part of the result. The level has so few cells that exchanges would
+    take longer than the same work on all ranks.
 
     Args:
         whole: cycle of the whole problem, projected or not.

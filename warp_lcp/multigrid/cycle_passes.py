@@ -1,13 +1,14 @@
-"""Passes of a hierarchy: of its cycles, with the legs that are waves of them and stream memory once, and those that build its levels.
+"""Kernels of a hierarchy: those of its cycles, and those that build its levels.
 
-Coarser levels are the Galerkin product with piecewise-constant 2 x 2 x 2 aggregates. They keep the
-7-point stencil on every level and cope with any mask: the weight between two aggregates is the sum
-over the faces between them. A cell's excess is its diagonal less its faces to other unknowns: what
-AIR, held unknowns and the shift contribute. An aggregate's diagonal is the sum of its cells'
-excesses plus its outer faces, a sum of positive numbers: taking inner faces off the diagonals would
-cancel. Weights along axes that are not aggregated are not too stiff, so they are multiplied by
-`stiffen`, the over-correction that the prolongation applies to all; the excess, whose held
-neighbors are one cell and not one aggregate away, by `held`.
+Legs of a cycle are fused kernels that stream memory once. Coarser levels are the Galerkin product
+with piecewise-constant 2 x 2 x 2 aggregates. They keep the 7-point stencil on every level and allow
+any mask: the weight between two aggregates is the sum over the faces between them. A cell's excess
+is its diagonal less its faces to other unknowns: the contributions of AIR, held unknowns and the
+shift. An aggregate's diagonal is the sum of its cells' excesses plus its outer faces, a sum of
+positive numbers; subtracting inner faces from the diagonals would cancel. The Galerkin product is
+too stiff along aggregated axes. Weights along axes that are not aggregated are not too stiff, so
+they are multiplied by `stiffen`, the over-correction that the prolongation applies to all; the
+excess, whose held neighbors are one cell and not one aggregate away, by `held`.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import warp as wp
 
 from warp_lcp.kernels import FusedKernel, KernelFile
 
-UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections are of order one
+UNBOUNDED = 1e30  # represents an infinite bound of a correction; corrections are of order one
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/cycle.h")
 LEVELS = KernelFile(Path(__file__).parent / "headers/coarsen.h")
@@ -32,9 +33,9 @@ CORRECT = KERNELS["cycle.correct"]
 COARSE_BOUNDS = KERNELS["cycle.bounds"]
 DESCEND = FusedKernel("cycle.descend", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 1), (RESTRICT, 2))
 ASCEND = FusedKernel("cycle.ascend", (CORRECT, 0), (SWEEP_INTO_RING, 1), (SWEEP_OUT_OF_RING, 2))
-# On a box of cells among those of other processes: the first sweep from zero is made in ghost
-# cells, too, where it needs only their right-hand side. So what follows waits for no exchange, but
-# for the residual beside others' cells, which is found again.
+# On a box of cells among those of other processes. The first sweep from zero is also made in ghost
+# cells, which need only their right-hand side. So the next stages wait for no exchange, except for
+# the residual beside others' cells, which is recomputed.
 DESCEND_FROM_GHOSTS = FusedKernel(
     "cycle.descend_from_ghosts", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2), (RESTRICT, 3)
 )
@@ -52,7 +53,7 @@ SIGN = LEVELS["renew.sign"]
 
 @dataclass(frozen=True, slots=True)
 class Coarsening:
-    """What the kernels that coarsen a matrix take, compact or not.
+    """Arguments of the kernels that coarsen a matrix, compact or not.
 
     Attributes:
         changed: rows of the finer level that have changed, uint8.

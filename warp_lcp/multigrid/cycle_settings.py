@@ -1,4 +1,7 @@
-"""How multigrid cycles go: those of a Galerkin hierarchy of a grid, and those of an algebraic one."""
+"""Settings of multigrid cycles.
+
+Those of a Galerkin hierarchy of a grid, and those of an algebraic one.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +22,12 @@ from warp_lcp.settings import (
 
 
 class Smoothing(Settings):
-    """What damps the upper part of a spectrum: two Chebyshev-Jacobi sweeps."""
+    """Smoother of the upper part of a spectrum: two Chebyshev-Jacobi sweeps."""
 
     interval: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Check the settings, and that the interval is one."""
+        """Check the settings, the interval among them."""
         super().__post_init__()
         if not self.interval[0] < self.interval[1]:
             raise SettingError("interval", self.interval, "in order")
@@ -63,16 +66,16 @@ class CycleSettings(Smoothing):
         coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is
             quick for 16 cells only.
         one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0:
-            none do. On the CPU a captured graph's launches cost next to nothing, and its legs that
-            stream through a level are faster.
+            no levels. On the CPU a captured graph's launches cost next to nothing, and its legs
+            that stream through a level are faster.
         one_launch_cuda: the same on a GPU, in one block of threads: 8^3 cells; with 16^3 one
             multiprocessor works longer than launches would take, 2 ms of a solve on an H200.
         one_launch_cluster: the same on a GPU that has clusters of blocks (compute capability 9.0
             on), unless `one_launch_cuda` is 0: eight multiprocessors share 16^3 cells.
         semicoarsening_threshold: an axis is coarsened once its mean weight is at least this
             fraction of the strongest axis's mean weight.
-        projected_sweeps: pairs of sweeps, forth and back, that stand for a solve on the coarsest
-            level of a projected cycle.
+        projected_sweeps: pairs of sweeps, forward and backward, that replace a solve on the
+            coarsest level of a projected cycle.
         projected_sweeps_cuda: the same on a GPU, where each sweep is a barrier. With 8, 4 and 2
             pairs 43 problems took the same iterations, one of them one more with a single pair.
     """
@@ -95,16 +98,16 @@ class CycleSettings(Smoothing):
 
 @dataclass(frozen=True, kw_only=True)
 class AlgebraicSettings(Smoothing):
-    """How the hierarchy is built and cycled.
+    """Settings of an algebraic hierarchy and its cycles.
 
     Args:
-        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above
-            what rounding leaves of entries that cancel.
+        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above the
+            rounding errors of entries that cancel.
         gamma: coarse cycles a level; 1 is a V-cycle.
         gamma_unsymmetric: the same on an unsymmetric A.
         skew: a level whose skew part is larger than this share of its symmetric off-diagonal part
-            takes plain aggregates: Galerkin products of smoothed ones are centered differences,
-            which are unstable where convection rules; those of plain ones stay M-matrices.
+            has plain aggregates: Galerkin products of smoothed ones are centered differences, which
+            are unstable where convection dominates; those of plain ones stay M-matrices.
         interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi
             sweeps damp.
         coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.

@@ -1,4 +1,7 @@
-"""Coarsest solver of a grid: a dense inverse, made on the device; projected sweeps if there are bounds."""
+"""Coarsest solver of a grid: a dense inverse, computed on the device.
+
+With bounds it makes projected sweeps.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from warp_lcp.multigrid.cycle_passes import ASSEMBLE, ELIMINATE, INVERT, SOLVE
 class DenseInverse:
     """Coarsest solver: x = A^-1 b by the dense inverse of the level's matrix.
 
-    An unknown whose pivot is what rounding leaves of a singular component is held at 0.
+    An unknown whose pivot is rounding error of a singular component is held at 0.
 
     Args:
         level: a `StencilLevel` or `LineLevel`.
@@ -51,7 +54,7 @@ class DenseInverse:
         )
 
     def record(self, program: CommandBuffer, *, by_block: bool) -> None:
-        """Record the inversion of the matrix as it will be.
+        """Record the inversion of the matrix at the time of a run.
 
         Args:
             program: that records.
@@ -64,7 +67,10 @@ class DenseInverse:
             self._record_compact(program)
 
     def _record_compact(self, program: CommandBuffer) -> None:
-        """Record Gauss-Jordan elimination: the matrix need not be symmetric."""
+        """Record Gauss-Jordan elimination.
+
+        The matrix need not be symmetric.
+        """
         s, (nz, ny, nx) = self.level.stencil, self._counts
         (px, py, pz), least = s.periodic, PINNED[self.level.x.dtype]
         matrix, inverse = self.matrix.flatten(), self.inverse.flatten()
@@ -88,7 +94,11 @@ class DenseInverse:
         ).launch(program.launch)
 
     def _record_seven_points(self, program: CommandBuffer, *, by_block: bool) -> None:
-        """Record L D L' and the columns of the inverse; on CUDA, Gauss-Jordan elimination by one block."""
+        """Record the computation of the inverse.
+
+        The CPU computes L D L' and the columns of the inverse; CUDA uses Gauss-Jordan elimination
+        by one block.
+        """
         s, changed, real, m = (
             self.level.stencil,
             self.level.changed,
@@ -119,11 +129,14 @@ class DenseInverse:
         ).launch(program.launch)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
-        """Return the stages of a `CoarsestSolver`: once, whatever `visits` is, for this is the solution."""
+        """Return the stages of a `CoarsestSolver`.
+
+        They run once, whatever `visits` is, because the result is the exact solution.
+        """
         return self._sweeps(from_zero=from_zero) if projected else [self.product]
 
     def _sweeps(self, *, from_zero: bool) -> Iterator[CycleStage]:
-        """Yield projected pairs of sweeps, forth and back: symmetric."""
+        """Yield projected pairs of sweeps, forward and backward: symmetric."""
         level, settings = self.level, self.level.settings
         on_cpu = self._device.is_cpu
         pairs = settings.projected_sweeps if on_cpu else settings.projected_sweeps_cuda

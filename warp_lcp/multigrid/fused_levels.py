@@ -1,6 +1,6 @@
-"""All small levels of a hierarchy in one launch.
+"""Fused coarse levels: all small levels of a hierarchy in one launch.
 
-A block of threads, or a cluster of blocks, goes through a list of stages.
+A block of threads, or a cluster of blocks, executes a list of stages.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class FusedCoarseLevels:
-    """Coarsest solver: the last levels of a hierarchy, in one launch on a GPU.
+    """Coarsest solver: the last levels of a hierarchy in one GPU launch.
 
     The cycle's stages are unrolled into a table on the device. Results are those of one launch a
     stage, to rounding.
@@ -41,7 +41,7 @@ class FusedCoarseLevels:
 
     @functools.cached_property
     def coarsening(self) -> PersistentKernel:
-        """The making of all levels from the first one."""
+        """Stages that compute all levels from the first one."""
         stages: list[Any] = [
             s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)
         ]
@@ -60,7 +60,10 @@ class FusedCoarseLevels:
 
 
 def cells_of_one_launch(settings: CycleSettings, device: wp.Device) -> int:
-    """Return the most cells of a level that runs in one launch with those below it; 0: none does."""
+    """Return the most cells of a level that is fused with those below it.
+
+    They run in one launch. 0: no level is fused.
+    """
     if device.is_cpu:
         return settings.one_launch_cpu
     block, cluster = settings.one_launch_cuda, settings.one_launch_cluster
@@ -68,7 +71,10 @@ def cells_of_one_launch(settings: CycleSettings, device: wp.Device) -> int:
 
 
 def first_small(levels: Listed[StencilLevel], cells: int) -> int:
-    """Return the index of the first of the last levels that have at most so many cells each and are stored alike."""
+    """Return the index of the first level to fuse.
+
+    It and all levels below it have at most so many cells each and are stored alike.
+    """
     first = len(levels)
     while (
         first > 0

@@ -1,7 +1,7 @@
-"""Legs of a cycle on a level of which other processes have parts: ghost cells, and cells beside cuts.
+"""Legs of a cycle on a distributed level, with ghost cells and halo exchange.
 
-A leg streams through memory once, as in one process, and waits for one exchange: cells beside
-those of others are computed again, or ahead.
+A leg streams through memory once, as in one process, and waits for one exchange: cells beside those
+of other processes are computed twice, or ahead.
 """
 
 from __future__ import annotations
@@ -23,20 +23,25 @@ if TYPE_CHECKING:
     from warp_lcp.multigrid.stencil_level import StencilLevel
 
 Corner = list[int]  # k, j, i
-GATHERED = 32_768  # cells at which a level is gathered: exchanges would take as long as its cells
-# cells from a cut corrected ahead: two are swept, the next one, and its aggregate's other
+# Cells at which a level is gathered: exchanges would take as long as its computations.
+GATHERED = 32_768
+# Distance from a cut within which cells are corrected ahead: two cells are swept, the third is next
+# to them, and the fourth is the other one of its aggregate.
 BESIDE = 4
 
 
 def whole_counts(stencil: PaddedStencil) -> tuple[int, int, int]:
-    """Return the cells (nz, ny, nx) of a stencil's grid, also of those that other processes have."""
+    """Return the shape (nz, ny, nx) of a stencil's whole grid.
+
+    Cells of other processes count.
+    """
     return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
 
 
 @forward_kernel(module="warp_lcp.multigrid.halo_levels")
 @no_type_check
 def keep_side_kernel(d: wp.array3d(dtype=Any), axis: int, at: int, known: wp.array2d(dtype=Any)):
-    """Keep a layer of ghost cells across an axis."""
+    """Store the values of a layer of ghost cells across an axis."""
     a, b = wp.tid()
     if axis == 0:
         known[a, b] = d[a + 1, b + 1, at]
@@ -56,7 +61,7 @@ def mark_side_kernel(
     known: wp.array2d(dtype=Any),
     changed: wp.array2d(dtype=wp.uint8),
 ):
-    """Mark rows beside ghost cells that differ from those that are known."""
+    """Mark rows beside ghost cells that differ from their former values."""
     a, b = wp.tid()
     if axis == 0:
         if d[a + 1, b + 1, at] != known[a, b]:
@@ -76,7 +81,10 @@ for _T in (wp.uint8, wp.float32, wp.float64):
 
 
 def share_changes(level: StencilLevel, launch: Launch) -> None:
-    """Fill the diagonal's ghost cells; mark rows beside those that changed: their faces depend on them."""
+    """Fill the diagonal's ghost cells, and mark rows beside changed ones.
+
+    The faces of marked rows depend on the changed cells.
+    """
     s, counts = level.stencil, level.stencil.padding.counts
     assert s.ghosts is not None
     d, sides = s.d.reshape(s.padding.shape), []
@@ -94,7 +102,10 @@ def share_changes(level: StencilLevel, launch: Launch) -> None:
 
 
 def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner]]:
-    """Return the cells of a box within `depth` of others', as boxes low <= (k, j, i) < high that do not overlap."""
+    """Return the cells of a box within `depth` of those of other processes.
+
+    They are boxes low <= (k, j, i) < high that do not overlap.
+    """
     low, high, found = [0, 0, 0], list(stencil.padding.counts), list[tuple[Corner, Corner]]()
     for axis, end in stencil.ghosts.cuts if stencil.ghosts is not None else ():
         a, first, last = 2 - axis, low.copy(), high.copy()
@@ -111,8 +122,8 @@ def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner
 def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
     """Yield steps 1 and 2 of a cycle from x = 0.
 
-    The first sweep is made in ghost cells, too, where it needs their right-hand side alone; the
-    residual beside others' cells is found again when ghost cells are filled.
+    The first sweep is also made in ghost cells, where it needs their right-hand side alone. The
+    residual beside others' cells is recomputed when ghost cells are filled.
     """
     for field in (level.b, level.lower, level.upper)[
         : 3 if projected and level.upper.size else 1 + projected
@@ -139,12 +150,15 @@ def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> It
 
 
 def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
-    """Yield steps 5 and 6: cells beside cuts are corrected and swept ahead, and exchanged."""
+    """Yield steps 5 and 6 of a cycle.
+
+    Cells beside cuts are corrected and swept ahead, and exchanged.
+    """
     s, near, scale = level.stencil, level.near, level.settings.over_correction
     assert s.ghosts is not None
-    if not coarse.gathered:  # then its ghost cells have been taken with its part
+    if not coarse.gathered:  # a gathered level's ghost cells are set with its part
         yield from coarse.stencil.fillings(coarse.x)
-    for axis, end in s.ghosts.cuts:  # those of x are filled since the restriction
+    for axis, end in s.ghosts.cuts:  # those of x have been filled since the restriction
         ours, theirs = (
             Rows.beyond(v.stencil.padding, s.device, axis, end) for v in (level, coarse)
         )
@@ -158,7 +172,7 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
             coarse, scale, projected=projected, rows=_finer_part(level, coarse, low, high), x=near
         )
     yield from _sweeps_beside(level, level.t, near, 2, projected=projected)
-    # the ring takes that for what is above the last plane, too
+    # The ring uses that for the plane above the last one, too.
     yield passes.CLEAR.bind(Rows.beyond(s.padding, s.device, 2, 0), x=near)
     yield from level.filling("t")
     correcting = level.correcting(coarse, scale, projected=projected)
@@ -175,7 +189,10 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
 def _sweeps_beside(
     level: StencilLevel, y: Any, x: Any, depth: int, *, projected: bool
 ) -> Iterator[BoundKernel]:
-    """Yield one of a leg's sweeps, from x to y, in cells within `depth` of others'."""
+    """Yield one of a leg's sweeps, from x to y, in cells near those of others.
+
+    The distance is at most `depth`.
+    """
     for low, high in beside_cuts(level.stencil, depth):
         rows = Rows.part(level.stencil.padding, level.stencil.device, low, high)
         yield level.sweeping(
@@ -184,7 +201,7 @@ def _sweeps_beside(
 
 
 def _coarser_part(level: StencilLevel, coarse: StencilLevel, low: Corner, high: Corner) -> Rows:
-    """Return cells of the coarser level with those that they stand for."""
+    """Return cells of the coarser level with their cells of the finer level."""
     factors, s = coarse.factors[::-1], level.stencil
     first = [n * f for n, f in zip(low, factors, strict=True)]
     last = [min(n * f, most) for n, f, most in zip(high, factors, s.padding.counts, strict=True)]
@@ -193,7 +210,7 @@ def _coarser_part(level: StencilLevel, coarse: StencilLevel, low: Corner, high: 
 
 
 def _finer_part(level: StencilLevel, coarse: StencilLevel, low: Corner, high: Corner) -> Rows:
-    """Return cells with those of the coarser level that stand for them."""
+    """Return cells with those of the coarser level that contain them."""
     (fx, fy, fz), s = coarse.factors, level.stencil
     first = [n // f for n, f in zip(low, (fz, fy, fx), strict=True)]
     last = [-(-n // f) for n, f in zip(high, (fz, fy, fx), strict=True)]

@@ -1,4 +1,7 @@
-"""A Galerkin hierarchy of a grid stencil, and its linear and projected (monotone) cycles."""
+"""Galerkin hierarchy of a grid stencil, with linear and projected cycles.
+
+Projected cycles are monotone multigrid.
+"""
 
 from __future__ import annotations
 
@@ -39,21 +42,21 @@ from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kerne
 class Hierarchy:
     """Multigrid for (P A P + P D P) e = r on a grid.
 
-    The finest level shares A's weights; its diagonal is the caller's to fill (0 takes a cell out),
-    followed by `rebuild`. `cycle` and `monotone_cycle` are programs that read the right-hand side
-    from the finest `b` and write its `x`; they allocate nothing and read nothing back.
+    The finest level shares A's weights. The caller fills its diagonal (0 removes a cell), and then
+    calls `rebuild`. `cycle` and `monotone_cycle` are programs that read the right-hand side from
+    the finest `b` and write its `x`; they allocate nothing and read nothing back.
 
     Args:
         stencil: the operator on all unknowns.
         real: type of the corrections.
-        bounded: whether projected cycles are wanted; they need bounds on every level.
+        bounded: whether projected cycles are needed; they need bounds on every level.
         settings: of the cycles.
         shifted: whether the finest diagonal is a number of type `real` even where the operator only
             counts faces, so that a shift fits.
         bounds: memory of the finest level's bounds, where the caller has fields that a projected
             cycle may overwrite; an empty upper one if corrections have no upper bounds.
-        shrunk: by how much the cells of the finest level are fewer than those of the last level
-            above it that cycles visit more than once, where it is a level of a larger hierarchy.
+        shrunk: for a part of a larger hierarchy: ratio of the cells of the last level above that
+            cycles visit more than once to the cells of the finest level here.
         strength: weights along x, y and z that decide which axes are coarsened first; None: the
             mean ones.
         finest: another hierarchy's finest level of this stencil, where this one shares it.
@@ -94,12 +97,15 @@ class Hierarchy:
         }
         s = self.finest.stencil
         signed = s.weights is not None and s.spans is not None and s.pattern is None
-        # of rows of weights
+        # Hashes of rows of weights.
         self._signs = zeros(s.padding.counts[:2], wp.uint64, self.device) if signed else None
         self.refresh()
 
     def _is_coarsest(self, level: StencilLevel) -> bool:
-        """Whether a dense inverse of a level is cheap; on several processes, whether it is gathered."""
+        """Return whether a dense inverse of a level is cheap.
+
+        On several processes: whether the level is gathered.
+        """
         ghosts, counts = level.stencil.ghosts, whole_counts(level.stencil)
         if ghosts is not None:
             return (
@@ -111,7 +117,10 @@ class Hierarchy:
         )
 
     def _coarsest_solver(self) -> CoarsestSolver:
-        """Return what solves on the coarsest levels: small ones in one launch, the last one by its dense inverse."""
+        """Return the solver of the coarsest levels.
+
+        Small levels are fused in one launch; the last one is solved by its dense inverse.
+        """
         self._dense = dense = DenseInverse(self.levels[-1])
         compact = self.finest.stencil.pattern is not None
         cells = 0 if compact else cells_of_one_launch(self.settings, self.device)
@@ -129,7 +138,10 @@ class Hierarchy:
         return solve
 
     def _gather(self, *, bounded: bool) -> CoarsestSolver:
-        """Return what solves on the last level that processes share: on every one of them, a hierarchy of the whole grid."""
+        """Return the solver of the last distributed level.
+
+        Every process has a hierarchy of the whole grid from there on.
+        """
         last, (nz, ny, nx) = self.levels[-1], whole_counts(self.levels[-1].stencil)
         assert last.stencil.ghosts is not None
         gathering, strength = last.stencil.ghosts.gathering, tuple(self._strength)
@@ -173,12 +185,10 @@ class Hierarchy:
         )
 
     def refresh(self) -> None:
-        """Read rows and weights of the operator again after in-place changes.
+        """Update rows and weights of the operator after in-place changes.
 
-        Also clears what lies outside the new rows.
-
-        Rows whose span or weights are not what they were are marked in the finest level's
-        `changed`. Weights are compared by 64 bits a row that they hash to.
+        It also clears fields outside the new rows, and marks rows whose span or weights have
+        changed in the finest level's `changed`. Weights are compared by a 64-bit hash of their row.
         """
         ours, theirs = self.finest.stencil.weights, self._source.weights
         for w, source in zip(ours or (), theirs or (), strict=True):
@@ -192,7 +202,7 @@ class Hierarchy:
     def knows_changes(self) -> bool:
         """Whether `refresh` finds the changed rows, by launches that can be recorded.
 
-        On several processes none knows what others have changed.
+        On several processes it does not: a process has no record of the others' changes.
         """
         s = self.finest.stencil
         return s.spans is not None and s.pattern is None and s.ghosts is None
@@ -216,6 +226,8 @@ class Hierarchy:
     def hold(self, d: wp.array[Any], free: wp.array[Any]) -> None:
         """Set the finest diagonal for a free set: d where `free`, else 0.
 
+        `free` is a stored uint8 field. Changed rows are marked.
+
         `free` is a stored uint8 field; changed rows are marked.
         """
         s = self.finest.stencil
@@ -227,12 +239,11 @@ class Hierarchy:
         self.rebuild_changed()
 
     def rebuild_changed(self) -> None:
-        """Rebuild the levels only for marked rows of the finest level.
+        """Rebuild the levels for marked rows of the finest level only.
 
-        Those marked in its `changed`, and the coarse rows that depend on them.
-
-        Code that writes the finest diagonal must mark the rows, as `hold` does. The result is
-        bitwise that of a complete rebuild.
+        The rows are marked in its `changed`; the coarse rows that depend on them are rebuilt. Code
+        that writes the finest diagonal must mark the rows, as `hold` does. The result is bitwise
+        that of a complete rebuild.
         """
         self.rebuilding.run()
 
@@ -258,7 +269,7 @@ class Hierarchy:
         return program
 
     def _rebuild_gathered(self, program: CommandBuffer) -> None:
-        """Record what gathers the last level's stencil, and builds the levels below it."""
+        """Record the gathering of the last level's stencil, and the levels below it."""
         assert self._gathered is not None
         ours, finest = self.levels[-1].stencil, self._gathered.finest
         gathering: Any = ours.ghosts.gathering  # type: ignore[union-attr]
@@ -273,23 +284,28 @@ class Hierarchy:
 
     @cached_property
     def cycle(self) -> CommandBuffer:
-        """Linear cycle: symmetric positive (semi-)definite approximate inverse."""
+        """Program of a linear cycle: a symmetric approximate inverse.
+
+        It is positive (semi-)definite.
+        """
         return recorded(self.device, self._stages(projected=False))
 
     @cached_property
     def monotone_cycle(self) -> CommandBuffer:
-        """Projected cycle on all levels.
+        """Program of a projected cycle on all levels.
 
-        Every sweep is clipped, and coarse bounds keep the finer iterate within its own.
-
-        It moves whole aggregates on and off their bounds, where an active-set method moves the
+        Every sweep is clipped, and coarse bounds keep the finer iterate within its own. The cycle
+        moves whole aggregates on and off their bounds, where an active-set method moves the
         boundary by about a layer of cells a step.
         """
         return recorded(self.device, self._stages(projected=True))
 
     @cached_property
     def projected_sweep(self) -> CommandBuffer:
-        """Projected Jacobi sweep of the finest level; it never increases the energy."""
+        """Program of a projected Jacobi sweep of the finest level.
+
+        The sweep never increases the energy.
+        """
         program, L = CommandBuffer(self.device), self.finest
         L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(
             program.launch
@@ -298,18 +314,18 @@ class Hierarchy:
 
     @property
     def ends_in_wave(self) -> bool:
-        """Whether the last leg of a linear cycle is one pass through memory.
+        """Whether the last leg of a linear cycle is one fused kernel.
 
-        A caller may then fuse more with it, see `cycle_with`.
+        A caller may then fuse further kernels with it, see `cycle_with`.
         """
         return len(self.cycles[False].levels) > 1 and self.finest.fuses
 
     def cycle_with(self, wave: FusedKernel, *more: BoundKernel) -> CommandBuffer:
-        """Return the linear cycle whose last leg does more, if `ends_in_wave`.
+        """Return the linear cycle with kernels added to its last leg, if `ends_in_wave`.
 
         Args:
-            wave: `ASCEND`, and kernels behind it.
-            more: those, bound.
+            wave: fused kernel of `ASCEND`, and the added kernels.
+            more: those kernels, bound.
         """
         leg = self._last_leg()
         longer = [
@@ -326,13 +342,16 @@ class Hierarchy:
         return self.cycles[projected].stages()
 
     def _coarser(self, fine: StencilLevel, *, bounded: bool) -> StencilLevel:
-        """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""
+        """Return the next level: aggregates of two cells along some axes.
+
+        All axes are coarsened, or only the strong ones where axes differ much.
+        """
         s, counts = fine.stencil, fine.stencil.padding.counts
         whole = whole_counts(s)
         factors = self._factors(whole)
         fewer: Any = tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True))
         padding = Padding(fewer, s.padding.small_pages)
-        # a coarse face is as many finer ones as the other axes were aggregated by
+        # A coarse face sums as many finer ones as cells are aggregated along the other axes.
         for axis in range(3):
             self._strength[axis] *= math.prod(factors) / factors[axis]
         pattern = coarser_pattern(s.pattern, factors) if s.pattern else None
@@ -362,8 +381,8 @@ class Hierarchy:
             stencil, self.real, self.settings, bounded=bounded, upper=fine.upper.size > 0
         )
         level.factors, level.block = factors, block
-        # visiting levels of half the cells twice would cost as much on each of them: only every
-        # second one is
+        # If the cells are only halved, visiting every level twice would cost as much on each of
+        # them: only every second level is visited twice.
         level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:
             most = (
@@ -374,15 +393,15 @@ class Hierarchy:
         return level
 
     def _factors(self, counts: tuple[int, int, int]) -> tuple[int, int, int]:
-        """Return by how many cells x, y and z are aggregated."""
+        """Return the number of cells in an aggregate along x, y and z."""
         long = [n > 1 for n in reversed(counts)]
         strongest = max(w for w, more in zip(self._strength, long, strict=True) if more)
         chosen = [
             more and w >= self.settings.semicoarsening_threshold * strongest
             for w, more in zip(self._strength, long, strict=True)
         ]
-        # an axis of one cell may be aggregated with its ghost: it changes nothing, and keeps
-        # isotropic grids in one form
+        # An axis of one cell may be aggregated with its ghost cell. The result is the same, and
+        # isotropic grids keep one variant of their kernels.
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 
 
@@ -395,7 +414,10 @@ def _finest_level(
     bounds: Pair | None,
     shifted: bool,
 ) -> StencilLevel:
-    """Return the level of an operator's stencil: its weights, and a diagonal of its own, 0 so far."""
+    """Return the level of an operator's stencil.
+
+    It has the operator's weights, and a diagonal of its own, 0 so far.
+    """
     d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
     weights = stencil.weights
     if weights is not None and weights[0].dtype is not real:
@@ -409,7 +431,7 @@ def _finest_level(
 def _whole_stencil(
     part: PaddedStencil, counts: tuple[int, int, int], strength: tuple[float, float, float]
 ) -> PaddedStencil:
-    """Return a stencil like a process's of the whole grid, still empty."""
+    """Return an empty stencil of the whole grid, like that of a process."""
     padding = Padding(counts)
 
     def like(field: wp.array[Any]) -> wp.array[Any]:

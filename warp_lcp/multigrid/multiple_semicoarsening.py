@@ -1,4 +1,7 @@
-"""Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
+"""Multiple semicoarsening, for anisotropy whose direction varies in space.
+
+There is a hierarchy for each direction of strong coupling.
+"""
 
 import math
 from collections.abc import Iterator
@@ -17,24 +20,26 @@ from warp_lcp.operators.sparse import GATHER
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 
-# ratios of weights that differ by this factor between places, or from the mean weights', ask for a
-# hierarchy of their own
+# Ratios of weights that differ by this factor between places, or from the mean weights', need a
+# hierarchy of their own.
 TURN = 10.0
-SHARE = 0.01  # of the sampled blocks that must do so
-LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
-# cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
+SHARE = 0.01  # least share of the sampled blocks with such ratios
+LEAST = 1e-6  # least weight that counts, relative to a block's largest
+# Cells of a block along each long axis: 64 faces an axis, whose mean noise does not look like a
+# change of direction.
 EDGES = {2: 8, 3: 4}
-# the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
+# The most blocks that are sampled along each axis: 2 ms in all, whatever the grid.
 SAMPLES = {2: 24, 3: 8}
 
 
 class MultipleSemicoarsening(Hierarchy):
-    """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
+    """A `Hierarchy` and companions that coarsen other axes first.
 
-    Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong
-    axis differs from place to place no order of coarsening suits all of them. Each hierarchy deals
-    with the places that it suits, and each cycle starts from what the one before has left, so that
-    they share the finest level and need no residuals between them.
+    Cycles visit them one after another, forward and backward. Point sweeps smooth along strong
+    couplings only, so levels must coarsen there; where the strong axis differs from place to place
+    no order of coarsening suits all of them. Each hierarchy corrects the places that it suits, and
+    each cycle starts from the result of the one before, so that they share the finest level and
+    need no residuals between them.
 
     Args:
         strengths: of each companion.
@@ -44,14 +49,15 @@ class MultipleSemicoarsening(Hierarchy):
         self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any
     ) -> None:
         settings = options.pop("settings", None) or CycleSettings()
-        # a launch of all levels starts from x = 0: the finest one stays out of it
+        # A fused launch of all levels starts from x = 0, so the finest level must not be part of
+        # it.
         fewer = math.prod(stencil.padding.counts) - 1
         names = ("one_launch_cpu", "one_launch_cuda", "one_launch_cluster")
         settings = replace(
             settings, **{name: min(getattr(settings, name), fewer) for name in names}
         )
         super().__init__(stencil, real, **options, settings=settings)
-        # W-cycles save a step in ten and cost two to four times as much
+        # W-cycles save a step in ten and cost two to four times as much.
         options["settings"] = replace(settings, gamma=1)
         self.companions = [
             Hierarchy(stencil, real, **options, strength=strength, finest=self.finest)
@@ -61,17 +67,23 @@ class MultipleSemicoarsening(Hierarchy):
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the levels hold, the finest one once; shared weights not counted."""
+        """Memory of the levels [bytes].
+
+        The finest one counts once, shared weights not at all.
+        """
         return super().nbytes + sum(c.nbytes - self.finest.nbytes for c in self.companions)
 
     def refresh(self) -> None:
-        """Take the operator's rows and weights again."""
+        """Update the operator's rows and weights."""
         super().refresh()
         for companion in getattr(self, "companions", ()):
             companion.refresh()
 
     def rebuild_changed(self) -> None:
-        """Coarsen what the finest level's marked rows change; the last hierarchy clears the marks."""
+        """Coarsen what the finest level's marked rows change.
+
+        The last hierarchy clears the marks.
+        """
         wp.copy(self._marks, self.finest.changed)
         for part in (self, *self.companions):
             wp.copy(self.finest.changed, self._marks)
@@ -82,7 +94,10 @@ class MultipleSemicoarsening(Hierarchy):
         return self.companions[0]._last_leg()
 
     def _stages(self, *, projected: bool) -> Iterator[CycleStage]:
-        """Yield a cycle on each hierarchy, the first from x = 0; linear ones forth and back, which is symmetric."""
+        """Yield a cycle on each hierarchy, the first from x = 0.
+
+        Linear cycles go forward and backward, which is symmetric.
+        """
         parts = [*self.companions, self, *(() if projected else self.companions[::-1])]
         for place, part in enumerate(parts):
             yield from part.cycles[projected].stages(from_zero=place == 0)
@@ -99,15 +114,17 @@ def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarc
 
 
 def turns(stencil: PaddedStencil) -> list[Strength]:
-    """Return the ways in which cells are coupled that the mean weights do not tell; none where the strong axes are the same everywhere.
+    """Return the strengths of coupling that the mean weights do not show.
 
-    Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor
-    surfaces and cut cells, which are few in a block, from equal ones; where a block's ratios of
-    weights along the axes differ from the median block's by `TURN`, the direction turns.
+    Empty where the strong axes are the same everywhere. Blocks are sampled. The mean logarithm of
+    64 faces hardly depends on random coefficients, surfaces and cut cells, which are few in a
+    block; where a block's ratios of weights along the axes differ from the median block's by
+    `TURN`, the direction turns.
     """
     if stencil.weights is None or stencil.pattern is not None:
         return []
     logs = _sampled(stencil)
+    # Ratios of weights along the axes, as differences of logarithms.
     centered = logs - logs.mean(axis=1, keepdims=True)
     if (
         len(logs) == 0
@@ -116,12 +133,14 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
         return []
     long = _long(stencil)
     relative = logs - logs.max(axis=1, keepdims=True)
+    # Blocks are grouped by their strong axes: those within TURN of the strongest one.
     ways, way_of = np.unique(relative > -math.log(TURN), axis=0, return_inverse=True)
     mean, found = np.log(np.maximum(np.array(stencil.mean_weights)[long], 1e-300)), []
     for way in range(len(ways)):
         members = relative[way_of == way]
         if len(members) < SHARE * len(relative):
             continue
+        # A group needs a hierarchy of its own if its ratios differ from those of the mean weights.
         typical = np.median(members, axis=0)
         if _mismatch(typical[None], mean)[0] > math.log(TURN):
             strength = np.full(3, LEAST)
@@ -131,7 +150,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
 
 
 def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return by how much the ratios of rows of weights differ from others, as a logarithm."""
+    """Return how much the ratios of rows of weights differ, as a logarithm."""
     return np.ptp(logs - other, axis=1)
 
 
@@ -141,7 +160,10 @@ def _long(stencil: PaddedStencil) -> list[int]:
 
 
 def _sampled(stencil: PaddedStencil) -> np.ndarray:
-    """Return the mean logarithms of the weights along the long axes, a row a block that has open faces along all of them."""
+    """Return the mean logarithms of the weights along the long axes.
+
+    One row for each block that has open faces along all of them.
+    """
     cells, long, device = stencil.padding.counts, _long(stencil), stencil.device
     dimension = max(len(long), 2)
     edges = [min(n, EDGES[dimension]) for n in cells]
@@ -149,7 +171,7 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     samples = [min(n, SAMPLES[dimension]) for n in blocks]
     shape, sides = stencil.padding.shape, (math.prod(samples), math.prod(edges))
     along = [
-        # samples are spread evenly over the blocks
+        # Samples are spread evenly over the blocks.
         (np.arange(m) * n // m * edge + 1)[:, None] + np.arange(edge)
         for m, n, edge in zip(samples, blocks, edges, strict=True)
     ]
@@ -159,12 +181,13 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     ).transpose(0, 2, 4, 1, 3, 5)
     order = wp.array(places.ravel(), dtype=wp.int32, device=device)
     assert stencil.weights is not None
-    # by block, axis, face
+    # Indices: block, axis, face.
     faces = np.stack([_gathered(w, order).reshape(sides) for w in stencil.weights], axis=1)
     least = LEAST * faces.max(axis=(1, 2), keepdims=True)
     totals = np.log(np.where(faces > 0, np.maximum(faces, least), 1.0)).sum(axis=2)
     counts = np.count_nonzero(faces, axis=2)
-    counted = (2 * counts >= sides[1])[:, long].all(axis=1)  # few open faces tell nothing
+    # Blocks with few open faces are not representative.
+    counted = (2 * counts >= sides[1])[:, long].all(axis=1)
     return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
 
 

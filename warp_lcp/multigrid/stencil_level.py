@@ -1,4 +1,4 @@
-"""Level of a stencil on a grid: sweeps, transfers by aggregates, and the legs of a cycle."""
+"""Level of a stencil on a grid: sweeps, transfers by aggregates, legs of a cycle."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from warp_lcp.multigrid.cycle_passes import Coarsening
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
-# cells up to which a launch on a GPU costs more than work that is done again: by the counts of
-# `benchmarks/gpu_counts.py`, two sweeps in one issue 119 instructions a cell, not 82, and a
-# correction with a sweep 105, not 78
+# Up to as many cells, a launch on a GPU costs more than repeated work: by the counts of
+# `benchmarks/gpu_counts.py`, two sweeps in one kernel issue 119 instructions a cell instead of 82,
+# and a correction with a sweep 105 instead of 78.
 JOINED_CELLS = 1 << 20
 Pair = tuple[wp.array[Any], wp.array[Any]]
 
@@ -39,8 +39,8 @@ class StencilLevel:
         bounds: memory of the bounds; None: fields of the level.
 
     Attributes:
-        x, b, t: iterate, right-hand side and what lies between two sweeps.
-        factors: cells of the finer level along x, y and z that one of this level stands for.
+        x, b, t: iterate, right-hand side and the value between two sweeps.
+        factors: cells of the finer level along x, y and z in a cell of this level.
         gathered: whether its problem is solved on every process, see `GatheredLevel`.
         in_one_launch: whether its stages are those of one launch, see `FusedCoarseLevels`.
     """
@@ -66,24 +66,28 @@ class StencilLevel:
             else (self.x, self.x)
         )
         self.form = stencil.weights is not None, stencil.d.dtype, real, stencil.pattern
-        # weights of a compact level, one field after another
+        # Weights of a compact level, one field after another.
         self.block: wp.array[Any] | None = None
         self.factors = 1, 1, 1
-        # passes by what tells them apart: a W-cycle repeats few of them many times
+        # Bound kernels by their keys: a W-cycle repeats few of them many times.
         self._bound: dict[Any, Any] = {}
-        # by a cycle of the next finer level; by how much since a level that was visited more
+        # Visits by a cycle of the next finer level; reduction of cells since a level that was
+        # visited more often.
         self.visits, self.shrunk = 1, 1.0
         rows = stencil.padding.counts[:2]
-        self.changed = zeros(rows, wp.uint8, stencil.device)  # rows, since the last rebuild
+        self.changed = zeros(rows, wp.uint8, stencil.device)  # rows changed since the last rebuild
         self.changed.fill_(1)
-        # of the fields' contents
+        # Spans that the fields' contents have.
         self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)
 
     def renewing(self, *, keeps_weights: bool) -> BoundKernel:
-        """Return the pass that clears the fields outside the rows' new spans and marks rows whose span has changed.
+        """Return the kernel that clears fields outside the rows' new spans.
+
+        It also marks rows whose span has changed.
 
         Args:
-            keeps_weights: whether the weights are not the level's own to clear.
+            keeps_weights: whether the weights do not belong to the level, so that they are not
+                cleared.
         """
         s = self.stencil
         lower_x, lower_y, lower_z = (None if keeps_weights or s.pattern else s.weights) or (
@@ -105,7 +109,7 @@ class StencilLevel:
         )
 
     def signing(self, signs: wp.array[Any]) -> BoundKernel:
-        """Return the pass that marks rows whose weights hash to other 64 bits than before."""
+        """Return the kernel that marks rows whose weights hash to other 64 bits."""
         s = self.stencil
         assert s.weights is not None
         weight_x, weight_y, weight_z = s.weights
@@ -120,7 +124,10 @@ class StencilLevel:
         )
 
     def coarsening(self, coarse: StencilLevel, stiffen: float, held: float) -> BoundKernel:
-        """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
+        """Return the kernel that updates rows of the coarser level.
+
+        They are those that depend on changed rows of this level.
+        """
         s, c = self.stencil, coarse.stencil
         shared = Coarsening(
             self.changed, coarse.changed, c.d, s.padding.counts[2], *s.periodic, stiffen, held
@@ -141,7 +148,7 @@ class StencilLevel:
         )
 
     def restricting(self, coarse: StencilLevel, rows: Rows | None = None) -> BoundKernel:
-        """Return the pass that sums the residual over aggregates, all unless told."""
+        """Return the kernel that sums the residual over aggregates, by default all."""
         there = rows or self._coarser_rows(coarse)
 
         def make() -> Any:
@@ -160,7 +167,10 @@ class StencilLevel:
         rows: Rows | None = None,
         x: wp.array[Any] | None = None,
     ) -> BoundKernel:
-        """Return the pass that adds `scale` times the coarse correction to x, or another field, clipped if projected."""
+        """Return the kernel that adds `scale` times the coarse correction.
+
+        It adds to x, or to another field; the result is clipped to the bounds if projected.
+        """
         there = rows or self._finer_rows(coarse)
         lower, upper = self._sides(projected)
         make = lambda: passes.CORRECT.bind(  # noqa: E731
@@ -173,15 +183,19 @@ class StencilLevel:
             lower=lower,
             upper=upper,
         )
-        return self._once((coarse, projected, id(rows)), make)  # which keeps the rows
+        # The kernel keeps the rows alive, so that their id stays unique.
+        return self._once((coarse, projected, id(rows)), make)
 
     def filling(self, name: str) -> list[BoundKernel | Task]:
-        """Return what fills the ghost cells of a field, x or t."""
+        """Return the exchange that fills the ghost cells of x or t."""
         return self._once(name, lambda: self.stencil.fillings(getattr(self, name)))
 
     @cached_property
     def near(self) -> wp.array[Any]:
-        """Field of which a leg up uses the cells beside other processes', then three planes."""
+        """Buffer of the ascending leg.
+
+        It uses the cells beside other processes' first, then three planes.
+        """
         return zeros(self.stencil.padding.size, self.real, self.stencil.device, small_pages=True)
 
     @property
@@ -200,7 +214,7 @@ class StencilLevel:
     def pair(
         self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False
     ) -> Iterator[BoundKernel | Task]:
-        """Yield two sweeps, x to t and back; x is taken for 0 if from_zero."""
+        """Yield two sweeps, x to t and back; x is taken as 0 if from_zero."""
         if from_zero and self.joins_sweeps:
             yield self._two_sweeps(weights, projected=projected)
             return
@@ -217,7 +231,10 @@ class StencilLevel:
         from_zero: bool = False,
         ring: wp.array[Any] | None = None,
     ) -> tuple[BoundKernel, BoundKernel]:
-        """Return the same for one wave: what is between the sweeps lies in a ring of planes, of t unless told."""
+        """Return the same for one fused kernel.
+
+        Values between the sweeps lie in a ring of planes, by default of t.
+        """
         between = self.t if ring is None else ring
         into = self.sweeping(
             between,
@@ -233,7 +250,7 @@ class StencilLevel:
 
     @property
     def joins_sweeps(self) -> bool:
-        """Whether two sweeps from zero are one launch, and a correction and the sweep after it.
+        """Whether two sweeps from zero are one launch, and correction and sweep another.
 
         They are on CUDA, where small levels take as long as their launches, unless ghost cells must
         be filled between sweeps. Compact stencils have too many neighbors.
@@ -245,10 +262,10 @@ class StencilLevel:
 
     @property
     def fuses(self) -> bool:
-        """Whether a leg of the cycle is one pass through memory.
+        """Whether a leg of the cycle is one fused kernel.
 
         It is on the CPU, in three planes at a time, unless periodic ghost cells must be filled
-        between sweeps; those of other processes' cells are computed.
+        between sweeps. Ghost cells at other processes' cells are computed instead.
         """
         s = self.stencil
         streams = s.device.is_cpu and not any(s.periodic) and not self.in_one_launch
@@ -257,7 +274,10 @@ class StencilLevel:
     def descend(
         self, coarse: StencilLevel, *, projected: bool, from_zero: bool
     ) -> tuple[CycleStage, ...]:
-        """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
+        """Return steps 1 and 2 of a cycle.
+
+        A pair of Chebyshev-Jacobi sweeps, and the residual restricted to the next level.
+        """
         make = lambda: tuple(self._descent(coarse, projected=projected, from_zero=from_zero))  # noqa: E731
         return self._once(("descend", coarse, projected, from_zero), make)
 
@@ -276,7 +296,10 @@ class StencilLevel:
             yield Leg(passes.DESCEND, (*sweeps, self.restricting(coarse)))
 
     def coarsen_bounds(self, coarse: StencilLevel) -> tuple[BoundKernel]:
-        """Return step 3: the member nearest to its bound limits its aggregate."""
+        """Return step 3 of a cycle, for the bounds of aggregates.
+
+        The member that is closest to its bound limits its aggregate.
+        """
         make = lambda: passes.COARSE_BOUNDS.bind(  # noqa: E731
             self._coarser_rows(coarse),
             stencil=self.stencil,
@@ -290,7 +313,10 @@ class StencilLevel:
         return (self._once(("bounds", coarse), make),)
 
     def ascend(self, coarse: StencilLevel, *, projected: bool) -> tuple[CycleStage, ...]:
-        """Return steps 5 and 6: the correction and the reverse pair, which keeps the cycle symmetric."""
+        """Return steps 5 and 6 of a cycle.
+
+        The correction, and the reverse pair of sweeps, which keeps the cycle symmetric.
+        """
         return self._once(
             ("ascend", coarse, projected), lambda: tuple(self._ascent(coarse, projected=projected))
         )
@@ -312,7 +338,7 @@ class StencilLevel:
             yield from self.pair(weights, projected=projected)
 
     def _two_sweeps(self, weights: tuple[float, float], *, projected: bool) -> BoundKernel:
-        """Return the pass x = two sweeps of 0."""
+        """Return the kernel of two sweeps from x = 0."""
         lower, upper = self._sides(projected)
         make = lambda: passes.TWO_SWEEPS.bind(  # noqa: E731
             self.stencil.rows,
@@ -330,7 +356,7 @@ class StencilLevel:
     def _correct_and_sweep(
         self, coarse: StencilLevel, omega: float, *, projected: bool
     ) -> BoundKernel:
-        """Return the pass t = a sweep of x and the coarse correction of it."""
+        """Return the kernel t = a sweep of x with the coarse correction added."""
         lower, upper = self._sides(projected)
         make = lambda: passes.CORRECT_AND_SWEEP.bind(  # noqa: E731
             self._finer_rows(coarse),
@@ -348,7 +374,7 @@ class StencilLevel:
         return self._once(("correct and sweep", coarse, omega, projected), make)
 
     def coarsened(self, coarse: StencilLevel) -> Iterator[BoundKernel | Task]:
-        """Yield the making of the next level."""
+        """Yield the stages that compute the next level."""
         yield self.coarsening(
             coarse, self.settings.over_correction, self.settings.dirichlet_scaling
         )
@@ -356,7 +382,7 @@ class StencilLevel:
             yield from coarse.stencil.fillings(w)
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the pass with this key, made at its first use."""
+        """Return the bound kernel with this key, created at its first use."""
         made = self._bound.get(key)
         if made is None:
             made = self._bound[key] = make()
@@ -383,7 +409,11 @@ class StencilLevel:
         kind: StencilKernel = passes.SWEEP,
         rows: Rows | None = None,
     ) -> BoundKernel:
-        """Return the pass y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero.
+        """Return the kernel y = x + omega D^-1 (b - A x).
+
+        It is clipped to the bounds if projected; x is taken as 0 if from_zero.
+
+        `kind` may be one that goes into or out of a ring; `rows` are all by default.
 
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
