@@ -202,7 +202,7 @@ for (int k_i = begin_, p_ = (int)L.base + begin_ * plane_step_ + row_ * row_step
         from_ = from_ > span[0] ? from_ : span[0];
         to_ = to_ < span[1] ? to_ : span[1];
     }
-    // Cell of the other level. One of its cells covers one or two cells of this level along an axis.
+    // Cell of the other level. One of its cells covers one or two cells of this level on an axis.
     int q = 0;
     if constexpr (LEVELS) {
         const auto over = [](int i, int f) { return f < -1 ? i >> 1 : f > 1 ? 2 * i : i; };
