@@ -28,7 +28,7 @@
                 const T cx = affine() ? gradient[3 * p] * dx : (T)0,
                         cy = affine() ? gradient[3 * p + 1] * dx : (T)0;
                 const T cz = affine() && rows() == 4 ? gradient[3 * p + 2] * dx : (T)0;
-                // the slopes are subtracted: the value at node (k, j, i).
+                // Without the slopes: the value at node (k, j, i).
                 T v = velocity[3 * p + axis];
                 if (affine()) v = fused(-cz, fz, fused(-cy, fy, fused(-cx, fx, v)));
                 const long long o = k * s1 + j * s2 + i;

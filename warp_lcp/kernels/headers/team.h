@@ -119,7 +119,7 @@ const auto take = [](const Word* made, char* arguments) {
     for (Word left = *patch++; left > 0; --left, patch += 3)
         __builtin_memcpy(arguments + patch[0], (const void*)patch[1], patch[2]);
 };
-// copy bytes of a field, or clear them.
+// Copy bytes of a field, or clear them.
 const auto copy = [](const Word* made, Long begin, Long end) {
     const char* from = (const char*)made[FUNCTION];
     char* to = (char*)made[ARGUMENTS];
@@ -173,7 +173,7 @@ const auto take_any = [=](const Word* op, Word runs) -> Long {
     }
     return -1;
 };
-// whether this thread now owns the chunk.
+// Whether this thread now owns the chunk.
 const auto take_next = [=](const Word* op, Word runs, Word chunk) {
     for (Word l = 0; l < op[LANES]; ++l)
         if (chunk < start_of(op, l + 1)) return take_of(op, l, runs, false, (Long)chunk) >= 0;
