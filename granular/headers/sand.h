@@ -54,8 +54,8 @@ auto counted = open;
 #endif
 
 // snippet rate_bound: mu(I) friction, which grows with the rate of shear [Jop, Forterre & Pouliquen
-// 2006]: the radius is r + gain e/(e + half), with e the cell's rate of shear times dx [m/s]. At e
-// = half it has half of the gain. Both are functions of the pressure.
+// 2006]: the radius is r + gain e/(e + half), with e the cell's rate of shear times dx [m/s]. Both
+// `gain` and `half` are functions of the pressure; at e = half there is half of the gain.
 auto gain_at = [&](T x) INLINE { return RATE && x > (T)0 ? (T)numbers[GAIN] * x : (T)0; };
 auto half_at = [&](T x) INLINE { return RATE && x > (T)0 ? (T)numbers[HALFWAY] * sqrt(x) : (T)0; };
 auto gained = [](T e, T gain, T half) INLINE { return e > (T)0 ? gain * e / (e + half) : (T)0; };

@@ -438,7 +438,7 @@ for (int i = first; i < last; ++i) {
 }
 
 // kernel granular.report.report: How close each cell is to yielding. Sums: cells that carry shear,
-// yielded ones, power of friction; `most`: the largest of a predicted fraction
+// yielded ones, power of friction; `most`: the largest predicted fraction
 //   compute    float64
 //   whole      float32 numbers
 //   box        uint8 flags; float32 now, drive, stiff, ratio, openings?, share_x, share_y?,

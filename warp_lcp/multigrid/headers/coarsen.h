@@ -133,7 +133,7 @@ if (make) {
                     bx_ += f;
                     ax_ += g;
                     by_ += h;
-                    ay_ += l;  // the value of the last row remains
+                    ay_ += l;  // the last row's l counts
                     if (!UPPER) bz_ += o;
                     if (UPPER || !BOTH) az_ += q;
                 };

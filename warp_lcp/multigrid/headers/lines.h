@@ -90,7 +90,8 @@ for (int k = 0; k < n; ++k) {
             b = 0;
         }
     }
-    // at most one alone: two coarse cells with shares in one cell only would be equal
+    // Without positive weights one coarse cell alone gets a share: two that share in the same cell
+    // only would be equal.
     shares[at] = odd_x || odd_y ? a : e != 0 ? (T)1 : (T)0;
     shares[size + at] = odd_x && !odd_y ? b : (T)0;
     shares[2 * size + at] = odd_y && !odd_x ? b : (T)0;

@@ -83,7 +83,7 @@ SIMD for (int k = 0; k < n; ++k) {
 //   reads      int8 cells; float64 multiplier, x
 //   writes     float64 face_x?, face_y?, face_z?, shift?
 //   sums       sum_x, sum_y, sum_z, sum_shift
-// the other cell is the one `left` elements before that at `to`
+// across a face to the cell `left` elements before that at `to`
 const auto across = [&](int k, int left, long long to) -> T {
     const bool open = (cells[k] != 2) & ((cells + to)[k - left] != 2);
     return open ? (multiplier[k] - (multiplier + to)[k - left]) * (x[k] - (x + to)[k - left])

@@ -150,7 +150,7 @@ with_bounds([&](auto lower, auto upper) {
 });
 
 // kernel subspace.between: Free set: unknowns between their bounds ([Book] eq. 2.92). Counts:
-// unknowns that moved, and held ones
+// unknowns that entered or left it, and held ones
 //   compute    float64
 //   bounds
 //   reads      float64 x; int8 unknown
