@@ -1,4 +1,4 @@
-// Kernel of sources: points of the lattice that moves with a source and enters its cells.
+// Kernel of sources: points of a source's moving lattice that enter its cells.
 
 // kernel warp_lcp.material.sources.enter: Trace the points of a source's lattice, which all move
 // along the same straight line, through its cells. For each point: the cell in which it begins, and

@@ -11,7 +11,7 @@
 //   module     projected_multigrid.steps
 const S beta = (S)scalars[BETA];
 const T step = scalars[STEP], inverse = step != 0 ? reciprocal(step) : 0;
-const bool fresh = beta == 0;  // q is not read then: it may hold NaN
+const bool fresh = beta == 0;  // q may hold anything then, also NaN
 fetch(0, n, x, z, q);
 with_bounds([&](auto lower, auto upper) {
     SIMD8 for (int k = 0; k < n; ++k) {

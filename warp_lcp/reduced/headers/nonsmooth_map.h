@@ -1,5 +1,5 @@
-// Kernels of nonsmooth Newton methods: maps, derivatives and steps. Constants say what of the maps
-// a problem needs; the rest is not computed.
+// Kernels of nonsmooth Newton methods: maps, derivatives and steps. Constants say which
+// parts of the maps a problem needs; other parts are not computed.
 
 // snippet map_numbers: Type R of a map's values, its constants, and a square root that is
 // vectorized in this type.
