@@ -41,7 +41,11 @@ gc.disable()  # until tests are collected: of what that makes, nothing is garbag
 
 
 def pytest_collection_finish():
-    """Keep what has been imported and collected, a million objects, out of all searches for garbage: each would take a second."""
+    """Freeze the garbage collector's objects after collection.
+
+    A million objects are imported and collected by then: each full garbage collection would take a
+    second.
+    """
     if "emulated_cuda" not in sys.modules:  # which finds kernels among all objects
         gc.freeze()
     gc.set_threshold(2000, 10, 10)  # three times the usual: a test leaves little

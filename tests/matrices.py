@@ -1,4 +1,4 @@
-"""Matrices of tests, as NumPy and SciPy have them, and what is posed with them."""
+"""Test matrices as NumPy and SciPy arrays, and the problems posed with them."""
 
 import numpy as np
 import scipy.sparse
@@ -7,13 +7,19 @@ import warp_lcp as wl
 
 
 def spd(n, seed, shift):
-    """Return a random symmetric positive definite matrix whose eigenvalues are at least `shift`, shape (n, n)."""
+    """Return a random symmetric positive definite matrix, shape (n, n).
+
+    Its eigenvalues are at least `shift`.
+    """
     B = np.random.default_rng(seed).standard_normal((n, n))
     return B @ B.T / n + shift * np.eye(n)
 
 
 def poisson(*counts):
-    """Return the stencil of 2 d on the diagonal and -1 to each neighbor, held at 0 outside, as a CSR matrix."""
+    """Return the Laplacian stencil in d = len(counts) dimensions as a CSR matrix.
+
+    The diagonal is 2 d, the weight of each neighbor -1; values outside the grid are 0.
+    """
     A = scipy.sparse.csr_array((1, 1))
     for n in counts:
         T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
@@ -24,7 +30,10 @@ def poisson(*counts):
 
 
 def laplacian(n, diagonal=2.0):
-    """Return the five-point stencil on n x n points, -1 to each neighbor and twice `diagonal` in the middle, as a CSR matrix."""
+    """Return the five-point stencil on n x n points as a CSR matrix.
+
+    The diagonal is twice `diagonal`, the weight of each neighbor -1.
+    """
     T, one = (
         scipy.sparse.diags_array([-1.0, diagonal, -1.0], offsets=[-1, 0, 1], shape=(n, n)),
         scipy.sparse.eye_array(n),
@@ -33,14 +42,14 @@ def laplacian(n, diagonal=2.0):
 
 
 def dense_and_sparse(A, device):
-    """Return both operators of a matrix."""
+    """Return the dense and the sparse operator of a matrix."""
     return wl.DenseOperator(A, device=device), wl.SparseOperator(
         scipy.sparse.csr_array(A), device=device
     )
 
 
 def posed(A, b, kind, lower=0.0, upper=np.inf):
-    """Return the problem of a matrix as an operator of a kind, "dense" or "sparse"."""
+    """Return the LCP of a matrix, as an operator of kind "dense" or "sparse"."""
     operator = (
         wl.DenseOperator(A, device="cpu")
         if kind == "dense"
@@ -50,7 +59,10 @@ def posed(A, b, kind, lower=0.0, upper=np.inf):
 
 
 def planted_solution(A, rng, share):
-    """Return b and a strictly complementary solution x of A x + b = y, of which a share of the unknowns is at 0."""
+    """Return b and a strictly complementary solution x of A x + b = y.
+
+    `share` is the probability that an unknown is at its bound 0.
+    """
     held = rng.random(len(A)) < share
     x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))
     return np.where(held, rng.uniform(0.1, 1.0, len(A)), 0.0) - A @ x, x

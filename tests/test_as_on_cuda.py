@@ -127,7 +127,10 @@ APART = {"granular source"}  # of pouring-pile, a minute
 
 
 def features(name: str) -> set[str]:
-    """Return what decides about the kernels of a built-in scene: its tables, some of them by dimension, shapes, joints and settings."""
+    """Return the properties of a built-in scene that determine its kernels.
+
+    They are its tables, some of them by dimension, its shapes, joints and settings.
+    """
     scene = load_scene(name)
     kind, data = scene.scene.simulator, scene.model_dump(exclude_unset=True)
     found = {f"{kind} {table}" for table in data.keys() - {"camera", "output", "solver"}}

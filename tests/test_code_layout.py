@@ -1,4 +1,7 @@
-"""Layout of the source: line width, one class per name, the formatter's exemptions, untyped annotations."""
+"""Layout of the source: line width, class names, exemptions of the formatter.
+
+A line has at most 100 columns, and a class name is defined once.
+"""
 
 import ast
 import re

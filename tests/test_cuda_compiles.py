@@ -482,7 +482,10 @@ def compile_for_cuda(name, archs, folder):
     ids=["one", "all"],
 )
 def test_kernels_compile_for_cuda(reals, archs, tmp_path, every_object):
-    """One variant of each family of modules but for those that have compiled as they are, or all of them."""
+    """Compilation for CUDA of one variant of each family of modules, or of all.
+
+    Modules that have compiled unchanged are left out.
+    """
     names = modules_of_every_kernel(reals)
     assert len(names) > 15
     assert not kernels_not_taken()

@@ -1,12 +1,12 @@
 // Kernels of the pressure projection.
 
-// snippet pressure_face: Solids on a cell's lower faces, and the free surface between cells. In
-// 2-D the third axis repeats the first with a step of 0, so that what enters also leaves.
+// snippet pressure_face: Solids on a cell's lower faces, and the free surface between cells. In 2-D
+// the third axis repeats the first one with a step of 0, so that its inflow equals its outflow.
 const long long sz = planes == 2 ? s1 : 0;
 const float* a[3] = {open_x, open_y, planes == 2 ? open_z : open_x};
 const float* solid[3] = {solid_x, solid_y, planes == 2 ? solid_z : solid_x};
-// the open fraction of a cell's lower face, what the solid adds to what passes it, and the
-// reciprocal of theta between two cells
+// `fraction`: open fraction of a cell's lower face; `passes`: velocity through it, open u + (1 -
+// open) u_solid; `inverse_theta`: 1 / theta between two cells (ghost fluid method).
 auto fraction = [&](int axis, long long i, long long s) {
     return CUT ? a[axis][CUT ? i : 0]
                : (((kind[i] == SOLID) | (kind[i - s] == SOLID)) ? 0.0f : 1.0f);
@@ -15,9 +15,9 @@ auto passes = [&](const float* u, int axis, long long i, long long s) {
     const double open = fraction(axis, i, s);
     return open * u[i] + (MOVING ? (1.0 - open) * solid[axis][MOVING ? i : 0] : 0.0);
 };
-auto inverse_theta = [&](long long i, long long n) {  // FLUID i, AIR n
+auto inverse_theta = [&](long long i, long long n) {  // i is FLUID, n is AIR
     const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0] / phi[GHOST ? i : 0] : 1.0f;
-    // beyond an open side there is air whatever phi says
+    // beyond an open side there is air, whatever phi is
     const float least = inverse > 1.0f ? inverse : 1.0f;
     return least < (float)(1.0 / THETA_MIN) ? least : (float)(1.0 / THETA_MIN);
 };
@@ -26,7 +26,7 @@ auto outflow = [&](const float* u, const float* v, const float* w, long long i) 
            passes(v, 1, i, s2) + passes(w, 2, i + sz, sz) - passes(w, 2, i, sz);
 };
 
-// kernel fluids.pressure.prepare: Right-hand side b, lower bound, first guess and what the free
+// kernel fluids.pressure.prepare: Right-hand side b, lower bound, initial guess, and what the free
 // surface adds to the diagonal of every cell
 //   compute    float64
 //   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?, u,
@@ -44,8 +44,8 @@ SIMD8 for (int i = first; i < last; ++i) {
     if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
     start[i] = fluid ? (x < bound ? bound : x) : 0.0;
 }
-// Where the surface itself pulls by more, with a pressure below that of the air, no air gets to the
-// wall before the pressure is below that.
+// Where surface tension itself lowers the pressure at the wall further below that of the air, this
+// pressure is the bound: air does not reach the wall before.
 if (BOUNDED && jump) {
     const long long steps[6] = {-1, 1, -s2, s2, -sz, sz};
     for (int i = first; i < last; ++i) {
@@ -62,8 +62,8 @@ if (BOUNDED && jump) {
         start[i] = x < least ? least : x;
     }
 }
-// What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away,
-// and the air beyond open sides.
+// Addition to the operator's diagonal for FLUID cells: air nearer than a cell away, and the air
+// beyond open sides.
 if (shift) {
     const int nx = given.kind.shape[2] - 2, ny = given.kind.shape[1] - 2,
               nz = given.kind.shape[0] - 2;
@@ -81,8 +81,9 @@ if (shift) {
     }
 }
 
-// kernel fluids.pressure.subtract_gradient: Project the open faces that touch FLUID and mark them
-// 1; other faces become 0, or -1 inside solids of whole cells
+// kernel fluids.pressure.subtract_gradient: Subtract the pressure gradient, u -= (x_i - x_(i-1)) /
+// theta, on open faces that touch FLUID and mark them 1; mark the other faces 0, or -1 inside
+// solids of whole cells
 //   compute    float64
 //   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?;
 //              float64 x; float32 field; int8 known
@@ -92,24 +93,24 @@ if (shift) {
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
 const int edge =
     (axis == 1 && j == 0) || (axis == 2 && k == 0) ? last : (axis == 0 && first == 0 ? 1 : first);
-for (int i = first; i < edge; ++i) known[i] = -1;  // the ring's own lower faces lie in the wall
+for (int i = first; i < edge; ++i) known[i] = -1;  // lower faces of the ghost ring lie in the wall
 SIMD8 for (int i = edge; i < last; ++i) {
     const int here = kind[i], below = kind[i - s], wet = (here == FLUID) | (below == FLUID);
     const float open = fraction(axis, i, s);
     const float inverse = !GHOST ? 1.0f
                                  : (here == AIR ? inverse_theta(i - s, i)
                                                 : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
-    // a source's cells are SOLID, their faces open
+    // cells of a source are SOLID, but their faces are open
     const int projected = wet & (open > 0.0f) & (here != SOLID) & (below != SOLID);
     field[i] -= projected ? (float)(x[i] - x[i - s]) * inverse : 0.0f;
     const int hidden = CUT ? 0 : (here == SOLID) & (below == SOLID);
     known[i] = projected ? 1 : (hidden ? -1 : 0);
 }
 
-// kernel fluids.pressure.support: Give faces with weight beside projected ones their change, up to
-// `limit` [m/s] and not beyond them; they become 2. Open faces between AIR cells that particles
-// gave weight, beside projected ones. All that a face reads of others is of projected ones, which
-// no other task writes here: the order does not matter.
+// kernel fluids.pressure.support: Change of faces beside projected ones: open faces between AIR
+// cells with weight from particles take the mean change of the projected faces beside them, up to
+// `limit` [m/s] and not beyond the mean velocity of these; they are marked 2. Only projected faces
+// are read, and no task writes to them here: the order does not matter.
 //   compute    float64
 //   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?;
 //              float64 x; float32 field; int8 known; float32 weight, jump?
@@ -118,7 +119,7 @@ SIMD8 for (int i = edge; i < last; ++i) {
 #include "pressure_face"
 const int nx = given.kind.shape[2], ny = given.kind.shape[1], nz = given.kind.shape[0];
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
-// of the jump of surface tension, see `fluids.surface_tension.push`
+// Jump of surface tension on the face, over theta; see `fluids.surface_tension.push`.
 auto over = [&](long long liquid, long long air) {
     return jump[liquid] * (inverse_theta(liquid, air) - 1.0f) + jump[air];
 };
@@ -188,7 +189,7 @@ for (int from = first; from < last; from += M) {
 }
 released = found;
 
-// kernel fluids.pressure.count_fluid: How many cells are FLUID
+// kernel fluids.pressure.count_fluid: Number of FLUID cells
 //   compute    float64
 //   box        int8 kind
 //   sums       fluid
@@ -197,7 +198,7 @@ int found = 0;
 SIMD for (int i = first; i < last; ++i) found += kind[i] == FLUID;
 fluid = found;
 
-// kernel tolerance.change: the first guess becomes what the solve changed
+// kernel tolerance.change: Change by the solve: guess = x - guess
 //   compute    float64
 //   reads      float64 x
 //   writes     float64 guess

@@ -1,9 +1,10 @@
-// Kernels of surface tension. linear, cubic: coefficients of the distance that a smooth share
-// means.
+// Kernels of surface tension. linear, cubic: coefficients of the distance as a function of the
+// smooth share.
 
-// snippet smooth_share: The smooth share of liquid, 2 once - twice, and the distance to its
-// surface [cells], > 0 outside, that it means on a plane: with it central differences are those of
-// lines, where a share's own would miss a fiftieth of the slope and add as much to the curvature.
+// snippet smooth_share: Smooth share of liquid, 2 once - twice, and the distance to its surface
+// [cells], > 0 outside, that a plane with this share has. Central differences of this distance are
+// those of straight lines. Differences of the share itself would lose a fiftieth of the slope and
+// add as much to the curvature.
 auto share = [&](long long n) { return (float)2 * once[n] - twice[n]; };
 auto distance = [&](long long n) {
     const float t = 0.5f - share(n), within = t < -0.45f ? -0.45f : (t > 0.45f ? 0.45f : t);
@@ -11,8 +12,8 @@ auto distance = [&](long long n) {
 };
 auto slope = [&](long long i, long long s) { return 0.5f * (distance(i + s) - distance(i - s)); };
 
-// kernel fluids.surface_tension.curvature: bend = the curvature of the contours of the distance
-// [1/cells], > 0 where the liquid bulges, in cells near the surface; else 0
+// kernel fluids.surface_tension.curvature: bend = curvature of the contours of the distance d,
+// div(grad d / |grad d|) [1/cells], > 0 where the liquid bulges, in cells near the surface; else 0
 //   compute    float32
 //   box        float32 once, twice, bend
 //   numbers    int planes; float32 linear, cubic, limit
@@ -42,7 +43,7 @@ for (int i = first; i < last; ++i) {
 }
 
 // kernel fluids.surface_tension.jump: jump = scale times the curvature at the nearest point of the
-// smooth surface in cells beside the surface; else 0
+// smooth surface, in cells beside the surface; else 0
 //   compute    float32
 //   box        float32 once, twice, bend, jump; int8 kind
 //   numbers    int planes; float32 linear, cubic, scale
@@ -78,8 +79,8 @@ for (int i = first; i < last; ++i) {
     jump[i] = scale * (planes == 2 ? (1 - p[2]) * plane(q) + p[2] * plane(q + s1) : plane(q));
 }
 
-// kernel fluids.surface_tension.push: Push the faces that the surface crosses by the pressure's
-// jump on it over their distance from the liquid's cell; see snippet pressure_face
+// kernel fluids.surface_tension.push: Add the pressure jump on the surface, over theta, to the
+// faces that the surface crosses; see snippet pressure_face
 //   compute    float32
 //   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi,
 //              jump, field
@@ -88,7 +89,7 @@ for (int i = first; i < last; ++i) {
 #include "pressure.h:pressure_face"
 const int nx = given.kind.shape[2], ny = given.kind.shape[1], nz = given.kind.shape[0];
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
-// no cell of the ring has a surface
+// cells of the ghost ring have no surface
 const int lowest[3] = {axis == 0 ? 2 : 1, axis == 1 ? 2 : 1, planes != 2 ? 0 : (axis == 2 ? 2 : 1)};
 const bool inside = j >= lowest[1] && j + 1 < ny && k >= lowest[2] && (planes != 2 || k + 1 < nz);
 const int low = first > lowest[0] ? first : lowest[0], high = last < nx - 1 ? last : nx - 1;
@@ -97,14 +98,14 @@ for (int i = low; i < high && inside; ++i) {
                dry = kind[i] == AIR && kind[i - s] == FLUID;
     if (!wet && !dry) continue;
     const long long liquid = wet ? i : i - s, air = wet ? i - s : i;
-    // of linear interpolation, over theta
+    // jump by linear interpolation, over theta
     const float over = jump[liquid] * (inverse_theta(liquid, air) - 1.0f) + jump[air];
     field[i] += wet ? over : -over;
 }
 
-// kernel fluids.surface_tension.surface_energy: Area of the surface and of the walls that are wet,
-// in faces of cells: a parabola of the share times its slope has the integral 1 across a surface,
-// and counts cells only whose neighbors know their distance.
+// kernel fluids.surface_tension.surface_energy: Area of the surface and of the wetted walls, in
+// faces of cells. The area is the sum of w(share) |grad d|, with a parabola w of the share whose
+// integral across a surface is 1. Only cells whose neighbors have a distance count.
 //   compute    float64
 //   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi,
 //              once, twice

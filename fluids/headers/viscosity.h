@@ -1,40 +1,40 @@
 // Kernels of the viscous solve: weights, walls and forces.
 
-// snippet viscous_walls: What links of a component's face to others weigh where walls are: `d` its
-// distance, `h` the slip length of a face in a wall, `y`, `z` of the two other components; a link
-// to a wall ends at it, or behind it by the slip length.
+// snippet viscous_walls: Weights of the links from a component's face to others where walls are.
+// `d`: distance of the component's faces; `h`: slip length of a face in a wall; `y`, `z`: distances
+// of the other two components. A link to a wall ends at the wall, or behind it by the slip length.
 const bool deep = planes == 2;
 const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0],
                 sc = step[axis == 2 ? 1 : 2];
 const int first_other = axis == 0 ? 1 : 0, last_other = axis == 2 ? 1 : 2;
 const auto solid = [&](const float* distance, long long i) { return distance[i] <= (float)CLOSE; };
-// the reciprocal length of a link from i to the wall before q
+// reciprocal length of a link from i to the wall before q
 const auto beyond = [&](long long i, long long q, float slip) {
     const float length = (d[i] + slip) / (d[i] - d[q]);
     return 1.0f / (length > (float)THETA ? length : (float)THETA);
 };
-// Where such a link ends [cells from face i]: at most at face q, where the products of its edge
-// take the wall's velocity. Liquid and wall that turn as one then have no rate of strain, as weight
+// End of such a link [cells from face i], at most at face q, where the products of its edge use the
+// wall's velocity. Liquid and wall that rotate together then have no rate of strain, since weight
 // times length is that of the whole link.
 const auto end_of = [&](long long i, long long q) {
     const float length = h[q] < INFINITY ? (d[i] + h[q]) / (d[i] - d[q]) : 1.0f;
     return length < 1.0f ? (length > (float)THETA ? length : (float)THETA) : 1.0f;
 };
-// along the component's own axis through cell c
+// Link along the component's own axis through cell c.
 const auto head_on = [&](long long i, long long q, long long c) {
     const bool held = (kind[c] == FLUID) & (contact[c] != RELEASED);
     const bool along = !CUT || d[i] - d[q] >= (float)ALONG;  // no slip across a wall
     const float slip = along ? 0.0f : h[q];
     return held && slip < INFINITY ? cell[c] * beyond(i, q, slip) : 0.0f;
 };
-// which knows already of a length above 1
+// link beside: the weight includes a length above 1 already
 const auto beside = [&](long long i, long long q, float weight) {
     const float inverse = h[q] < INFINITY ? beyond(i, q, h[q]) : 0.0f;
     return weight * (inverse > 1.0f ? inverse : (h[q] < INFINITY ? 1.0f : 0.0f));
 };
 
-// kernel fluids.viscosity.distance: Signed distance of a component's faces from walls that liquid
-// may stick to [cells], and the slip length of the wall on those in one, else -1
+// kernel fluids.viscosity.distance: Signed distance [cells] of a component's faces from walls that
+// liquid may stick to, and the slip length of the wall on faces in one, else -1
 //   compute    float32
 //   whole      float32 slip
 //   box        float32 out, hold, nodes?; int8 kind?; int16 wall?; int32 index?
@@ -45,7 +45,7 @@ const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 
                 sc = step[axis == 2 ? 1 : 2];
 for (int i = first; i < last; ++i) {
     const int at[3] = {i, j, k}, size[3] = {nx, ny, nz};
-    const bool edge = at[axis] == 0;  // below it nothing is stored
+    const bool edge = at[axis] == 0;  // nothing is stored below it
     const long long below = edge ? i : i - sa;
     int owner = 0;
     float distance;
@@ -79,7 +79,7 @@ for (int i = first; i < last; ++i) {
     hold[i] = solid ? slip[owner > 0 ? owner : 0] : -1.0f;
 }
 
-// kernel fluids.viscosity.weights: Which share of cells, edges and faces the liquid fills, times
+// kernel fluids.viscosity.weights: Share of cells, edges and faces that the liquid fills, times
 // `scale` for cells and edges; see fluids.viscosity
 //   compute    float32
 //   box        float32 cell, mixed, xy, xz?, yz?, vx, vy, vz?, dx, dy, dz?, hx, hy, hz?, phi?, mx?,
@@ -93,7 +93,7 @@ const float* h[3] = {hx, hy, deep ? hz : hx};
 float* edge[3] = {xy, deep ? xz : xy, deep ? yz : xy};
 float* volume[3] = {vx, vy, deep ? vz : vx};
 const long long step[3] = {1, s2, s1};
-const auto filled = [&](const long long* cells, int n) {  // the mean over some cells
+const auto filled = [&](const long long* cells, int n) {  // mean over some cells
     if (GHOST) {
         float sum = 0.0f;
         for (int c = 0; c < n; ++c) sum += phi[GHOST ? cells[c] : 0];
@@ -106,8 +106,8 @@ const auto filled = [&](const long long* cells, int n) {  // the mean over some 
     }
     return open ? (float)wet / (float)open : 0.0f;
 };
-// The liquid's viscosity, in units of that which `scale` has: the mean over faces that have some,
-// and the least of them where it differs.
+// Viscosity of the liquid, in units of that in `scale`: the mean over the faces that have a
+// viscosity, or the least of them where it differs.
 const float* m[3] = {VARIES ? mx : dx, VARIES ? my : dx, VARIES && deep ? mz : dx};
 struct Thick {
     float sum, least, most;
@@ -165,7 +165,7 @@ for (int i = first; i < last; ++i) {
     for (int axis = 0; axis <= planes; ++axis) {
         const long long cells[2] = {i - step[axis], i};
         const int at = axis == 0 ? i : (axis == 1 ? j : k);
-        // no projection gave it a velocity of its own
+        // the projection gave it no velocity of its own
         const bool airy = kind[cells[0]] == AIR && kind[i] == AIR;
         volume[axis][i] = inside && at > 1 && !airy ? filled(cells, 2) : 0.0f;
     }
@@ -187,8 +187,8 @@ for (int i = first; i < last; ++i) {
             const long long q = faces[f], p = faces[f ^ 1];  // of one component
             if (!(d[axis][q] <= (float)CLOSE)) continue;
             wall = true;
-            // a link that slip makes longer than 1 pulls less, and so do its products: what is left
-            // is a square
+            // A link that slip makes longer than 1 has a smaller weight, and so have its products:
+            // the remainder is a square.
             const float length = d[axis][p] > (float)CLOSE
                                      ? (d[axis][p] + h[axis][q]) / (d[axis][p] - d[axis][q])
                                      : 1.0f;
@@ -200,8 +200,8 @@ for (int i = first; i < last; ++i) {
     }
 }
 
-// kernel fluids.viscosity.diagonal: The diagonal of a component's rows, 0 where there is no
-// unknown; what walls add to it; and for faces in a wall whether it holds, else -1
+// kernel fluids.viscosity.diagonal: Diagonal of a component's rows, 0 where there is no unknown;
+// what walls add to it; and for faces in a wall whether it holds, else -1
 //   compute    float32
 //   box        float32 diagonal, drag, held, d, h, cell, xb, xc?, volume, thin?; int8 kind;
 //              uint8 contact
@@ -247,8 +247,8 @@ for (int i = first; i < last; ++i) {
     diagonal[i] = free + wall;
 }
 
-// kernel fluids.viscosity.force: What viscosity does to a component in a step, less what it has
-// done: r = -K u - V (u - u1), and sums over it
+// kernel fluids.viscosity.force: Viscous force on a component in a step, minus what it has done
+// already: r = -K u - V (u - u1); sums over it
 //   compute    float32
 //   whole      float32 turn?, shift?
 //   box        float32 r, diagonal, u, ub, uc?, d, h, db, dc?, cell, mixed, xb, xc?, volume,
@@ -262,12 +262,12 @@ double lost = 0, driven = 0, square = 0, large = 0;
 const auto wall_speed = [&](const float* of, long long i) {
     return MOVING ? (double)of[MOVING ? i : 0] : 0.0;
 };
-// whether a face is a source's, by the step along its component's axis
+// whether a face belongs to a source, by the step along its component's axis
 const auto source = [&](long long q, long long s) {
     return ((kind[q] == SOLID) & (base[q] != SOLID)) |
            ((kind[q - s] == SOLID) & (base[q - s] != SOLID));
 };
-// the wall's velocity at the end of the link from i to q along an axis
+// velocity of the wall at the end of the link from i to q along an axis
 const auto met = [&](int i, long long q, int other, int side) {
     if (source(q, sa)) return (double)u[q];
     if (!MOVING || !turn) return wall_speed(own, q);
@@ -340,9 +340,10 @@ taken = lost;
 given_by_walls = driven;
 stiff = large;
 
-// kernel fluids.viscosity.links: What pulls a component's faces towards solids: each link's
+// kernel fluids.viscosity.links: Coupling of a component's faces to solids. For each link: its
 // weight, or that of a product with a face in the solid, times the velocities of the solid's unit
-// motions where the link meets it, or at that face. Without `entry_rows` their number in each row.
+// motions at the end of the link, or at that face. Without `entry_rows`: number of links in each
+// row.
 //   compute    float32
 //   whole      int32 counts, offsets?, entry_rows?, blocks?, body; float64 values?, center
 //   box        float32 d, h, db, dc?, cell, mixed, xb, xc?, diagonal; int8 kind; uint8 contact;
@@ -412,8 +413,8 @@ for (int i = first; i < last; ++i) {
 }
 counts[k * (int)(s1 / s2) + j] = e - begin;
 
-// kernel fluids.viscosity.cover: Faces in a wall that the pressure has moved, as a part of them is
-// open, take the velocity of the wall that holds them
+// kernel fluids.viscosity.cover: Faces in a wall that are partly open, so that the pressure has
+// moved them, take the velocity of the wall that holds them
 //   compute    float32
 //   box        float32 total, u, hold, h, own?; int8 kind, base
 //   numbers    int axis
@@ -427,7 +428,7 @@ SIMD for (int i = first; i < last; ++i) {
     total[i] = stays ? speed - u[i] : total[i];
 }
 
-// kernel fluids.viscosity.add: What a solve has found changes a component; the total of it
+// kernel fluids.viscosity.add: Add the solution of a solve to a component and to its total change
 //   compute    float32
 //   box        float32 u, total, more
 SIMD for (int i = first; i < last; ++i) {
@@ -435,7 +436,7 @@ SIMD for (int i = first; i < last; ++i) {
     total[i] += more[i];
 }
 
-// kernel fluids.viscosity.sum: A kept velocity and what viscosity has changed
+// kernel fluids.viscosity.sum: Saved velocity plus the viscous change: u = kept + more
 //   compute    float32
 //   box        float32 u, kept, more
 SIMD for (int i = first; i < last; ++i) u[i] = kept[i] + more[i];

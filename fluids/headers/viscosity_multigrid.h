@@ -1,12 +1,12 @@
-// Kernels of the multigrid method of the viscous solve.
+// Kernels of the multigrid method for the viscous solve.
 
-// snippet viscous_levels: Between a level and the finer one: coarse cell n covers cells 2n - 1 and
-// 2n, coarse face n is face 2n - 1, and of parts of the two so many more.
+// snippet viscous_levels: Indices between a level and the finer one: coarse cell n covers cells 2n
+// - 1 and 2n; coarse face n is face 2n - 1. On parts of the two levels a shift is added.
 const int shift[3] = {shift_x, shift_y, shift_z};
 const auto clamped = [](int i, int n) { return i < 0 ? 0 : (i < n ? i : n - 1); };
 
-// snippet viscous_stencil: What the neighbors of a face of component x, and faces of y and z, add
-// to its row: A x = diagonal x - around.
+// snippet viscous_stencil: What the neighbors of a face of one component, and faces of the other
+// two, add to its row: A x = diagonal x - around.
 const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0],
                 sc = step[axis == 2 ? 1 : 2];
 const auto pair = [&](const T* n, long long s, long long i) {
@@ -27,9 +27,9 @@ const auto around = [&](long long i) { return along(i) + pair(xb, sb, i) + other
 const int* reach = span + 4 * (k * (int)(s1 / s2) + j);
 const int low = first > reach[0] ? first : reach[0], high = last < reach[1] ? last : reach[1];
 
-// kernel fluids.viscosity.span: Where the unknowns of each row begin and end, and its core: the
-// longest run of cells whose equations are those of the cells beside them. Into `ends` how long
-// the runs are that touch the row's two ends.
+// kernel fluids.viscosity.span: First and last unknown of each row, and its core: the longest run
+// of cells whose equations equal those of the cells beside them. `ends`: lengths of the runs that
+// touch the two ends of the row.
 //   compute    float32
 //   whole      int32 span, ends?
 //   box        float32 dx, dy, dz?
@@ -69,8 +69,8 @@ if (ends) {
 }
 
 // kernel fluids.viscosity.sweep: Gauss-Seidel over the rows of one color, or over what lies before
-// and behind their cores: no two of them meet in the component. Even cells of a row go first, or
-// odd ones; what other rows and components add is found before, for all of a row together.
+// and behind their cores; no two rows of a color touch in the component. Even cells of a row go
+// first, or odd ones. What other rows and components add is computed before, for the whole row.
 //   compute    float32
 //   whole      int32 span
 //   box        float32 x, y, z?, xb, xc?, cell, mixed, diagonal, b, scratch
@@ -120,8 +120,8 @@ SIMD for (int i = low; i < high; ++i) {
     out[i] = diagonal[i] > 0 ? (RESIDUAL ? right[RESIDUAL ? i : 0] - v : v) : 0;
 }
 
-// kernel fluids.viscosity.average: The mean over the finer level, times `scale`: of two cells an
-// axis, or of three faces where bit n of `faces` is set for axis n
+// kernel fluids.viscosity.average: Mean over the finer level, times `scale`: of two cells per axis,
+// or of three faces if bit n of `faces` is set for axis n
 //   compute    float32
 //   whole      float32 fine
 //   box        float32 out
@@ -149,8 +149,8 @@ for (int i = first; i < last; ++i) {
     out[i] = scale * sum;
 }
 
-// kernel fluids.viscosity.close: Whether a wall holds a coarse face: the mean of the finer ones
-// that lie on it, -1 if one of those is not in a wall
+// kernel fluids.viscosity.close: Whether a wall holds a coarse face: the mean of the finer faces on
+// it, -1 if one of them is not in a wall
 //   compute    float32
 //   whole      float32 fine
 //   box        float32 out
@@ -174,8 +174,8 @@ for (int i = first; i < last; ++i) {
     out[i] = least < 0.0f ? -1.0f : sum / (float)count;
 }
 
-// kernel fluids.viscosity.coarse_diagonal: The diagonal of a component's rows on a coarse level;
-// and what counts as there when finer ones interpolate: unknowns, and faces that a wall holds
+// kernel fluids.viscosity.coarse_diagonal: Diagonal of a component's rows on a coarse level; and
+// the places that finer levels interpolate from: unknowns, and faces that a wall holds
 //   compute    float32
 //   box        float32 diagonal, there, h, volume, drag, cell, xb, xc?
 //   numbers    int axis, planes
@@ -211,8 +211,8 @@ for (int i = first; i < last; ++i) {
     there[i] = sum > 0.0f ? 1.0f : 0.0f;
 }
 
-// kernel fluids.viscosity.prolong: Add the coarse correction, or (NORM) find the reciprocal of
-// what the interpolation makes of 1 where there is something, 0 elsewhere
+// kernel fluids.viscosity.prolong: Prolongation: add the coarse correction. NORM: the reciprocal of
+// the interpolation of 1 where it is not 0, 0 elsewhere
 //   compute    float32
 //   whole      float32 coarse; int32 span
 //   box        float32 norm, diagonal?, x?
@@ -268,8 +268,8 @@ for (int start = low; start < high; start += M) {
     }
 }
 
-// kernel fluids.viscosity.restrict: The transpose of the interpolation, a mean over the cells of
-// the finer level
+// kernel fluids.viscosity.restrict: Restriction: the transpose of the interpolation, a mean over
+// the cells of the finer level
 //   compute    float32
 //   whole      float32 fine, norm; int32 span
 //   box        float32 out, diagonal

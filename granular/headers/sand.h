@@ -1,11 +1,11 @@
 // Snippets that kernels of sand share: the grid, the yield set, walls.
 
-// snippet shape: A field of stresses: its layers, see `granular.yield_set`; the axes of each
-// shear; elements from layer to layer and along each axis. Steps read 28 fields: the address of a
-// row of each takes two registers, that of a field is an argument. So on CUDA they count cells
-// from a field's first (FIELD and FIELDS name fields, ROW comes before the row's), of which a
-// thread has one (END). What they read AGAIN, where KEEP is never negative, which the compiler
-// cannot know, is read again: else 48 addresses are held while the cell yields.
+// snippet shape: Field of stresses: its layers, see `granular.yield_set`; the axes of each shear;
+// offsets between layers and along each axis. Steps read 28 fields. The address of a row of each
+// takes two registers; that of a field is an argument. On CUDA they therefore count cells from the
+// first one of a field, and a thread has one cell (END). FIELD and FIELDS name fields, ROW comes
+// before the row's values. Values read with AGAIN are loaded again, since the compiler cannot know
+// that KEEP is never negative; otherwise 48 addresses are held while the cell yields.
 #ifdef __CUDA_ARCH__
 #define INLINE
 #define UNROLL
@@ -20,7 +20,7 @@
 #define ROW 0
 #define END end
 #define AGAIN(KEEP, CELL) (CELL)
-// Vectorized loops may call no function and have no loops inside: these vanish.
+// Vectorized loops cannot call functions or contain loops: these are inlined and unrolled.
 #define INLINE __attribute__((always_inline))
 #define UNROLL PRAGMA(clang loop unroll(full))
 #endif
@@ -31,20 +31,20 @@ const long long nx = given.share_x.shape[2],
                 layer = nx * given.share_x.shape[1] * given.share_x.shape[0];
 const long long s[3] = {1, nx, nx * given.share_x.shape[1]};
 
-// snippet span: The span of a row: cells that hold sand and the cells beside them.
+// snippet span: Span of a row: cells that hold sand, and the cells beside them.
 const int* span = spans + 2 * (k * (long long)given.spans.shape[1] + j);
 const int begin = first > span[0] ? first : span[0], end = last < span[1] ? last : span[1];
 if (begin >= end) continue;
 
-// snippet light: The sum of 1 / mass around an edge.
+// snippet light: Sum of 1 / mass around an edge.
 const float* inverse[3] = FIELDS(inverse);
 auto light = [&](int d, long long o) {
     const int a = ALPHA[d], b = BETA[d];
     return (T)(inverse[a][o] + inverse[a][o - s[b]] + inverse[b][o] + inverse[b][o - s[a]]);
 };
 
-// snippet openings: Where solids cut cells (CUT): the open part of a cell's lower faces, and how
-// much of a cell its differences along an axis stand for.
+// snippet openings: Solids that cut cells (CUT): open part of a cell's lower faces, and the part of
+// a cell that its differences along an axis stand for.
 #if CUT
 auto open = [&](int axis, long long i) INLINE { return (T)openings[axis * layer + i]; };
 auto counted = [&](int axis, long long i) INLINE { return (T)openings[(DIM + axis) * layer + i]; };
@@ -53,9 +53,9 @@ auto open = [](int, long long) INLINE { return (T)1; };
 auto counted = open;
 #endif
 
-// snippet rate_bound: Friction that grows with the rate of shear [Jop, Forterre & Pouliquen 2006]:
-// the radius is r + gain e/(e + half), with e the cell's rate of shear times dx [m/s] and half the
-// one at which half of the gain is there, both functions of the pressure.
+// snippet rate_bound: mu(I) friction, which grows with the rate of shear [Jop, Forterre & Pouliquen
+// 2006]: the radius is r + gain e/(e + half), with e the cell's rate of shear times dx [m/s]. Both
+// `gain` and `half` are functions of the pressure; at e = half there is half of the gain.
 auto gain_at = [&](T x) INLINE { return RATE && x > (T)0 ? (T)numbers[GAIN] * x : (T)0; };
 auto half_at = [&](T x) INLINE { return RATE && x > (T)0 ? (T)numbers[HALFWAY] * sqrt(x) : (T)0; };
 auto gained = [](T e, T gain, T half) INLINE { return e > (T)0 ? gain * e / (e + half) : (T)0; };
@@ -63,9 +63,9 @@ auto gained = [](T e, T gain, T half) INLINE { return e > (T)0 ? gain * e / (e +
 // snippet divergence: w = drive + div(m' u) of a cell, and the diagonal of the pressure's matrix
 // there.
 #include "openings"
-// What passes a face counts by the face's mass: div(m u). A full cell cannot be compressed: it
-// counts volume, div u, or else a block that falls would be squeezed at its front, where lighter
-// faces let less out than comes in from behind. `passes` goes from one to the other.
+// The flux through a face is weighted by the face's mass: div(m u). In a full cell, which cannot be
+// compressed, it is the volume: div u. Otherwise a falling block would be compressed at its front,
+// where lighter faces let less out than comes in from behind. `passes` blends the two.
 auto passes = [](T mass, T full) INLINE { return mass + full * ((T)1 - mass); };
 auto fullness = [](T free) INLINE {
     const T c = (T)1 - free * (T)(1.0 / NEARLY);
@@ -85,7 +85,7 @@ auto divergence = [&](long long i, T& diagonal) INLINE {
     return w;
 };
 
-// snippet edges: What edges read and change of the velocity.
+// snippet edges: Velocities that edges read and change.
 #include "light"
 const float* share[3] = FIELDS(share);
 T* u[3] = FIELDS(u);
@@ -93,7 +93,7 @@ auto rate = [&](int d, long long o) {
     const int a = ALPHA[d], b = BETA[d];
     return (u[a][o] - u[a][o - s[b]]) + (u[b][o] - u[b][o - s[a]]);
 };
-// what a change of an edge's stress does to the velocity
+// Change of the velocity by a change of an edge's stress.
 auto shear = [&](int d, long long o, T by) {
     const int a = ALPHA[d], b = BETA[d];
     u[a][o] -= (T)inverse[a][o] * by;
@@ -103,17 +103,17 @@ auto shear = [&](int d, long long o, T by) {
 };
 
 // snippet yield: Nearest point of { |n|^2 / 2 + sum over shears of max_q b_q^2 <= r^2 } in the
-// metric |n|^2 / 2 + sum of b_q^2 / 4. With a multiplier mu n shrinks by 1 + mu and the largest
-// |b_q| of a shear are cut to m = max_n S_n / (n + 4 mu), S_n the sum of the n largest of the
-// four; mu is the root of 1/r - 1/sqrt(|n|^2/2 + sum m^2), nearly linear in mu. The box of Narain
-// et al. bounds each part by itself instead: |n|^2 / 2 <= r^2, |b_q| <= r. RATE: a step of `soft`
-// leaves the rate of shear e = mu r / soft, by which r itself grows: the step is backward Euler's,
-// and what it comes to rest at does not depend on its length. Newton's line for 1/size then meets
-// 1/r(e) where r(e) (size - slope mu) + slope soft e = size^2: a quadratic for e.
+// metric |n|^2 / 2 + sum of b_q^2 / 4. With a multiplier mu, n shrinks by 1 + mu, and the largest
+// |b_q| of a shear are cut to m = max_n S_n / (n + 4 mu), S_n the sum of the n largest of the four.
+// mu is the root of 1/r - 1/sqrt(|n|^2/2 + sum m^2), which is nearly linear in mu. The box of
+// Narain et al. bounds each part on its own: |n|^2 / 2 <= r^2, |b_q| <= r. RATE: a step of `soft`
+// leaves the rate of shear e = mu r / soft, by which r itself grows. The step is that of backward
+// Euler, whose state at rest does not depend on its length. Newton's line for 1/size meets 1/r(e)
+// where r(e) (size - slope mu) + slope soft e = size^2, a quadratic for e.
 auto larger = [](T a, T b) INLINE { return a > b ? a : b; };
 auto smaller = [](T a, T b) INLINE { return a < b ? a : b; };
 auto magnitude = [](T a) INLINE { return a < (T)0 ? -a : a; };
-// how much n shrinks, and the largest |b| of each shear
+// Factor by which n shrinks, and the largest |b| of each shear.
 auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T static_, T gain, T half, T soft,
                  T (&cap)[SHEARS]) INLINE {
     T r = static_, e = 0;
@@ -122,7 +122,7 @@ auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T static_, T gain, T 
         return smaller(r / larger(sqrt(normal2), (T)LEAST_RADIUS), (T)1);
     }
     const T inverse_r = (T)1 / (RATE ? r + gain : r), all = sqrt(normal2);
-    T mu = all * inverse_r - (T)1, size = 0;  // a lower bound: each part by itself must fit
+    T mu = all * inverse_r - (T)1, size = 0;  // a lower bound: each part on its own must fit
     UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 0; n < 4; ++n) mu =
         larger(mu, (T)0.25 * (largest[d][n] * inverse_r - (T)(n + 1)));
     mu = larger(mu, (T)0);
@@ -164,7 +164,7 @@ auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T static_, T gain, T 
     UNROLL for (int d = 0; d < SHEARS; ++d) cap[d] *= onto;
     return onto * shrink;
 };
-// sums of the one, two, three, four largest
+// sums of the one, two, three and four largest
 auto sums = [&](T a, T b, T c, T d, T (&out)[4]) INLINE {
     const T ab = larger(a, b), ba = smaller(a, b), cd = larger(c, d), dc = smaller(c, d);
     const T low = smaller(ab, cd), high = larger(ba, dc);
@@ -174,22 +174,22 @@ auto sums = [&](T a, T b, T c, T d, T (&out)[4]) INLINE {
     out[3] = out[2] + smaller(ba, dc);
 };
 
-// snippet wall_bound: How much friction a wall bears under a load >= 0: mu times it (Coulomb), and
-// no more than the sand beside it bears in simple shear, however fast: on a wall rougher than sand
-// it is the sand that fails, in a band thinner than a cell. Without that bound a column of depth h
-// that is pushed between walls a distance l apart loads itself by exp(2 mu h / l) (Janssen): walls
-// that stick leave it no stress at all.
+// snippet wall_bound: Largest friction of a wall under a load >= 0: mu times the load (Coulomb),
+// and at most what the sand beside it bears in simple shear at any rate. On a wall rougher than
+// sand it is the sand that fails, in a band thinner than a cell. Without this bound a column of
+// depth h that is pushed between walls a distance l apart loads itself by exp(2 mu h / l)
+// (Janssen), and walls that stick leave it no stress at all.
 auto wall_bound = [&](float mu, auto load) {
     const auto wall = mu * load,
                sand = (numbers[FRICTION] + numbers[GAIN]) * load + numbers[COHESION];
     return wall < sand ? wall : sand;
 };
 
-// snippet wall_face: Friction on a wall face of a cell: the copies on its edges, two of each
-// shear, within `wall_bound` of the normal load, in the metric sum b_q^2 / 2. The load is that of
-// the face: x - n and the weight of the half cell before it, or of all of it where there is no
-// pressure. `rate` and `light` tell an edge's rate of shear and the sum of 1 / mass around it;
-// `from` tells where a copy's step starts, `store` gets its new value and the face's diagonal.
+// snippet wall_face: Friction on a wall face of a cell: the copies on its edges, two of each shear,
+// within `wall_bound` of the normal load, in the metric sum b_q^2 / 2. The load is that of the
+// face: x - n, plus the weight of the half cell before it, or of the whole cell if there is no
+// pressure. `rate` and `light`: rate of shear of an edge, and the sum of 1 / mass around it.
+// `from`: start of a copy's step. `store` receives its new value and the face's diagonal.
 #include "wall_bound"
 const float* shares[3] = XYZ(share);
 auto face = [&](int entry, auto from, const float* now, const float* weight, T omega, auto light,
@@ -258,7 +258,7 @@ auto face = [&](int entry, auto from, const float* now, const float* weight, T o
         }
 };
 
-// snippet wall_sums: Sums of entries of walls, behind those of others.
+// snippet wall_sums: Sums over entries of walls, behind those of other entries.
 const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, es, ee, ss, 0, residual};
 for (int c = 0; c < COLUMNS; ++c)
     partials[c * (long long)(given.partials.shape[0] / COLUMNS) + behind + c_] = found[c];

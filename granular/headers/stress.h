@@ -1,6 +1,6 @@
 // Kernels of the stress solve, its forces on bodies, and its report.
 
-// kernel granular.stress.edge_stress: The shear of an edge: the mean of its copies
+// kernel granular.stress.edge_stress: Shear of an edge: mean of its copies
 //   compute    float32 | float64
 //   whole      int32 spans
 //   box        float32 share_x, share_y?, share_z?, y; T edge_x, edge_y?, edge_z?
@@ -23,10 +23,10 @@ for (int d = 0; d < SHEARS; ++d) {
     }
 }
 
-// kernel granular.stress.face_velocity: The velocity that a stress leaves: u = u* + (div sigma) /
-// mass, sigma = -x + s. On a face that a solid cuts the pressure acts on what is open, the
-// deviator by what it stands for in the cell (the adjoint of its rate of strain), and the
-// tractions of the walls in both cells.
+// kernel granular.stress.face_velocity: Velocity under a stress: u = u* + (div sigma) / mass, sigma
+// = -x + s. On a face that a solid cuts, the pressure acts on the open part, and the deviator by
+// the part of the cell that it stands for (the adjoint of its rate of strain); the tractions of the
+// walls in both cells are added.
 //   compute    float32 | float64
 //   whole      int32 spans
 //   box        float32 share_x, y; T edge_x, edge_y?, edge_z?; float32 start_x, start_y?, start_z?,
@@ -87,15 +87,15 @@ for (int d = 0; d < SHEARS; ++d) {
     MASKED for (int i = begin; i < end; ++i) rate[i] = (ua[i] - ua[i - sb]) + (ub[i] - ub[i - sa]);
 }
 
-// kernel granular.stress.step: One projected step of every cell that holds sand, with momentum:
+// kernel granular.stress.step: One projected step with momentum for every cell that holds sand:
 // from y = x + beta (x - x_before) against the gradient over the diagonal, onto x >= floor and the
-// yield set of the new x. `point` becomes where the next gradient is taken, x + lookahead beta (x
-// - x_before). Sums, of pressure (0, 1, 2) and of friction (3, 4, 5), in the metric of the
-// diagonal: <e, s>, <e, e>, <s, s> with the error of the projection e = x_new - y and the step s =
-// x_new - x; 6, 7: estimates of the squared natural residuals of both. RESIDUAL: from the stresses
-// themselves with step 1, nothing is changed; sums 0 and 1 are the squared natural residuals.
-// TRIAL: no sums, and the new stresses go to `point` alone, which a step no longer needs once it
-// knows the velocity there.
+// yield set of the new x. `point` becomes the place of the next gradient, x + lookahead beta (x -
+// x_before). Sums of pressure (0, 1, 2) and of friction (3, 4, 5) in the metric of the diagonal:
+// <e, s>, <e, e>, <s, s> with the error of the projection e = x_new - y and the step s = x_new - x;
+// 6, 7: estimates of the squared natural residuals of both. RESIDUAL: a step of length 1 from the
+// stresses themselves; nothing is changed, and sums 0 and 1 are the squared natural residuals.
+// TRIAL: no sums; the new stresses go to `point` alone, which a step no longer needs once the
+// velocity there is known.
 //   compute    float32 | float64
 //   whole      int32 spans; float64 momentum; float32 numbers; float64 partials
 //   box        uint8 flags; float32 now, before, point, drive, stiff, openings?, share_x, share_y?,
@@ -181,7 +181,7 @@ MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
             keep = sheared ? shrink : (T)0;
     const int cell = AGAIN(keep, i);
     T es = 0, ee = 0, ss = 0;
-    // held: the copies on walls are the walls'
+    // held: copies on walls belong to the walls
     auto put = [&](int c, T value, T from, T weight, T ahead, int held) INLINE {
         const long long at = c * layer + cell;
         const float old = now[at], earlier = before[at], ahead_of = point[at];
@@ -226,7 +226,7 @@ const T found[COLUMNS] = {x_es, x_ee, x_ss, s_es, s_ee, s_ss, x_residual, s_resi
 for (int c = 0; c < COLUMNS; ++c) partial[c * columns] = found[c];
 #endif
 
-// kernel granular.bodies.step: the step of the cells beside bodies alone, from a list
+// kernel granular.bodies.step: As granular.stress.step, for listed cells beside bodies
 //   compute    float32 | float64
 //   whole      int32 cell, spans; float64 momentum; float32 numbers
 //   box        uint8 flags; float32 now, before, point, drive, stiff, openings?, share_x, share_y?,
@@ -239,8 +239,8 @@ for (int c = 0; c < COLUMNS; ++c) partial[c * columns] = found[c];
 //              NEXT_S
 #include "granular.stress.step"
 
-// kernel granular.stress.wall_step: What the step does to cells, for wall faces: a step of their
-// copies, after that. TRIAL: after one that has left its stresses in `point`
+// kernel granular.stress.wall_step: The step for wall faces: a step of their copies, after that of
+// the cells. TRIAL: after one that has left its stresses in `point`
 //   compute    float32 | float64
 //   whole      int32 cells; uint8 sides; int32 walls; float32 friction, fraction, now, before,
 //              point; T edge_x, edge_y?, edge_z?; float32 share_x, share_y?, share_z?, inverse_x,
@@ -287,7 +287,7 @@ for (int m = first; m < end; ++m) {
 #include "sand.h:wall_sums"
 #endif
 
-// kernel granular.bodies.wall_step: the step of walls of those cells
+// kernel granular.bodies.wall_step: As granular.stress.wall_step, for the walls of listed cells
 //   compute    float32 | float64
 //   whole      int32 cells; uint8 sides; int32 walls; float32 friction, fraction, now, before,
 //              point; T edge_x, edge_y?, edge_z?; float32 share_x, share_y?, share_z?, inverse_x,
@@ -297,13 +297,13 @@ for (int m = first; m < end; ++m) {
 //              GAIN, DIM, BOX = 0, RESIDUAL, TRIAL = 0, NOW_S, NEXT_S
 #include "granular.stress.wall_step"
 
-// kernel granular.stress.traction: Friction of the wall in a cell, within `wall_bound` of its
-// load, against the sand's slip along it: the mean of its faces' velocities by what is open of
-// them, without the part along the wall's normal n. A layer holds the traction times the wall's
-// area over what is open of the cell's two faces along an axis: so much a face takes of it for its
-// own open part. The load is the pressure, which is all that keeps sand from going into the wall,
-// and the weight of what no face of the cell stands for: of all that a cell holds with no sand
-// upon it.
+// kernel granular.stress.traction: Friction of the wall in a cell, within `wall_bound` of its load,
+// against the slip of the sand along the wall. The slip is the mean of the velocities of the cell's
+// faces, weighted by their open parts, without the part along the wall's normal n. A layer holds
+// the traction times the wall's area over the open part of the cell's two faces along an axis; a
+// face takes this times its own open part. The load is the pressure, which alone keeps sand from
+// moving into the wall, and the weight of the part that no face of the cell stands for: of the
+// whole cell if no sand is above it.
 //   compute    float32 | float64
 //   whole      float32 walls, friction; uint8 flags; float32 fraction, openings?, now, before,
 //              point, share_x, inverse_x, inverse_y?, inverse_z?; T u_x, u_y?, u_z?; float64
@@ -324,7 +324,7 @@ double es = 0, ee = 0, ss = 0, residual = 0;
 for (int m = first; m < last; ++m) {
     const long long cell = cells[m];
     if (!(flags[cell] & HOLDS)) continue;
-    // normal (3), area, what faces leave out along each axis (3), volume
+    // normal (3), area, part that faces leave out along each axis (3), volume
     const float* n = walls + 8 * m;
     const T size = n[3], x = now[cell];
     T v[DIM], sum[DIM], across = 0, stiffest = 0, load = x;
@@ -374,8 +374,8 @@ for (int m = first; m < last; ++m) {
 }
 #include "sand.h:wall_sums"
 
-// kernel granular.stress.admit: What of the last stresses has a place now: pressure where there is
-// sand, shear where a cell carries it, copies where they have a share
+// kernel granular.stress.admit: Keep the last stresses where they have a place now: pressure where
+// there is sand, shear where a cell carries it, copies where they have a share
 //   compute    float32 | float64
 //   box        uint8 flags; float32 stiff, share_x, share_y?, share_z?, now, before, point
 //   numbers    float32 ratio
@@ -403,8 +403,8 @@ for (int i = first; i < last; ++i) {
             put(c * layer + i, sand ? now[c * layer + i] * ratio : 0.0f);
 }
 
-// kernel granular.stress.damp: A part of the pattern that alternates in all directions, found in
-// `source`, is taken from `now`, which holds the same
+// kernel granular.stress.damp: Subtract a part of the pattern that alternates in all directions,
+// found in `source`, from `now`, which holds the same values
 //   compute    float32 | float64
 //   box        uint8 flags; float32 share_x, share_y?, share_z?, source, now
 //   constants  SHEARS_HERE, PARTLY, DIM, BOX = 0, DAMPED
@@ -437,8 +437,8 @@ for (int i = first; i < last; ++i) {
                 (DIM == 3 ? 0.5f : 1.0f) * ((q == 0 || q == 3) ? by : -by);
 }
 
-// kernel granular.report.report: How near each cell is to yielding; found: cells that carry shear,
-// yielded ones, what friction takes, the most of a fraction predicted
+// kernel granular.report.report: How close each cell is to yielding. Sums: cells that carry shear,
+// yielded ones, power of friction; `most`: the largest predicted fraction
 //   compute    float64
 //   whole      float32 numbers
 //   box        uint8 flags; float32 now, drive, stiff, ratio, openings?, share_x, share_y?,

@@ -1,7 +1,7 @@
 // Kernels of interleaved Gauss-Seidel sweeps over the stresses of sand.
 
-// kernel granular.interleaved.sweep_pressure: A sweep over the pressure, the velocity kept up to
-// date
+// kernel granular.interleaved.sweep_pressure: Gauss-Seidel sweep over the pressure, with the
+// velocity updated at once
 //   compute    float32
 //   whole      float32 numbers
 //   box        uint8 flags; float32 now, drive, share_x, mass_x, mass_y?, mass_z?, inverse_x,
@@ -30,7 +30,8 @@ for (int i = first; i < last; ++i) {
     }
 }
 
-// kernel granular.interleaved_listed.sweep_pressure: the same over a list of cells
+// kernel granular.interleaved_listed.sweep_pressure: As granular.interleaved.sweep_pressure, over
+// listed cells
 //   compute    float32
 //   whole      float32 numbers; int32 cells
 //   box        uint8 flags; float32 now, drive, share_x, mass_x, mass_y?, mass_z?, inverse_x,
@@ -40,8 +41,8 @@ for (int i = first; i < last; ++i) {
 //   constants  TENSION, HOLDS, FIRM, STEP_OF_CELL, NEARLY, DIM, BOX = 0, CUT = 0
 #include "granular.interleaved.sweep_pressure"
 
-// kernel granular.interleaved.sweep_friction: A sweep over the friction, the velocity kept up to
-// date
+// kernel granular.interleaved.sweep_friction: Gauss-Seidel sweep over the friction, with the
+// velocity updated at once
 //   compute    float32
 //   whole      float32 numbers
 //   box        uint8 flags; float32 now, stiff, share_x, share_y?, share_z?, inverse_x, inverse_y?,
@@ -76,7 +77,7 @@ for (int i = first + ROW; i < last + ROW; ++i) {
             part[d][q] = share[d][at[d][q]] > 0.0f ? (T)share[d][at[d][q]] : (T)0;
             diagonal += (T)4 * part[d][q] * part[d][q] * light(d, at[d][q]);
         }
-    // more than half the norm of a cell's own block: stable
+    // Larger than half the norm of the cell's own block, which makes the sweep stable.
     const T soft = (T)omega / ((T)0.6 * diagonal);
     T n[NORMALS], normal2 = 0;
     if (DIM == 2) {
@@ -125,7 +126,8 @@ for (int i = first + ROW; i < last + ROW; ++i) {
         }
 }
 
-// kernel granular.interleaved_listed.sweep_friction: the same over a list of cells
+// kernel granular.interleaved_listed.sweep_friction: As granular.interleaved.sweep_friction, over
+// listed cells
 //   compute    float32
 //   whole      float32 numbers; int32 cells
 //   box        uint8 flags; float32 now, stiff, share_x, share_y?, share_z?, inverse_x, inverse_y?,
@@ -136,7 +138,7 @@ for (int i = first + ROW; i < last + ROW; ++i) {
 //              RATE = 0
 #include "granular.interleaved.sweep_friction"
 
-// kernel granular.interleaved.sweep_walls: A sweep over the friction of walls
+// kernel granular.interleaved.sweep_walls: Gauss-Seidel sweep over the friction of walls
 //   compute    float32
 //   whole      int32 cells; uint8 sides; int32 walls; float32 friction, fraction; uint8 flags;
 //              float32 now, share_x, share_y?, share_z?, inverse_x, inverse_y?, inverse_z?, u_x,

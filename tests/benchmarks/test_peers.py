@@ -23,7 +23,8 @@ import os
 import sys
 import types
 
-sys.modules["petsc4py"] = types.SimpleNamespace(PETSc=None)  # which the program imports, and `serve` does not use
+sys.modules["petsc4py"] = types.SimpleNamespace(PETSc=None)  # which the program \
+imports, and `serve` does not use
 sys.path.append(sys.argv[1])
 from petsc_worker import serve
 

@@ -67,7 +67,11 @@ def places(simulation: ContactSimulation) -> np.ndarray:
     "name", ["box-stack", "heavy-on-light", "leaning-wall", "sphere-stack", "wall"]
 )
 def test_what_stands_in_the_book_stands(name: str) -> None:
-    """After half a second no body has moved by a hundredth of a side, and the residual is that of the scene."""
+    """Stability of the book's stacks.
+
+    After half a second no body has moved by a hundredth of a side, and the residual meets the
+    tolerance of the scene.
+    """
     simulation = made(built_in(name))
     before, residuals = places(simulation), []
     for _ in range(50):

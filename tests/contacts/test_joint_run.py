@@ -244,7 +244,11 @@ def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
 
 @pytest.mark.parametrize("name", ["gear-pyramid", "gears", "motor-arm", "reach", "snake"])
 def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
-    """meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists them."""
+    """Frames of built-in scenes.
+
+    meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists
+    them.
+    """
     assert "joints" in succeed("check", name, "--device", "cpu")
     assert name in succeed("scenes")
     succeed("run", name, "--device", "cpu", "--out", tmp_path / "run", "--frames", 1)

@@ -23,7 +23,10 @@ def mpi(tmp_path):
 
 @pytest.fixture(scope="module")
 def mpi_of_module(tmp_path_factory):
-    """Run this interpreter on ranks in a folder of the module, see `starter`: a start takes seconds, which tests can share."""
+    """Run this interpreter on ranks in a folder of the test module, see `starter`.
+
+    A start takes seconds; the tests of a module can share one.
+    """
     return starter(tmp_path_factory.mktemp("ranks"))
 
 

@@ -11,7 +11,8 @@ BLOCKS = """
 
     ranks = Ranks.world()
     collectives.PATIENCE = 1.0
-    collective = collectives.Collective(ranks, (OSError, ValueError), lambda text: sys.stderr.write(text + "\\n"))
+    collective = collectives.Collective(ranks, (OSError, ValueError), \
+lambda text: sys.stderr.write(text + "\\n"))
 
     def one():
         with collective.together():
@@ -59,7 +60,8 @@ BLOCKS = """
             block()
             text = "fine"
         except BaseException as error:
-            text = f"{type(error).__name__} {error} {getattr(error, 'errno', '')} {getattr(error, '__notes__', '')} {collective.failed}"
+            text = f"{type(error).__name__} {error} {getattr(error, 'errno', '')} \
+{getattr(error, '__notes__', '')} {collective.failed}"
         print(f"{ranks.rank} {block.__name__}: {text.strip()}\\n", end="")
 """
 ALONE = """
@@ -69,7 +71,8 @@ ALONE = """
 
     ranks = Ranks.world()
     collectives.PATIENCE = 1.0
-    with collectives.Collective(ranks, (ValueError,), lambda text: sys.stderr.write(text + "\\n")).together():
+    with collectives.Collective(ranks, (ValueError,), \
+lambda text: sys.stderr.write(text + "\\n")).together():
         if ranks.rank == 1:
             raise ValueError("left alone")
         ranks.sum(1)  # without rank 1

@@ -24,7 +24,10 @@ __all__ = ["run"]
 
 @pytest.fixture
 def befall(mpi, tmp_path):
-    """Run dots on ranks of which one meets a fault, see `faults_on_ranks`, and which end within SECONDS; return what was said."""
+    """Run dots on ranks with a fault on one, see `faults_on_ranks`.
+
+    The ranks must end within SECONDS. Return their output.
+    """
 
     def go(ranks, fault, *more):
         (tmp_path / "dots.toml").write_text(SCENE)

@@ -7,7 +7,8 @@ from warp_lcp.distributed import launch
 HELLO = """
     import os, sys
     from mpi4py import MPI
-    print(f"rank {MPI.COMM_WORLD.rank} of {MPI.COMM_WORLD.size}, {sys.argv[1]}, {os.environ['OPENBLAS_NUM_THREADS']}\\n", end="")
+    print(f"rank {MPI.COMM_WORLD.rank} of {MPI.COMM_WORLD.size}, {sys.argv[1]}, \
+{os.environ['OPENBLAS_NUM_THREADS']}\\n", end="")
 """
 
 

@@ -31,9 +31,7 @@ PROGRAM = """
 """
 
 
-def test_a_rank_without_objects_makes_the_next_one_and_one_that_found_no_garbage_ends_with_the_others(
-    mpi,
-):
+def test_a_rank_without_objects_creates_the_next_one_and_all_ranks_end(mpi):
     assert sorted(mpi(2, PROGRAM, seconds=60.0).stdout.split()) == [
         "ended0",
         "ended1",

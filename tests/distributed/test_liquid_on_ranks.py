@@ -173,7 +173,10 @@ def logs():
 
 @pytest.fixture(scope="module")
 def done(mpi_of_module):
-    """Return what runs the program once on n ranks, with all that is wanted of so many, and returns the folder of its logs."""
+    """Return a function of n that runs the program on n ranks and returns the folder of its logs.
+
+    The program runs once for each n, with all the cases that tests need on n ranks.
+    """
     wanted = {2: "run,bare,own-model,fail,differ,launches", 3: "bare,own-model", 4: "run"}
 
     @functools.cache

@@ -182,7 +182,10 @@ WRONG = {  # commands, with what is said of each
 
 
 def test_wrong_input_and_troubles_end_a_run_with_a_message(run, tmp_path):
-    """One command after the other on the same ranks: what is wrong is said once, and the next command goes as if nothing had been."""
+    """Errors of several commands on the same ranks.
+
+    Each error is printed once, and does not affect the next command.
+    """
     commands = [
         f"DOTS_TROUBLE='{trouble}' run dots.toml --out {number}"
         for number, trouble in enumerate(TROUBLES)

@@ -158,7 +158,11 @@ class Before:
         return status.st_ino, status.st_mtime_ns, status.st_size
 
     def check(self) -> int:
-        """Compare with what is there now: nothing up to the checkpoint was written again. Return the steps that were not repeated."""
+        """Compare with the present contents.
+
+        Nothing up to the checkpoint may have been written again. Return the number of steps that
+        were not repeated.
+        """
         assert read_record(self.out)["resumed_from_step"] == self.step
         if self.step:  # a row keeps the seconds of the process that computed it
             assert (self.out / "log.csv").read_text().splitlines()[: self.step + 1] == self.rows

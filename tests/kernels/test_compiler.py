@@ -21,10 +21,12 @@ cells[:, :2, 3:6] = wl.SOLID
 b = np.random.default_rng(0).standard_normal(cells.shape)
 assert wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b))
 loaded = {name: module for name, module in user_modules.items() if module.execs}
-launched = {name: [hook for e in module.execs.values() for hook in e.kernel_hooks] for name, module in loaded.items()}
+launched = {name: [hook for e in module.execs.values() for hook in e.kernel_hooks] \
+for name, module in loaded.items()}
 print(json.dumps({
     "modules": sorted(loaded),
-    "idle": [f"{m}: {k}" for m, module in loaded.items() for k in module.kernels if not any(h.startswith(k) for h in launched[m])],
+    "idle": [f"{m}: {k}" for m, module in loaded.items() for k in module.kernels \
+if not any(h.startswith(k) for h in launched[m])],
     "flags": sorted({module.options["cpu_compiler_flags"] for module in loaded.values()}),
 }))
 """

@@ -28,7 +28,10 @@ WIDTHS = (1, 2, 3, 4, 5, 7, 8, 11, 13, 18, 30)
 
 @pytest.fixture(params=[1, 1 << 18], ids=["blocks", "single loads"])
 def checked(monkeypatch, request):
-    """Have each pass by quads run by cells as well; return the counts of launches and of differences."""
+    """Run each quad pass by cells as well.
+
+    Return the counts of launches and of differences.
+    """
     from benchmarks import emulated_cuda
 
     monkeypatch.setattr(layout, "MANY_CELLS_OF_BLOCKS", request.param)
@@ -112,7 +115,8 @@ HEADER = """// Kernels of a test.
 double products = 0, most = -1e300; int total = 0;
 for (int k = 0; k < n; ++k) {
     total += (int)x[k]; products += x[k]*(y ? y[k] : 1.0); most = x[k] > most ? x[k] : most;
-    z[k] = x[k-1] + 10*x[k+1] + 100*x[k+ym] + 1000*(x + yp)[k] + 10000*(x + zm)[k] + 100000*x[k+zp]; }
+    z[k] = x[k-1] + 10*x[k+1] + 100*x[k+ym] + 1000*(x + yp)[k] \
++ 10000*(x + zm)[k] + 100000*x[k+zp]; }
 for (int k = 0; k < n; ++k) if (z[k] > 700000) { z[k] = -z[k]; changed[P.row] = 1; }
 """
 

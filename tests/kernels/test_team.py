@@ -250,7 +250,11 @@ def test_the_interpreter_ends_with_the_team():
 
 
 def test_an_interruption_is_heard_between_pieces():
-    """A table that would take minutes ends after Ctrl-C before it is through, and the next solve is right."""
+    """Interruption between pieces.
+
+    A table that would take minutes ends after Ctrl-C before it is complete, and the next solve is
+    right.
+    """
     done = run_python(
         SOLVE
         + """
@@ -258,10 +262,12 @@ import signal, threading
 from warp_lcp.kernels.launch_graph import CommandBuffer
 from warp_lcp.kernels.vectors import ADD, rows_of
 import warp as wp
-x, one = wp.zeros(1 << 22, dtype=wp.float32, device="cpu"), wp.full(1 << 22, 1.0, dtype=wp.float32, device="cpu")
+x, one = wp.zeros(1 << 22, dtype=wp.float32, device="cpu"), \
+wp.full(1 << 22, 1.0, dtype=wp.float32, device="cpu")
 program = CommandBuffer(x.device)
 for _ in range(100_000):
-    ADD.bind(rows_of(x), z=one, x=x).launch(program.launch) if _ == 0 else program.record(program._commands[0])
+    ADD.bind(rows_of(x), z=one, x=x).launch(program.launch) if _ == 0 \
+else program.record(program._commands[0])
 def interrupt():
     while x.numpy()[-1] < 2.0:  # launches that are done
         time.sleep(0.01)

@@ -130,7 +130,8 @@ def solved(planes):
     cells = np.zeros((planes, 400, 200), dtype=np.int8)
     cells[:, :40] = wl.FLUID
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), (cells == wl.FLUID).astype(float), 0.0)
-    return problem, wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=3))
+    return problem, wl.solve(problem, wl.ProjectedMultigrid(), \
+stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=3))
 
 assert solved(16)[0].A.layout.padding.small_pages  # kernels are loaded
 for grid_operator.LARGE in (1 << 20, 1 << 40):

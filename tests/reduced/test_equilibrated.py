@@ -90,7 +90,10 @@ def test_the_same_steps_in_any_units(kind):
 @pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
 @pytest.mark.parametrize("precision", ["mixed", "double", "single"])
 def test_no_solution_is_proved(b, kind, precision):
-    """y_2 = -x_1 - 1 < 0 whatever x >= 0 is: iterates leave for infinity, and were once said to be not finite."""
+    """Proof that no solution exists.
+
+    y_2 = -x_1 - 1 < 0 for every x >= 0: iterates diverge, and were once reported as not finite.
+    """
     result = wl.solve(posed(TURN, np.array(b), kind), InteriorPoint(precision=precision))
     assert result.status is wl.SolveStatus.INFEASIBLE
     assert np.isfinite(result.x.numpy()).all()

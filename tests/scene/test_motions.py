@@ -276,7 +276,8 @@ solids = "cut-cell"
 shape = "box"
 min = [0.1, 0.1]
 max = [0.2, 0.2]
-motion = { kind = "keyframes", times = [0, 1], rotate = [0, 90], translate = [[0, 0], [0.1, 0]], center = [0.1, 0.1] }
+motion = { kind = "keyframes", times = [0, 1], rotate = [0, 90], \
+translate = [[0, 0], [0.1, 0]], center = [0.1, 0.1] }
 [[solid]]
 shape = "sphere"
 center = [0.5, 0.5]

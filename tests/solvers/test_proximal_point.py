@@ -165,7 +165,11 @@ def test_a_workspace_begins_anew():
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_solution_nearest_to_the_start_is_found(kind):
-    """A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2 stays 8."""
+    """Solution nearest to the start.
+
+    A = [[1, -1], [-1, 1]] fixes x_1 - x_2 = 1 alone; D (x - c) lies in A's range, so that x_1 + x_2
+    stays 8.
+    """
     p = posed(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([-1.0, 1.0]), kind)
     result = wl.solve(
         p, wl.ProximalPoint(), x0=np.array([5.0, 3.0]), stopping=wl.StoppingCriteria(rtol=1e-9)

@@ -136,7 +136,11 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
 
 @pytest.mark.parametrize("name", SCALAR)
 def test_negative_diagonal_goes_to_the_bound_of_lesser_energy(name, device):
-    """Of -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6: the upright parabola's rule stays inside."""
+    """Negative diagonal: x at the bound of lower energy.
+
+    For -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6; the rule
+    of the upright parabola stays inside.
+    """
     for operator in dense_and_sparse(np.array([[-1.0]]), device):
         result = wl.solve(
             wl.LCP(operator, np.array([0.2]), -1.0, 2.0), SCALAR[name], stopping=TIGHT

@@ -1,7 +1,7 @@
 // Kernels of distributed vectors and particles.
 
-// kernel vector_copies.enter: A vector to a field: rows with a diagonal of 0 are no unknowns and
-// enter as 0
+// kernel vector_copies.enter: Copy a vector into a field: x = scale v. Rows with diagonal 0 are no
+// unknowns and get 0.
 //   compute    S
 //   reads      D d
 //   writes     S x
@@ -12,8 +12,8 @@ SIMD for (int k = 0; k < n; ++k) {
     x[k] = d[k] != 0 ? e : (T)0;
 }
 
-// kernel vector_copies.leave: A field to a vector: rows with a diagonal of 0 leave with what
-// another vector holds there, or as 0 if there is none
+// kernel vector_copies.leave: Copy a field into a vector: v = scale x. Rows with diagonal 0 get the
+// value of the vector `others`, or 0 if there is none.
 //   compute    S
 //   reads      D d; S x
 //   other      float64 v, others?
@@ -30,8 +30,8 @@ if (others) {
     }
 }
 
-// snippet side_of_box: Where a particle is: 0 in a box and away from its cuts, 1 within reach of
-// them, 2 beyond. The box begins at the grid coordinates `low` and ends at `high`
+// snippet side_of_box: Position of a particle relative to a box, low <= grid coordinate < high: 0
+// inside and away from its sides, 1 inside and within `reach` [cells] of them, 2 outside.
 #include "snippets.h:grid_coordinate"
 const T low[3] = {low_x, low_y, low_z}, high[3] = {high_x, high_y, high_z};
 auto side_of_box = [&](const T* at) -> int {
@@ -44,19 +44,19 @@ auto side_of_box = [&](const T* at) -> int {
     return 2 - in - away;
 };
 
-// snippet copy_bytes: Copies few bytes between types
+// snippet copy_bytes: Copy a few bytes between types.
 #ifdef __CUDA_ARCH__
 #define COPY_BYTES memcpy
 #else
 #define COPY_BYTES __builtin_memcpy
 #endif
 
-// snippet columns: Columns of particles that are there
+// snippet columns: The columns of particles that exist, and their copies to and from messages.
 #include "copy_bytes"
 float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data,
                           (float*)given.affine_0.data, (float*)given.affine_1.data,
                           (float*)given.affine_2.data, (float*)given.kept.data};
-auto to_words = [&](int* to, long long p) {  // of a message: place, then what columns hold
+auto to_words = [&](int* to, long long p) {  // message: place, then the columns
     COPY_BYTES(to, place + p, 8);
     to += 2;
     for (const float* column : columns)
@@ -77,15 +77,15 @@ auto from_words = [&](const int* from, long long p) {
 int words = 2;
 for (const float* column : columns) words += column ? 3 : 0;
 
-// snippet in_cells: Whether a cell is in a box, six numbers: its first cell, and the one behind the
-// last
+// snippet in_cells: Whether a cell is in a box that is grown by `more` cells. A box is six numbers:
+// its first cell, and the cell after its last.
 auto in_cells = [](const int* cell, const int* box, int more) -> bool {
     return cell[0] >= box[0] - more && cell[1] >= box[1] - more && cell[2] >= box[2] - more &&
            cell[0] < box[3] + more && cell[1] < box[4] + more && cell[2] < box[5] + more;
 };
 
-// kernel warp_lcp.distributed.particles.where: Where particles are: a box begins at the grid
-// coordinates `low` and ends at `high`; `reach` is in cells
+// kernel warp_lcp.distributed.particles.where: Position of particles relative to a box, see
+// `side_of_box`. `low` and `high` are grid coordinates, `reach` is in cells.
 //   compute    float32
 //   box        vec3 position; uint8 where
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 low_x,
@@ -95,9 +95,9 @@ const T* position = (const T*)given.position.data;
 SIMD for (int p = first; p < last; ++p) where[p] =
     (unsigned char)side_of_box(position + 3 * (long long)p);
 
-// kernel warp_lcp.distributed.particles.find_border: List the particles that are not well inside a
-// box, and their cells; count them, and those in each of the boxes from the third on. Cells are cut
-// off at the first box
+// kernel warp_lcp.distributed.particles.find_border: List the particles outside a box or near its
+// sides, and their cells. Count them, and those in each of the boxes from the third on. Cells are
+// clipped to the first box.
 //   compute    float32
 //   whole      vec3 position; int32 boxes, border, cells
 //   box        int32 found
@@ -138,8 +138,9 @@ for (int from = 0; from < count; from += BLOCK) {
 found[0] = many;
 
 // kernel warp_lcp.distributed.particles.pack: Write the particles in each of the boxes from the
-// third on to a message, one after another. Where axes have no end, positions go along by an
-// offset, and to `end_` at least, so that they are not inside by its rounding
+// third on to a message, box after box. Along periodic axes positions are shifted by an offset.
+// After a positive offset they are at least `end_`, so that rounding does not put them inside the
+// box.
 //   compute    float32
 //   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
 //              boxes, border, cells, message; float64 offsets
@@ -164,13 +165,14 @@ for (int b = 0; b < ends; ++b)
         to += words;
     }
 
-// kernel warp_lcp.distributed.particles.give_places: Give particles in the order of their cells
-// places: `most_a_cell` times the number of the cell among all ranks', and the number in the cell
+// kernel warp_lcp.distributed.particles.give_places: Number the particles in the order of their
+// cells: place = `most_a_cell` times the cell's number on the whole grid, plus the number within
+// the cell.
 //   compute    float32
 //   whole      int32 key; int64 place
 //   box        int32 found
 //   numbers    int count, most_a_cell, before_x, before_y, before_z, nx, ny, all_x, all_y, all_z
-auto around = [](int i, int n) -> long long { return (i % n + n) % n; };  // where axes have no end
+auto around = [](int i, int n) -> long long { return (i % n + n) % n; };  // periodic axes
 long long next = 0;
 for (int p = 0; p < count; ++p) {
     if (p == 0 || key[p] != key[p - 1]) {
@@ -183,7 +185,7 @@ for (int p = 0; p < count; ++p) {
     place[p] = next++;
 }
 
-// kernel warp_lcp.distributed.particles.unpack: Put the particles of messages behind the others
+// kernel warp_lcp.distributed.particles.unpack: Append the particles of messages
 //   compute    float32
 //   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
 //              message
@@ -192,10 +194,10 @@ for (int p = 0; p < count; ++p) {
 #include "columns"
 for (int p = 0; p < come; ++p) from_words(message + (long long)words * p, count + p);
 
-// kernel warp_lcp.distributed.particles.settle: Put ghosts behind the particles of this rank, after
-// `unpack`: the last ones take the room of those that have left the second box, and of ghosts. Find
-// how many are this rank's, how many there are with ghosts, and in how much of their room others
-// are: the first of `others`
+// kernel warp_lcp.distributed.particles.settle: Order the particles after `unpack`: own particles
+// first, then ghosts. The last particles move to the slots of those that have left the second box,
+// and of ghosts. `found`: the number of own particles, the number with ghosts, and the number of
+// own slots that are filled again, which are the first of `others`.
 //   compute    float32
 //   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
 //              boxes, border, cells, message, others, ghosts, flags
@@ -218,7 +220,7 @@ for (int p = count; p < total; ++p)
         ghosts[near++] = p;
     }
 const int own = total - gone, end = own + near;
-int *leaves = flags, *held = flags + gone;  // of the numbers from `own` on
+int *leaves = flags, *held = flags + gone;  // for the slots from `own` on
 for (int e = 0; e < gone; ++e) leaves[e] = 0;
 for (int e = 0; e < near; ++e) held[e] = 0;
 for (int e = 0; e < gone; ++e) {

@@ -1,6 +1,6 @@
 // Kernels of vector-Jacobian products of a solution.
 
-// kernel gradients.largest: The square and the largest magnitude of the natural residual, see
+// kernel gradients.largest: Square and largest magnitude of the natural residual, see
 // `residual.natural`
 //   compute    float64
 //   bounds
@@ -10,7 +10,7 @@
 //   largest    most
 T square = 0, most = 0;
 with_bounds([&](auto lower, auto upper) {
-    for (int k = 0; k < n; ++k) {  // a largest one is not vectorized
+    for (int k = 0; k < n; ++k) {  // compilers do not vectorize the maximum
         const T a = unit * (T)d[k], b = a < 0 ? -a : a, e = b == 0 ? (T)1 : b;
         const T r0 = natural_residual(y[k], e * (x[k] - lower(k)), e * (x[k] - upper(k))),
                 r = unknown[k] == 1 ? r0 : (T)0;
@@ -20,10 +20,10 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel gradients.sets: Free unknowns: those that are off their bounds by more than the tolerance
-// and what rounding leaves. `cells`, a copy of `unknown`, is 0 where one is held, by the `side` 1,
-// lower, or 2, upper: the nearer bound, of two that are one that which y's sign names. Degenerate:
-// held, though y is 0 as far as can be told, and not by two bounds that are one.
+// kernel gradients.sets: Classify the unknowns. Free: farther from both bounds than the tolerance
+// and the rounding error. Held: not free; `cells`, a copy of `unknown`, is 0 there, and `side` is 1
+// (lower) or 2 (upper), the nearer bound. If both bounds are equal, the sign of y decides.
+// Degenerate: held with |y| within the tolerance, and the bounds differ. Wrong: g is not finite.
 //   compute    float64
 //   bounds
 //   reads      float64 x, y; D d; int8 unknown; float64 b, g
@@ -49,8 +49,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel gradients.held: Where the lower bound holds an unknown, z stays, for an upper bound it
-// goes to `upper`; the rest is 0. And both sums
+// kernel gradients.held: Split z by bounds: it stays where the lower bound holds an unknown, moves
+// to `upper` where the upper bound does, and is 0 elsewhere. The sums of both parts
 //   compute    float64
 //   reads      int8 side
 //   writes     float64 z, upper?

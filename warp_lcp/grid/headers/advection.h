@@ -1,9 +1,10 @@
-// Kernels of advection: of particles, and of fields.
+// Kernels of the advection of particles and of fields.
 
-// snippet runge_kutta: A third-order Runge-Kutta step of particles; the kernel says what stops
-// them. That is two functions on a block of n particles: prepare(n) once a step, and move(a, A, b,
-// B, c, C, n), which sets `to` to what can be reached from `from` on the way to from + a A + b B +
-// c C, and `hit` to whether something was in the way. They may note particles in `list`.
+// snippet runge_kutta: Third-order Runge-Kutta step of particles (Ralston): x <- x + h (2 k1 + 3 k2
+// + 4 k3) / 9, where k2 is the velocity at x + h k1 / 2 and k3 that at x + 3 h k2 / 4. The kernel
+// provides two functions on a block of n particles. prepare(n) is called once per step. move(a, A,
+// b, B, c, C, n) sets `to` to the point reached from `from` on the way to from + a A + b B + c C,
+// and `hit` to whether an obstacle was met. Both may use `list`.
 int stopped = 0;
 for (int start = first; start < last; start += M) {
     const int n = last - start < M ? last - start : M;
@@ -25,7 +26,7 @@ for (int start = first; start < last; start += M) {
 }
 if (stopped > 0) count_up(given.stopped.data, stopped);
 
-// kernel warp_lcp.grid.advection.advect: Move particles from cell to cell
+// kernel warp_lcp.grid.advection.advect: Advect particles from cell to cell
 //   compute    float32
 //   whole      float32 u, v, w?; int8 room; int32 stopped
 //   box        vec3 position
@@ -37,8 +38,8 @@ const long long stride[3] = {1, s2, s1};
 const int counts[3] = {nx, ny, nz};
 int begin[M], end[M], cells[M];
 auto prepare = [](int) {};
-// Move a particle from cell to cell along the straight line to its aim: a closed face stops it, it
-// slides on along the face.
+// Move a particle from cell to cell along the straight line to its target. A closed face stops it;
+// the particle slides on along the face.
 auto cell_of = [&](T x, int axis) {
     const T least = first_cell[axis], e = counts[axis];
     x = x > least ? x : least;
@@ -53,13 +54,13 @@ auto walk = [&](int m) {
         x[d] = from[d][m];
         rest[d] = to[d][m] - x[d];
     }
-    // along each axis the walk goes one way only, so it crosses no more faces than this
+    // Along each axis the walk goes in one direction only: it crosses at most this many faces.
     for (int crossed = 0; crossed < nx + ny + nz; ++crossed) {
         int axis = -1;
         T t = 1;
         for (int d = 0; d <= planes; ++d) {
             const T gap = (T)cell[d] + (rest[d] > 0 ? (T)1 : (T)0) - x[d];
-            if (abs_of(rest[d]) > abs_of(gap)) {  // it crosses this face
+            if (abs_of(rest[d]) > abs_of(gap)) {  // crosses this face
                 T s = gap / rest[d];
                 s = s > 0 ? s : (T)0;
                 if (s < t) {
@@ -81,12 +82,12 @@ auto walk = [&](int m) {
             ++stopped;
         } else {
             cell[axis] += side;
-            // in again at the other side
+            // re-enter at the other side
             if ((ENDLESS >> axis & 1) && (cell[axis] < 1 || cell[axis] > counts[axis])) {
                 cell[axis] -= side * counts[axis];
                 x[axis] -= (T)(side * counts[axis]);
             }
-            // out through an open side: there is nothing to meet
+            // leave through an open side: there are no obstacles
             if (cell[axis] < first_cell[axis] || cell[axis] > counts[axis]) {
                 for (int d = 0; d <= planes; ++d) to[d][m] = x[d] + rest[d];
                 hit[m] = stopped > 0;
@@ -95,7 +96,7 @@ auto walk = [&](int m) {
         }
     }
     const signed char* here = room + (cell[2] * s1 + cell[1] * s2 + cell[0] - back);
-    for (int d = 0; d <= planes; ++d) {  // whoever moves along a closed face keeps off it too
+    for (int d = 0; d <= planes; ++d) {  // a path along a closed face keeps the margin too
         x[d] += rest[d];
         const T low = (T)cell[d] + margin, high = (T)cell[d] + 1 - margin;
         if (x[d] < low && here[-stride[d]] == 0) x[d] = low;
@@ -104,10 +105,10 @@ auto walk = [&](int m) {
     }
     hit[m] = stopped > 0;
 };
-// Aim at from + a A + b B + c C. Nothing stops a particle that stays in its cell off the faces, or
-// whose solids are further than it goes.
+// Target: from + a A + b B + c C. No obstacle stops a particle that stays in its cell away from the
+// faces, or whose distance to solids is larger than its path.
 auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, int n) {
-    const T rx = lx - 1, ry = ly - 1, rz = lz - 1;  // the ring
+    const T rx = lx - 1, ry = ly - 1, rz = lz - 1;  // the ghost ring
     SIMD for (int m = 0; m < n; ++m) {
         const T x = from[0][m], y = from[1][m], z = planes == 2 ? from[2][m] : (T)1.5;
         const T X = x + (a * A[0][m] + b * B[0][m] + c * C[0][m]),
@@ -120,7 +121,7 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
         T p = x > lx ? x : lx, q = y > ly ? y : ly, r = z > lz ? z : lz;
         const int i = floor_of(p < (T)nx ? p : (T)nx, 0), j = floor_of(q < (T)ny ? q : (T)ny, 1),
                   k = floor_of(r < (T)nz ? r : (T)nz, 2);
-        // beyond the ring nothing is known, nor needed
+        // beyond the ghost ring no values exist, and none are needed
         p = X > rx ? X : rx;
         q = Y > ry ? Y : ry;
         r = Z > rz ? Z : rz;
@@ -141,7 +142,7 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
         cells[m] = stays ? -1 : most;
     }
     int careful = 0;
-    // no branches: half of the particles change cells, which no branch predictor foresees
+    // no branches: half of the particles change cells, which branch prediction cannot foresee
     for (int m = 0; m < n; ++m) {
         list[careful] = m;
         careful +=
@@ -151,8 +152,8 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
 };
 #include "runge_kutta"
 
-// kernel warp_lcp.grid.distance_advection.advect_with_distance: Move particles among walls that
-// are given by their distance
+// kernel warp_lcp.grid.distance_advection.advect_with_distance: Advect particles among walls given
+// by a signed distance
 //   compute    float32
 //   whole      float32 u, v, w?, distance; int32 stopped
 //   box        vec3 position
@@ -163,8 +164,8 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
 #include "particles.h:sample"
 #include "walls.h:wall_distance"
 #include "walls.h:project"
-// Go towards the aim in strides that no wall can hide in; whoever gets too near is put back along
-// the normal and slides on.
+// Move towards the target in strides that are shorter than the distance to walls. A particle that
+// gets too close is moved back along the normal and slides on.
 auto slide = [](T* rest, const T* n) {
     const T inward = rest[0] * n[0] + rest[1] * n[1] + rest[2] * n[2];
     for (int d = 0; d < 3; ++d) rest[d] -= inward < 0 ? inward * n[d] : (T)0;
@@ -177,7 +178,8 @@ auto follow_edge = [&](T* rest, const T* one, const T* other) {
                 size > (T)1e-6 ? (rest[0] * e[0] + rest[1] * e[1] + rest[2] * e[2]) / size : (T)0;
     for (int d = 0; d < 3; ++d) rest[d] = along * e[d];
 };
-// Where a gradient leads nowhere the walls on either side of the way may be two.
+// Where the gradient does not lead out, there may be two walls, one on either side of the path.
+// Then the path follows their common edge.
 auto leave_corner = [&](const T* x, const T* n, T* rest) {
     const T length = sqrt(square(rest));
     if (!(length > 0)) return;
@@ -203,11 +205,11 @@ auto march = [&](int m, bool arrives) {
         finite &= (int)(abs_of(rest[d]) <= (T)3e38);
         most = abs_of(rest[d]) > most ? abs_of(rest[d]) : most;
     }
-    if (!finite) return;  // the sums over particles will find it
+    if (!finite) return;  // the sums over particles report it
     if (most > 1024) {
         for (int d = 0; d < 3; ++d) rest[d] *= 1024 / most;
     }
-    // velocity is sampled there, no more: what lies between is left to the last stage
+    // Only the velocity there is needed: obstacles on the way are left to the last stage.
     if (!arrives && square(rest) <= 4) {
         T y[3] = {to[0][m], to[1][m], to[2][m]};
         into_domain(y);
@@ -236,7 +238,7 @@ auto march = [&](int m, bool arrives) {
             met = 1;
             if (before >= margin && t * length > (T)SHORTEST &&
                 (!out || n[0] * rest[0] + n[1] * rest[1] + n[2] * rest[2] > 0)) {
-                // out on another side: too long a stride
+                // the particle came out on another side: the stride was too long
                 s = margin;
                 least = (T)0.5 * (t * length < least ? t * length : least);
                 continue;
@@ -246,7 +248,7 @@ auto march = [&](int m, bool arrives) {
             slide(rest, n);
             if (out == 2) leave_corner(y, n, rest);
             const T angle = n[0] * wall[0] + n[1] * wall[1] + n[2] * wall[2];
-            // another wall: if the way is blocked, on along the edge between the two
+            // another wall: if it blocks the path, follow the edge between the two
             if (touching && angle < (T)BEND) {
                 if (angle < (T)CORNER ||
                     rest[0] * wall[0] + rest[1] * wall[1] + rest[2] * wall[2] < 0)
@@ -264,8 +266,8 @@ auto march = [&](int m, bool arrives) {
     for (int d = 0; d <= planes; ++d) to[d][m] = x[d];
     hit[m] = met;
 };
-// No wall is nearer than `sure`: the distance's slope is at most the root of the dimension in a
-// cell, and about 1 over many.
+// No wall is nearer than `sure`. The slope of the distance is at most the square root of the
+// dimension within a cell, and about 1 over many cells.
 T sure[M];
 auto prepare = [&](int n) {
     const T flat = planes == 2 ? (T)0.57735 : (T)0.7071;
@@ -296,14 +298,15 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
 };
 #include "runge_kutta"
 
-// kernel warp_lcp.grid.semi_lagrangian.carry: A row's places with a mean level above `least`,
-// which are few or all: their list, their way back, and the value there
+// kernel warp_lcp.grid.semi_lagrangian.carry: Semi-Lagrangian advection of a row's places with a
+// mean level above `least`: list these places, which are few or all, trace them back, and
+// interpolate the field there
 //   compute    float32
 //   box        float32 u, v, w?, level, field, out
 //   numbers    int planes; float32 h, least; int before_x, before_y, before_z
 //   constants  AXIS, CENTERS, ENDLESS = 0
 typedef T Block[3][M];
-// Places are those of a larger grid, so that they are rounded alike in all parts of it.
+// Coordinates are those of a larger grid, so that they are rounded equally in all its parts.
 const int nx = before_x + given.u.shape[2] - 2, ny = before_y + given.u.shape[1] - 2,
           nz = before_z + given.u.shape[0] - 2;
 const long long s2 = given.u.shape[2], s1 = s2 * given.u.shape[1], up = planes == 2 ? s1 : 0,
@@ -362,7 +365,7 @@ for (int start = first; start < last; start += M) {
         c = planes == 2 && c > nz ? nz : c;
         const T fx = x - (T)a, fy = y - (T)b, fz = planes == 2 ? z - (T)c : (T)0;
 #if AXIS == CENTERS
-        // The value between the nodes of a cell.
+        // Linear interpolation between the nodes of a cell.
         const T* p = g + (c * s1 + b * s2 + a);
         const T* q = p + up;
         const T p0 = p[0] + fx * (p[1] - p[0]), p1 = p[s2] + fx * (p[s2 + 1] - p[s2]);
@@ -370,8 +373,9 @@ for (int start = first; start < last; start += M) {
         const T low = p0 + fy * (p1 - p0), high = q0 + fy * (q1 - q0);
         out[list[m]] = low + fz * (high - low);
 #else
-        // Beyond the array the last value goes on. On the CPU four nodes along x are one vector: 64
-        // nodes in 12 ns instead of 60.
+        // Cubic interpolation (Catmull-Rom), limited to the range of the nearest nodes. Beyond the
+        // array the last value is repeated. On the CPU four nodes along x are one vector: 64 nodes
+        // take 12 ns instead of 60.
         auto weigh = [](T f, T* w) {
             w[0] = (T)0.5 * f * (f * (2 - f) - 1);
             w[1] = 1 + (T)0.5 * f * f * (3 * f - 5);

@@ -1,11 +1,12 @@
-// Kernels of cells that solids cut.
+// Kernels of cut cells: open fractions of faces, states and capacities of cells.
 
-// snippet cut_area: The area {d > 0} of a face from its corners v, in order around it: that of the
-// polygon whose vertices lie where d, linear along the edges, is 0. Exact for planes.
+// snippet cut_area: Area of the part of a face with d > 0, from d at its corners v in cyclic order.
+// It is the area of the polygon whose vertices are the zeros of d, linear along the edges. Exact
+// for planes.
 auto area = [](const float* v) {
     int open = 0, start = 0;
     for (int c = 0; c < 4; ++c) open += v[c] > 0.0f;
-    // of an edge, on a's side; a and b have different signs
+    // open part of an edge, on a's side; a and b have different signs
     auto part = [](float a, float b) { return a / (a - b); };
     auto corner = [&](int c) {
         return 0.5f * part(v[c], v[(c + 1) & 3]) * part(v[c], v[(c + 3) & 3]);
@@ -19,18 +20,19 @@ auto area = [](const float* v) {
         return 1.0f - corner(start);
     }
     while (v[start] <= 0.0f) ++start;
-    if (v[(start + 2) & 3] <= 0.0f) {  // two neighbors
+    if (v[(start + 2) & 3] <= 0.0f) {  // two adjacent corners
         const int a = v[(start + 1) & 3] > 0.0f ? start : (start + 3) & 3, b = (a + 1) & 3;
         return 0.5f * (part(v[a], v[(a + 3) & 3]) + part(v[b], v[(b + 1) & 3]));
     }
-    const int a = start & 1;  // across: the mean tells whether they meet
+    const int a = start & 1;  // two opposite corners: the mean tells whether they are connected
     const bool meet = v[0] + v[1] + v[2] + v[3] > 0.0f;
     return meet ? 1.0f - corner(1 - a) - corner(3 - a) : corner(a) + corner(a + 2);
 };
 
-// snippet cut_cell: A cut cell adds to the kernels of the cells around it what is open of it:
-// along the axis in which the distance changes most the open interval of a line is known and so is
-// the kernel's integral, cubic in the ends; across, three Gauss points (error for planes < 2e-4).
+// snippet cut_cell: Add the integral over the open part of a cut cell to the kernels of the cells
+// around it. Along the axis in which the distance changes most, the open interval of a line is
+// known; the kernel's integral is cubic in its ends. Across this axis there are three Gauss points
+// (error for planes < 2e-4).
 const long long s2 = near_.shape[2], s1 = s2 * near_.shape[1], cell = k * s1 + j * s2 + i,
                 sz = planes == 2 ? s1 : 0;
 const float* d = near_.data + cell;
@@ -42,14 +44,14 @@ for (int c = 0; c < 8; ++c) {
     for (int a = 0; a < 3; ++a) slope[a] += (c >> a) & 1 ? v[c] : -v[c];
 }
 int main = 0;
-// clearly more, so that cells along a plane at 45 degrees choose the same axis in spite of
-// rounding: else the error is 3e-3
+// Choose another axis only if its slope is clearly larger, so that cells along a plane at 45
+// degrees choose the same axis in spite of rounding. Otherwise the error is 3e-3.
 for (int a = 1; a <= planes; ++a)
     if (slope[a] * slope[a] > 1.05f * slope[main] * slope[main]) main = a;
 const int p = (main + 1) % 3, q = (main + 2) % 3, dim = planes + 1;
 const float at[3] = {0.1127016654f, 0.5f, 0.8872983346f},
             gauss[3] = {5.0f / 18.0f, 4.0f / 9.0f, 5.0f / 18.0f};
-// of the kernel of the cell below, of this one and of the cell above, at the Gauss points
+// Weights at the Gauss points: kernels of the cell below, of this cell and of the cell above.
 float side[3][3];
 for (int g = 0; g < 3; ++g) {
     const float t = at[g], r = t - 0.5f;
@@ -98,9 +100,9 @@ for (int m = 0; m < 3; ++m)
             out[(m - 1) * step[main] + (a - 1) * step[p] + (b - 1) * step[q]] += moment[m][a][b];
         }
 
-// kernel warp_lcp.grid.cut_cells.fractions: Open fractions a and wall numbers w of all faces
-// inside the domain from the distance d at nodes; d2: of the next solid, o, o2: whose they are.
-// Solids are far from most rows: those blocks are filled at once. Counted are the dropped and the
+// kernel warp_lcp.grid.cut_cells.fractions: Open fractions a and wall numbers w of all faces inside
+// the domain, from the distance d at nodes. d2: distance to the next solid; o, o2: numbers of the
+// solids. Most rows are far from solids: their blocks are filled at once. Counts: dropped faces and
 // partial faces.
 //   compute    float32
 //   whole      int32 counts
@@ -112,7 +114,7 @@ const long long sz = planes == 2 ? s1 : 0;
 const bool has_y = j > 1, has_z = planes == 2 && k > 1;
 int dropped = 0, partial = 0;
 auto low_of = [](float a, float b) { return a < b ? a : b; };
-auto clear = [&](long long i) {  // whether all of a cell with a face of distance 0 is open
+auto clear = [&](long long i) {  // whether a cell with a face of distance 0 is open as a whole
     float low = 0.0f, high = 0.0f;
     for (int c = 0; c < 8; ++c) {
         const float v = d[i + (c & 1) + ((c & 2) ? s2 : 0) + ((c & 4) ? sz : 0)];
@@ -194,8 +196,8 @@ for (int start = first; start < last; start += M) {
 if (dropped) count_up(counts, dropped);
 if (partial) count_up(counts + 1, partial);
 
-// kernel warp_lcp.grid.cut_cells.states: A cell is SOLID if all of its faces are closed. It is
-// open if none of its corners is closed, closed if none is open, and else cut
+// kernel warp_lcp.grid.cut_cells.states: States of cells. `base`: SOLID if all faces are closed.
+// `state`: 1 (open) if no corner is inside a solid, 0 (closed) if none is outside, else 2 (cut)
 //   compute    float32
 //   box        float32 d, ax, ay, az; int8 base, state
 //   numbers    int planes
@@ -213,14 +215,14 @@ SIMD for (int i = first; i < last; ++i) {
     const float high = high_of(
         high_of(high_of(d[i], d[i + 1]), high_of(d[i + s2], d[i + s2 + 1])),
         high_of(high_of(d[i + sz], d[i + sz + 1]), high_of(d[i + sz + s2], d[i + sz + s2 + 1])));
-    const signed char flat = kind == AIR ? 1 : 0;  // of a cell with distance 0 at all corners
+    const signed char flat = kind == AIR ? 1 : 0;  // if the distance is 0 at all corners
     const signed char no_cut = high > 0.0f ? (signed char)1 : (low < 0.0f ? (signed char)0 : flat);
     base[i] = kind;
     state[i] = low < 0.0f && high > 0.0f ? (signed char)2 : no_cut;
 }
 
-// kernel warp_lcp.grid.capacity.open_cells: A cell's kernel over the open cells: over its own cell
-// its integral is 2/3 along an axis, over either neighbor 1/6. Cut ones follow
+// kernel warp_lcp.grid.capacity.open_cells: Integral of a cell's kernel over the open cells: along
+// an axis it is 2/3 over its own cell and 1/6 over each neighbor. Cut cells are added afterwards
 //   compute    float32
 //   box        float32 capacity; int8 state
 //   numbers    int planes

@@ -1,5 +1,4 @@
-// Kernels of the level set: the particles' density, the distance that it means, the volume it
-// encloses.
+// Kernels of the level set: density of particles, signed distance, enclosed volume.
 
 // kernel grid.density.scatter_density: Add the share of particles to the cells around them
 //   compute    float32
@@ -37,8 +36,8 @@
                     const T share = each * wz[c] * wy[b];
                     T* row = density + ((k + c - 1) * s1 + (j + b - 1) * s2 + i);
 #ifndef __CUDA_ARCH__
-                    // four at once, of which the last gets nothing: a third of the stores, 9 ns a
-                    // particle in 3-D instead of 15
+                    // Four nodes at once, the last with weight 0: a third of the stores, 9 instead
+                    // of 15 ns per particle in 3-D.
                     if (i < nx) {
                         Four sum;
                         __builtin_memcpy(&sum, row - 1, sizeof(Four));
@@ -55,7 +54,7 @@
     });
 }
 
-// kernel warp_lcp.grid.density.gather_density: Let a cell add up the particles around it
+// kernel warp_lcp.grid.density.gather_density: Sum the shares of the particles around each cell
 //   compute    float32
 //   whole      int32 offsets; vec3 position
 //   box        float32 density
@@ -86,8 +85,8 @@ for (int i = first; i < last; ++i) {
     density[i] = each * total;
 }
 
-// kernel warp_lcp.grid.level_set.binomial: One binomial pass (1, 2, 1)/4 along every axis; there
-// is nothing outside the array
+// kernel warp_lcp.grid.level_set.binomial: Binomial filter (1, 2, 1)/4 along every axis; values
+// outside the array are 0
 //   compute    float32
 //   box        float32 source, out
 //   numbers    int planes
@@ -113,16 +112,16 @@ for (int start = first; start < last; start += M) {
         (T)0.5 * sum[m + 1] + (T)0.25 * (sum[m] + sum[m + 2]);
 }
 
-// kernel warp_lcp.grid.level_set.level_set_distance: phi = -G^-1(filled), or the normal
-// distribution's quantile after smoothing; a cell without a share of its own is marked to be
-// filled
+// kernel warp_lcp.grid.level_set.level_set_distance: Signed distance from the filled share f: phi =
+// -G^-1(f), or after smoothing -spread times the quantile of the normal distribution at f. A cell
+// without capacity gets known = 0, to be filled
 //   compute    float32
 //   box        float32 phi, density, capacity?, smooth?; int8 known, base
 //   numbers    float32 spread, limit
 //   constants  MIN_CAPACITY, TAIL, SOLID
 T ones[M], share[M], *given_phi = phi;
 for (int m = 0; m < M; ++m) ones[m] = 1;
-// the cube root of 0 <= v <= 1: a third of the exponent, then Newton
+// Cube root of 0 <= v <= 1: a third of the exponent as first guess, then Newton's method.
 auto root = [](T v) {
     union {
         float f;
@@ -134,8 +133,8 @@ auto root = [](T v) {
     for (int n = 0; n < 3; ++n) y = ((T)2 * y + v / (y * y)) * (T)(1.0 / 3);
     return y;
 };
-auto outer = [&](T q) { return root((T)6 * q) - (T)1.5; };  // G^-1 up to 1/6
-auto inner = [](T q) {  // and up to 1/2
+auto outer = [&](T q) { return root((T)6 * q) - (T)1.5; };  // G^-1 for shares up to 1/6
+auto inner = [](T q) {  // for shares up to 1/2
     T s = (q - (T)0.5) * (T)(4.0 / 3);
     for (int n = 0; n < 3; ++n)
         s -= ((T)0.5 + s * ((T)0.75 - s * s * (T)(1.0 / 3)) - q) / ((T)0.75 - s * s);
@@ -170,10 +169,11 @@ for (int start = first; start < last; start += M) {
     }
 }
 
-// kernel warp_lcp.grid.volume.volume: Cells that neither surface can cross are counted whole. In
-// the others phi between cell centers and the distance between nodes are multilinear, and each of
-// `parts` points an axis stands for its part of the cell, filled as far as a plane at that
-// distance fills it. In a module of its own: few runs ask for it.
+// kernel warp_lcp.grid.volume.volume: Volume of the liquid [cells]. Cells that neither surface can
+// cross are counted whole. In the other cells phi is multilinear between cell centers, and the
+// distance to walls between nodes. Each of `parts` points per axis stands for its part of the cell,
+// which is filled as far as a plane at that distance fills it. In a module of its own, since few
+// runs need it.
 //   compute    float32
 //   box        float32 phi, distance?; int8 known
 //   numbers    int planes, parts

@@ -1,10 +1,9 @@
-// Moving solids: their speeds, see `grid/motion.py`, and where they are, see
-// `grid/node_distance.py`.
+// Moving solids: speeds, see `grid/motion.py`, and positions, see `grid/node_distance.py`.
 
-// kernel warp_lcp.grid.motion.top_speed: Largest speed of the corners of boxes around solids, each
-// clipped to the domain, from one of `parts` + 1 times to the next or back. `reals` holds rotations
-// and translations, time by time, the boxes' corners, infinite ones without limits, and the
-// domain's size, 0 along z in 2-D.
+// kernel warp_lcp.grid.motion.top_speed: Largest speed of the corners of boxes around solids,
+// clipped to the domain, between consecutive ones of `parts` + 1 times, forward and backward.
+// `reals` holds rotations and translations, time by time; the boxes' corners, infinite for solids
+// without limits; and the size of the domain, 0 along z in 2-D.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 fastest
@@ -17,7 +16,8 @@ const double* size = boxes + 6 * count;
 const auto place = [&](const double* R, const double* t, const double* p, double* q) {
     for (int i = 0; i < 3; ++i) q[i] = along(p, 1, R + 3 * i, 1) + t[i];
 };
-// the corners of the box around the placed box, clipped to the domain; whether it is in it
+// Corners of the bounding box of the placed box, clipped to the domain. Returns whether it
+// intersects the domain.
 const auto clip = [&](int n, int m, double (*corners)[3]) {
     double low[3], high[3], p[3], q[3];
     const bool limited = isfinite(boxes[6 * n]);
@@ -80,13 +80,13 @@ for (int n = first; n < last; ++n) {
     }
 }
 
-// kernel warp_lcp.grid.node_distance.place: Place shapes by the poses of the solids that they are
-// parts of. `reals` holds the solids' rotations and translations; of the shapes as the scene places
-// them rotations, translations, scales, origins, `corners` points each, margins around these, and
-// limits; then the spacing and the reach [cells] of the grid. Then come, for each shape, the
-// inverse rotation and the origin where it is, for each solid the first node near it and one past
-// the last, and these of all. `indices` holds the shapes' starts, the grid's origin and the end of
-// its nodes.
+// kernel warp_lcp.grid.node_distance.place: Place shapes by the poses of their solids. `reals`
+// holds the solids' rotations and translations; of the shapes as the scene places them: rotations,
+// translations, scales, origins, `corners` points each, margins around these, and limits; then the
+// spacing and the reach [cells] of the grid. The results follow: for each shape the inverse
+// rotation and the origin of its pose; for each solid the first node near it and one past the last;
+// and these of all solids. `indices` holds the shapes' starts, the grid's origin and the end of its
+// nodes.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 near

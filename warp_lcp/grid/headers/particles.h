@@ -1,20 +1,20 @@
-// Kernels of particles, and what passes over particles share.
+// Kernels of particles, and snippets that passes over particles share.
 
-// snippet origin: cells of a larger grid before the first one of this, and a particle's grid
-// coordinate
+// snippet origin: Cells of a larger grid before the first one of this part, and the grid coordinate
+// of a particle.
 #include "snippets.h:grid_coordinate"
-// cells of a larger grid before the first one of this
+// cells of a larger grid before the first one of this part
 const int origin[3] = {before_x, before_y, before_z};
 
-// snippet floor: The cell that a coordinate along an axis lies in, also where those of a part of a
-// larger grid are below 0.
+// snippet floor: Cell of a coordinate along an axis: the floor, also for the negative coordinates
+// of a part of a larger grid.
 auto floor_of = [=](T x, int axis) {
     const int from = axis == 0 ? before_x : axis == 1 ? before_y : before_z;
     return (int)(x - (T)from) + from;
 };
 
-// snippet nodes: i, j, k: the lowest of the nodes around a particle; f: how far it lies beyond
-// them, in cells
+// snippet nodes: Nodes around a particle: i, j, k is the lowest one, f the particle's offset from
+// it [cells].
 #include "snippets.h:grid_coordinate"
 const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5,
         hz = axis == 2 ? (T)0 : (T)0.5;
@@ -39,7 +39,8 @@ auto nodes = [&](long long p, int& i, int& j, int& k, T& fx, T& fy, T& fz) {
     fz = fz > 1 - lz ? 1 - lz : fz;
 };
 
-// snippet weigh: The cell c of a coordinate and the weights of cells c - 1, c, c + 1.
+// snippet weigh: Cell c of a coordinate, and the weights of cells c - 1, c, c + 1: quadratic
+// B-splines.
 auto weigh = [&](T x, int count, T* w) {
     EXACT_MATH
     const T from = x > 1 ? x : (T)1, e = count;
@@ -51,8 +52,8 @@ auto weigh = [&](T x, int count, T* w) {
     return c;
 };
 
-// snippet add: Add to an element that other threads may add to on CUDA; a product as it is there,
-// or fused.
+// snippet add: Add to an element that other threads may change on CUDA. A product is rounded before
+// it is added on CUDA, and fused on the CPU.
 auto add = [](auto& element, auto value) {
 #ifdef __CUDA_ARCH__
     atomicAdd(&element, value);
@@ -68,14 +69,14 @@ auto add_product = [&](auto& element, auto a, auto b) {
 #endif
 };
 
-// snippet shares: Particles add to fields around them. On CUDA a task has its own particles, on
-// the CPU planes of the fields (rows in 2-D): all particles that touch those are added there in
-// their order, so that each sum is the one that a single thread makes. Where the order is not that
-// in which they lie, `runs` has the begin and the end of what lies in order, one run after another.
-// Planes are cut where particles are: share s begins in the middle of chunk s/shares of all, so
-// that sorted particles are as many in each share. visit(begin, end, ours): `ours` tells of a plane
-// whether it is the task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might
-// round in one form of it otherwise than in the other.
+// snippet shares: Deterministic sums of particles in the fields around them. On CUDA a task has its
+// own particles. On the CPU a task has planes of the fields (rows in 2-D): all particles that touch
+// these are added in their order, so that each sum equals that of a single thread. If this order is
+// not that of memory, `runs` holds the begin and the end of each sequence of consecutive particles.
+// The planes are divided by particles: share s begins in the middle of chunk s/shares of all, so
+// that sorted particles are distributed evenly. visit(begin, end, ours): ours(plane) tells whether
+// a plane belongs to the task. The arithmetic is EXACT_MATH with `fused`; otherwise the compiler
+// might round differently in the two instances of `visit`.
 const auto each_share = [&](auto visit) {
     const auto all = [](int) { return true; };
 #ifdef __CUDA_ARCH__
@@ -114,9 +115,9 @@ const auto each_share = [&](auto visit) {
 #endif
 };
 
-// snippet numbered_cells: Cells of fields of a SHAPE have the numbers of the larger grid where
-// this is a part of one, from `first_cell` to `nx`, `ny`, `nz`; a stored field begins `back`
-// elements before the first one of the larger grid's. So coordinates are rounded alike in all
+// snippet numbered_cells: Cells of fields of a SHAPE have the numbers of the larger grid,
+// `first_cell` to `nx`, `ny`, `nz`, if the grid is a part of one. Element numbers of the larger
+// grid minus `back` are those of the stored field. Coordinates are thus rounded equally in all
 // parts.
 const int nx = SHAPE[2] - 2 + origin[0], ny = SHAPE[1] - 2 + origin[1],
           nz = SHAPE[0] - 2 + origin[2];
@@ -126,7 +127,7 @@ const int first_cell[3] = {1 + origin[0], 1 + origin[1], 1 + origin[2]};
 #include "floor"
 const T lx = first_cell[0], ly = first_cell[1], lz = first_cell[2];
 
-// snippet particle_blocks: What the steps of particles see.
+// snippet particle_blocks: Variables of the kernels that advect particles.
 #include "origin"
 typedef T Block[3][M];
 const T margin = (T)MARGIN;
@@ -137,8 +138,8 @@ Block from, to, k1, k2, k3;
 int hit[M], list[M];
 auto abs_of = [](T x) { return x < 0 ? -x : x; };
 
-// snippet sample: Interpolate the velocity at grid coordinates; points outside the domain and NaN
-// are brought inside, along axes without an end from the other side.
+// snippet sample: Linear interpolation of the velocity at grid coordinates. Points outside the
+// domain and NaN are moved inside; along periodic axes points enter from the other side.
 auto sample = [&](const Block& at, Block& result, int n) {
     const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
     for (int axis = 0; axis <= planes; ++axis) {
@@ -162,7 +163,7 @@ auto sample = [&](const Block& at, Block& result, int n) {
             y = (y < ey ? y : ey) - hy;
             z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
             int i = floor_of(x, 0), j = floor_of(y, 1), k = floor_of(z, 2);
-            // the next node is stored, too
+            // the next node is stored too
             i = i < nx ? i : nx;
             j = j < ny ? j : ny;
             k = k < nz ? k : nz;
@@ -177,8 +178,8 @@ auto sample = [&](const Block& at, Block& result, int n) {
     }
 };
 
-// kernel warp_lcp.grid.touched.touched: The planes (rows in 2-D) of a field that some particles
-// may add to: the first, one past the last
+// kernel warp_lcp.grid.touched.touched: Planes (rows in 2-D) of a field that a chunk of particles
+// may add to: the first, and one past the last
 //   compute    float32 | float64
 //   whole      int32 touched
 //   box        vec3<T> position
@@ -196,8 +197,8 @@ SIMD for (int p = first; p < last; ++p) {
 touched[2 * c_] = (int)low - 1;
 touched[2 * c_ + 1] = (int)high + 2;
 
-// kernel warp_lcp.grid.particles.number: Number the stored cell that each particle lies in; in 2-D
-// its plane is k = 1 whatever z is
+// kernel warp_lcp.grid.particles.number: Number of the stored cell that contains each particle; in
+// 2-D the plane is k = 1 for every z
 //   compute    float32
 //   whole      int32 key
 //   box        vec3 position
@@ -217,9 +218,9 @@ SIMD for (int p = first; p < last; ++p) {
     key[p] = (k * (ny + 2) + j) * (nx + 2) + i;
 }
 
-// kernel warp_lcp.grid.particles.total: Add up particles: |v|^2, x, bad x and v, v; the largest
-// |v|^2, highest x and lowest x with the other sign. On CUDA a thread takes every `chunks`-th, its
-// neighbor the next.
+// kernel warp_lcp.grid.particles.total: Sums over particles: |v|^2, x, v, and the numbers of x and
+// v that are not finite. Maxima: |v|^2, x and -x. On CUDA a thread takes every `chunks`-th
+// particle, so that adjacent threads read adjacent particles.
 //   compute    float32
 //   box        vec3 position, velocity
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z
@@ -307,8 +308,8 @@ low_x = -low[0][0];
 low_y = -low[1][0];
 low_z = -low[2][0];
 
-// kernel warp_lcp.grid.particles.add_in_order: Add up the sums of threads in the order of the
-// threads, a column each; of the last columns take the largest
+// kernel warp_lcp.grid.particles.add_in_order: Add up the partial sums of threads in the order of
+// the threads, column by column; the last columns are maxima
 //   compute    float64
 //   whole      float64 partials, results
 //   numbers    int places_of_sums, sums_
@@ -325,8 +326,8 @@ for (int column = P.first; column < P.first + n; ++column) {
     results[column] = s;
 }
 
-// kernel warp_lcp.grid.particles.close_ranks: Remove the particles with a mark, in place; the
-// others keep their order. Count those with the mark 1, and those with another
+// kernel warp_lcp.grid.particles.close_ranks: Remove the marked particles in place; the others keep
+// their order. Counts: particles with mark 1, and those with another mark
 //   compute    float32
 //   whole      int32 marks; vec3 position, velocity, affine_0?, affine_1?, affine_2?, kept?
 //   box        int32 removed
@@ -335,7 +336,7 @@ float* const columns[] = {(float*)given.position.data, (float*)given.velocity.da
                           (float*)given.affine_0.data, (float*)given.affine_1.data,
                           (float*)given.affine_2.data, (float*)given.kept.data};
 int counts[2] = {0, 0}, to = 0;
-while (to < count && marks[to] == 0) ++to;  // nothing moves before the first that goes
+while (to < count && marks[to] == 0) ++to;  // particles before the first removed one stay
 for (int p = to; p < count; ++p) {
     if (marks[p] != 0) {
         ++counts[marks[p] != 1];
@@ -350,7 +351,8 @@ for (int p = to; p < count; ++p) {
 removed[0] = counts[0];
 removed[1] = counts[1];
 
-// kernel warp_lcp.grid.particles.sort_count: Count how many keys of a piece have each digit
+// kernel warp_lcp.grid.particles.sort_count: Radix sort, step 1: number of a piece's keys with each
+// digit
 //   compute    float32
 //   whole      int32 counts
 //   box        int32 key
@@ -360,8 +362,8 @@ int* mine = counts + (long long)c_ * (digits + APART);
 for (int d = 0; d < digits; ++d) mine[d] = 0;
 for (int p = first; p < last; ++p) ++mine[key[p] >> shift&(digits - 1)];
 
-// kernel warp_lcp.grid.particles.sort_begin: Find where the keys of each digit and piece begin:
-// those of smaller digits are before them, and those of the pieces before
+// kernel warp_lcp.grid.particles.sort_begin: Radix sort, step 2: first place of the keys of each
+// digit and piece, after those of smaller digits and of the pieces before
 //   compute    float32
 //   box        int32 counts
 //   numbers    int pieces, digits
@@ -375,8 +377,8 @@ for (int d = 0; d < digits; ++d)
         at += many;
     }
 
-// kernel warp_lcp.grid.particles.sort_place: Put the keys of a piece, and where they were at first,
-// to the place of their digit; those of one digit keep their order
+// kernel warp_lcp.grid.particles.sort_place: Radix sort, step 3: move the keys of a piece, and
+// their first positions, to the places of their digits; the order within a digit is kept
 //   compute    float32
 //   whole      int32 counts, order?, sorted, moved
 //   box        int32 key

@@ -5,8 +5,7 @@
 //   box        T field
 for (int i = first; i < last; ++i) field[i] = 0;
 
-// kernel warp_lcp.grid.active_rows.mark_segments: Mark the segment of a row that each particle lies
-// in
+// kernel warp_lcp.grid.active_rows.mark_segments: Mark the row segment that contains each particle
 //   compute    float32
 //   whole      uint8 marks
 //   box        vec3 position
@@ -26,17 +25,18 @@ for (int p = first; p < last; ++p) {
     marks[((long long)k * in_y + j) * in_x + i / segment] = 1;
 }
 
-// kernel warp_lcp.grid.extrapolate.fill_layer: Fill faces marked `fill` from neighbors known up to
-// `layer`, and mark them layer + 1. A pass over the marks finds what to fill, so that rows without
-// any cost a byte a face: with one thread a row in plain Warp a liquid of 276,000 cells spent 23
-// ms a step on its extrapolation, in this form it spends 8. In place without a race: a face that
-// another thread fills in this launch is marked `fill` or layer + 1 and is not read either way.
+// kernel warp_lcp.grid.extrapolate.fill_layer: Extrapolate by a layer: faces marked `fill` become
+// the mean of their neighbors known up to `layer`, and get the mark layer + 1. A pass over the
+// marks finds these faces, so that other rows cost a byte per face: for a liquid of 276,000 cells a
+// step takes 8 ms, and 23 ms with one thread per row in plain Warp. In place without a race: a face
+// that another thread fills in this launch is marked `fill` or layer + 1, and is read in neither
+// case.
 //   compute    float32
 //   box        float32 field; int8 known
 //   numbers    int layer, fill
 const int nz = given.known.shape[0], ny = given.known.shape[1], nx = given.known.shape[2];
-// where there is no neighboring row the row itself stands in for it, and no mark is low enough to
-// be a source
+// If there is no neighboring row, the row itself replaces it, and the limit 0 excludes it as a
+// source.
 const long long a = j > 0 ? -s2 : 0, b = j + 1 < ny ? s2 : 0, c = k > 0 ? -s1 : 0,
                 d = k + 1 < nz ? s1 : 0;
 const signed char now = (signed char)layer;
@@ -97,10 +97,10 @@ if (last == nx && nx > 1) fill_one(nx - 1);
 //   box        float32 field, source
 SIMD for (int i = first; i < last; ++i) field[i] = source[i];
 
-// kernel warp_lcp.grid.window_reduction.add_rows: Sums of what a pass has found in the rows of a
-// window, a column each; of the last columns the largest. The order is that of NumPy's pairwise summation:
-// 8 accumulators over up to 128 values, their sums added in pairs; of a box without whole planes,
-// rows that fit 8192 values one after another.
+// kernel warp_lcp.grid.window_reduction.add_rows: Reduce the values of a window's rows, column by
+// column; the last columns are maxima. Sums are taken in the order of NumPy's pairwise summation: 8
+// accumulators over up to 128 values, their sums added in pairs. A box without whole planes is
+// summed in groups of rows with at most 8192 values.
 //   compute    float64
 //   whole      float64 partials, host, results; vec2i pieces?
 //   numbers    int first_k, first_j, planes, rows_, box_k, box_j, box_planes, box_rows, hulls,

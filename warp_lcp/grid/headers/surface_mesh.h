@@ -1,7 +1,7 @@
-// Kernels of the surface of a liquid for pictures.
+// Kernels of the liquid surface in pictures.
 
-// kernel warp_lcp.grid.surface_mesh.room: Distance to the solids at a row of lattice cells from
-// that at the grid's nodes, in lattice cells
+// kernel warp_lcp.grid.surface_mesh.room: Distance to the solids [lattice cells] at a row of
+// lattice cells, from the distance at the grid's nodes
 //   compute    float32
 //   whole      float32 distance
 //   box        float32 out
@@ -9,7 +9,7 @@
 const int ny = given.distance.shape[1], nx = given.distance.shape[2];
 const long long s2 = nx, s1 = s2 * ny;
 const float scale = (float)parts, step = 1.0f / scale;
-// the stored cell that a lattice cell's center lies in, and where in it
+// Stored cell that contains the center of a lattice cell, and the position in it.
 auto cell = [&](int fine, float& f) {
     const float x = ((float)fine - 0.5f) * step + 1.0f;
     const int c = (int)x;
@@ -28,9 +28,9 @@ for (int i = first; i < last; ++i) {
     out[i] = scale * (low + fz * (high - low));
 }
 
-// kernel warp_lcp.grid.surface_mesh.boost: Add the kernels of particles that have few others
-// around them, the more the fewer these are. A particle looks at the share in its own lattice
-// cell; few have to go on.
+// kernel warp_lcp.grid.surface_mesh.boost: Add to the kernels of particles that have few others
+// around them: the fewer, the more. The share in the particle's own lattice cell decides, so that
+// most particles end here.
 //   compute    float32
 //   whole      float32 smooth, capacity?, thin
 //   box        vec3 position
@@ -67,15 +67,16 @@ for (long long p = first; p < last; ++p) {
                 add(thin[at + (c - 1) * s1 + (b - 1) * s2 + a - 1], boost * wz[c] * wy[b] * wx[a]);
 }
 
-// kernel warp_lcp.grid.surface_mesh.carve: Take what lies inside solids away from the liquid
+// kernel warp_lcp.grid.surface_mesh.carve: Remove the inside of solids from the liquid: phi =
+// max(phi, -room)
 //   compute    float32
 //   box        float32 room, phi
 SIMD for (int i = first; i < last; ++i) phi[i] = phi[i] > -room[i] ? phi[i] : -room[i];
 
-// kernel warp_lcp.grid.surface_mesh.surface_distance: Filled shares to distances [lattice cells]:
-// phi = -spread sqrt(2) erfinv(2 share - 1), what a half space would be away, by the series up to
-// the seventh power (0.2 % off at the nodes beside the surface); beyond the domain's sides there
-// is air.
+// kernel warp_lcp.grid.surface_mesh.surface_distance: Distance [lattice cells] from the filled
+// share, as for a half space: phi = -spread sqrt(2) erfinv(2 share - 1), by the series up to the
+// seventh power (error 0.2 % at the nodes beside the surface). Beyond the domain's sides there is
+// air.
 //   compute    float32
 //   box        float32 phi, smooth, thin, capacity?; int8 known?
 //   numbers    int planes; float32 spread
@@ -102,9 +103,9 @@ for (int start = first; start < last; start += M) {
     }
 }
 
-// kernel warp_lcp.grid.mesh_smoothing.see_neighbors: Add up the neighbors of each point. A closed
-// surface has each edge once in either direction, so that each neighbor is added once; an
-// outline's points have two neighbors.
+// kernel warp_lcp.grid.mesh_smoothing.see_neighbors: Sum of the neighbors of each point, and their
+// number. A closed surface has each edge once in either direction, so that each neighbor is added
+// once. The points of an outline have two neighbors.
 //   compute    float32
 //   whole      vec3 points; float32 sums
 //   box        int32 corners
@@ -127,8 +128,8 @@ for (long long t = first; t < last; ++t) {
     see(c[2], c[0]);
 }
 
-// snippet cube_cases: The cases of the cells of a block, and whether any of them has a surface;
-// `visit` gets each that has one. In 2-D the nodes above are those below: no edge along z is cut.
+// snippet cube_cases: Cases of the cells of a block (marching cubes). `visit` is called for each
+// cell that the surface crosses. In 2-D the nodes above are those below: no edge along z is cut.
 const long long up = planes == 2 ? s1 : 0;
 auto each = [&](auto visit) {
     unsigned char cases[M];
@@ -155,7 +156,7 @@ auto each = [&](auto visit) {
 const long long wide = planes == 2 ? 16 : 5;
 const int mask = planes == 2 ? 255 : 15;
 
-// kernel warp_lcp.grid.marching_cubes.count: Count the points that a row's nodes own and the
+// kernel warp_lcp.grid.marching_cubes.count: Count the points that a row's nodes own, and the
 // triangles of its cells
 //   compute    float32
 //   by_row     int32 owned, made
@@ -173,10 +174,10 @@ owned[P.row] = points;
 made[P.row] = elements;
 
 // kernel warp_lcp.grid.marching_cubes.points: Place the points of a row's nodes, and number the
-// nodes that have any. Edges along a side of the domain, half a cell from it, count as if they
-// were on it: the surface meets a wall on the wall, in a sharp edge. What closes it there, the
-// points between the nodes beside a side and the ring, lies on the side too, just off the sides'
-// common edges.
+// nodes that have any. Edges along a side of the domain, half a cell from it, count as if they were
+// on it: the surface meets a wall on the wall, in a sharp edge. The points that close the surface
+// there, between the nodes beside a side and the ghost ring, lie on the side too, slightly off the
+// common edges of the sides.
 //   compute    float32
 //   by_row     int32 ends, counts
 //   whole      vec3 into
@@ -186,7 +187,7 @@ made[P.row] = elements;
 #include "cube_cases"
 float* to = (float*)into;
 int next = ends[P.row] - counts[P.row];
-const int most[3] = {most_x, most_y, most_z};  // cells of the domain, whose numbers nodes have
+const int most[3] = {most_x, most_y, most_z};  // cells of the domain; nodes have their numbers
 auto place = [&](int axis, int c, float inset) {
     const int n = most[axis];
     if (n == 1 || (c > 1 && c < n)) return (float)c - 0.5f;
@@ -226,7 +227,7 @@ each([&](int i, int code) {
     const signed char* row = table + (code & mask) * wide;
     for (int n = 0; n < size * row[0]; ++n) {
         const int edge = row[1 + n], axis = edge / 4, b = edge % 4;
-        // the low end of the edge: b's two bits are the other two axes, the lower first
+        // Low end of the edge: the two bits of b are the other two axes, the lower one first.
         const int x = axis == 0 ? 0 : b & 1, y = axis == 0 ? b & 1 : (axis == 1 ? 0 : b >> 1),
                   z = axis == 2 ? 0 : b >> 1;
         const long long node = i + x + y * s2 + z * up;

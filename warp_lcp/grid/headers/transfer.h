@@ -1,6 +1,7 @@
 // Kernels of transfers between particles and faces.
 
-// kernel grid.transfer.scatter: Add the momentum and weight of particles to the nodes around them
+// kernel grid.transfer.scatter: Particles to grid: add momentum and weight of particles to the
+// nodes around them
 //   compute    float32 | float64
 //   whole      vec3<T> position, velocity, gradient?; T momentum, weight; int32 touched?, runs?
 //   numbers    int planes; T dx, inverse_dx; int before_x, before_y, before_z, axis, count, chunk,
@@ -14,7 +15,7 @@
     const T* gradient = (const T*)given.gradient.data;
 #include "particles.h:nodes"
     const long long s2 = given.weight.shape[2], s1 = s2 * given.weight.shape[1];
-    // types, not values: tests inside the loop cost a third of its time
+    // types instead of values: tests inside the loop would cost a third of its time
     auto visit = [&](auto affine, auto rows) {
         each_share([&](long long begin, long long end, auto ours) {
             EXACT_MATH
@@ -27,7 +28,8 @@
                 const T cx = affine() ? gradient[3 * p] * dx : (T)0,
                         cy = affine() ? gradient[3 * p + 1] * dx : (T)0;
                 const T cz = affine() && rows() == 4 ? gradient[3 * p + 2] * dx : (T)0;
-                T v = velocity[3 * p + axis];  // less the slopes: what node (k, j, i) sees
+                // Without the slopes: the value at node (k, j, i).
+                T v = velocity[3 * p + axis];
                 if (affine()) v = fused(-cz, fz, fused(-cy, fy, fused(-cx, fx, v)));
                 const long long o = k * s1 + j * s2 + i;
                 for (int n = 0; n < rows(); ++n) {
@@ -59,8 +61,9 @@
         visit(no, two);
 }
 
-// kernel warp_lcp.grid.transfer.interpolate: Find the velocity of some particles, and its gradient
-// if wanted, from the nodes around them
+// kernel warp_lcp.grid.transfer.interpolate: Grid to particles: interpolate the velocity, and its
+// gradient if needed, from the nodes around each particle. With `saved` (FLIP): plus flip (v - the
+// interpolated saved velocity)
 //   compute    float32 | float64
 //   whole      T field, saved?
 //   box        vec3<T> position, velocity, gradient?
@@ -120,8 +123,8 @@ for (int start = first; start < last; start += M) {
         visit([](long long, T, T, T) {});
 }
 
-// kernel warp_lcp.grid.transfer.gather_weights: Face (k, j, i) visits the particles of the cells
-// around it; along x they are consecutive, a range a row of cells
+// kernel warp_lcp.grid.transfer.gather_weights: Particles to grid, by faces: face (k, j, i) visits
+// the particles of the cells around it. Along x they are consecutive: one range per row of cells
 //   compute    float32 | float64
 //   whole      int32 offsets; vec3<T> position, velocity, gradient?
 //   box        T field, weight
@@ -133,8 +136,8 @@ const T* gradient = (const T*)given.gradient.data;
 #include "particles.h:nodes"
 const int nx = given.field.shape[2], ny = given.field.shape[1], nz = given.field.shape[0];
 for (int i = first; i < last; ++i) {
-    // a particle in cell c reaches the nodes c and c + 1 of its own axis, c - 1 to c + 1 of the
-    // others
+    // A particle in cell c reaches nodes c and c + 1 along the face's own axis, and c - 1 to c + 1
+    // along the others.
     const int x0 = i > 0 ? i - 1 : 0, x1 = axis == 0 || i + 1 >= nx ? i : i + 1;
     const int y0 = j > 0 ? j - 1 : 0, y1 = axis == 1 || j + 1 >= ny ? j : j + 1;
     const int z0 = planes == 1 ? k : (k > 0 ? k - 1 : 0),
@@ -149,7 +152,7 @@ for (int i = first; i < last; ++i) {
                 T fx, fy, fz;
                 nodes(p, pi, pj, pk, fx, fy, fz);
                 const int di = i - pi, dj = j - pj, dk = planes == 2 ? k - pk : 0;
-                if ((di | dj | dk) & ~1) continue;  // not one of the nodes around it
+                if ((di | dj | dk) & ~1) continue;  // the face is not one of the particle's nodes
                 const T w = (di ? fx : 1 - fx) * (dj ? fy : 1 - fy) *
                             (planes == 1 ? (T)1
                              : dk        ? fz

@@ -1,8 +1,9 @@
-// Snippets of the signed distance to walls, and the kernel that pushes particles out of them.
+// Snippets of the signed distance to walls, and the kernel that moves particles out of walls.
 
-// snippet wall_distance: The distance to walls and its gradient at grid coordinates in the domain,
-// in cells: that of the solids, linear between nodes, or of the domain. The smaller of both taken
-// at the nodes would close what is open between a solid and the domain's wall next to it.
+// snippet wall_distance: Distance to walls [cells] and its gradient at grid coordinates in the
+// domain: the smaller of the distance to solids, linear between nodes, and that to the domain's
+// sides. Taking the smaller one at the nodes would close the gap between a solid and a side of the
+// domain next to it.
 const float* level = given.distance.data - back;
 const T aim = (T)AIM;
 const int counts[3] = {nx, ny, nz};
@@ -85,9 +86,9 @@ auto measure_all = [&](const Block& at, T* result, int n) {
 };
 auto square = [](const T* g) { return g[0] * g[0] + g[1] * g[1] + g[2] * g[2]; };
 
-// snippet project: Where the distance on a grid has a saddle, as in the edge between two walls
-// along the grid, Newton's method along the gradient goes astray. There the direction is that of
-// differences over a cell, and the way out is searched in short legs.
+// snippet project: Way out of walls. Newton's method along the gradient fails where the distance on
+// a grid has a saddle, as in the edge between two walls along the grid. There the direction is that
+// of differences over a cell, and the way out is searched in short steps.
 auto wide_normal = [&](const T* x, T* n) {
     for (int d = 0; d < 3; ++d) {
         T s[2] = {0, 0}, g[3];
@@ -137,8 +138,9 @@ auto search = [&](T* x, T first_length, T limit) {
     }
     return false;
 };
-// Put a point that is too near or inside at the distance `aim`; n becomes the normal there. 0: no
-// way out within the limit, 2: it was the gradient that led nowhere.
+// Move a point that is too close to a wall, or inside, to the distance `aim`; n becomes the normal
+// there. Returns 0 if there is no way out within the limit, 2 if the gradient failed and the search
+// succeeded.
 auto project = [&](T* x, T* n, T limit) {
     const T start[3] = {x[0], x[1], x[2]};
     T s = measure(x, n), far = 0;
@@ -146,7 +148,7 @@ auto project = [&](T* x, T* n, T limit) {
     for (int step = 0; step < 8 && s < margin && far <= limit * limit; ++step) {
         const T need = aim - s, steepness = square(n), trust = 4 * need + (T)0.05;
         if (!(need * need <= steepness * trust * trust)) break;
-        // it is only here that the slope is not 1
+        // only here the slope differs from 1
         const T slope = sqrt(steepness), length = need / slope, most = need + (T)0.05;
         for (int d = 0; d < 3; ++d) x[d] += (length < most ? length : most) / slope * n[d];
         into_domain(x);
@@ -165,8 +167,8 @@ auto project = [&](T* x, T* n, T limit) {
     return out;
 };
 
-// kernel warp_lcp.grid.push_out.push_out: Put some particles that are inside walls, or too near,
-// outside; count those it moved and those it could not
+// kernel warp_lcp.grid.push_out.push_out: Move particles that are inside walls, or too close, out
+// of them; count those that moved and those that could not
 //   compute    float32
 //   whole      float32 distance; int32 moved, left
 //   box        vec3 position
@@ -209,7 +211,7 @@ for (int start = first; start < last; start += M) {
         int finite = 1;
         for (int d = 0; d <= planes; ++d)
             finite &= (int)(x[d] <= (T)3e38) & (int)(x[d] >= (T)-3e38);
-        if (!finite) continue;  // the sums over particles will find it
+        if (!finite) continue;  // the sums over particles report it
         into_domain(x);
         if (!project(x, normal, (T)PUSH)) {
             ++left;

@@ -1,8 +1,8 @@
-// Vectors of three and matrices of 3 x 3 numbers, for loops on the host.
+// Vectors of 3 and matrices of 3 x 3 numbers, for loops on the host.
 
-// snippet algebra: Products of vectors and 3 x 3 matrices. Sums are taken in the order in which
-// NumPy and OpenBLAS take them, so that the bits are those of arrays: `along` is that of a product
-// of matrices, of a dot product and of A' x; `across` that of A x. They begin with 0: none is -0.
+// snippet algebra: Products of vectors and 3 x 3 matrices. Sums are taken in the order of NumPy and
+// OpenBLAS, so that results equal those of array code to the last bit. `along`: the order of a
+// matrix product, a dot product and A'x. `across`: the order of A x. Adding 0 turns -0 into 0.
 const auto along = [&](const double* a, int s, const double* b, int t) {
     return fused(a[2 * s], b[2 * t], fused(a[s], b[t], a[0] * b[0])) + 0.0;
 };

@@ -1,6 +1,7 @@
-// Bounds of x. body(lower, upper) is called with functions of the cell, so that a loop over them
-// tests none: numbers, a code of two bits, or fields and numbers, see `warp_lcp.problem.bounds`.
-// What there is, BOUNDS, is known when the kernel is made: the rest is not compiled.
+// Bounds l <= x <= u of a cell. body(lower, upper) is called with functions of the cell index, so
+// that the loop inside does not branch on the kind of bounds: numbers, numbers with a code of two
+// bits per cell, or fields and numbers; see `warp_lcp.problem.bounds`. BOUNDS is known at compile
+// time; other kinds are not compiled.
 const auto with_bounds = [&](auto body) {
     const auto l = in_(given.bounds.lower.data, p), u = in_(given.bounds.upper.data, p);
     const auto code = in_(given.bounds.code.data, p);
@@ -24,7 +25,7 @@ const auto with_bounds = [&](auto body) {
 };
 const bool unbounded = BOUNDS == 'n' && given.bounds.least == -(double)INFINITY &&
                        given.bounds.most == (double)INFINITY;
-// of gaps to the bounds times the diagonal
+// max(above, min(below, y)): the natural residual, from the gaps to the bounds times the diagonal
 const auto natural_residual = [](double y, double below, double above) {
     const double least = below < y ? below : y;
     return above > least ? above : least;

@@ -1,6 +1,6 @@
-// How loops are written. SIMD: 16 elements at a time; SIMD8 where most are doubles; SIMD64 for
-// bytes. Sums may be taken in any order. clang vectorizes a loop only if it is told that arrays do
-// not alias and if conditionals select values that are computed anyway.
+// Macros for loops. SIMD: vectors of 16 elements; SIMD8: most elements are float64; SIMD64: bytes.
+// Sums may be reassociated. clang vectorizes a loop only if arrays are declared not to alias and if
+// conditionals select between values that are computed in any case.
 #ifdef __CUDA_ARCH__
 #define FAST_MATH
 #define EXACT_MATH
@@ -11,7 +11,7 @@
 #define VECTORS(WIDTH)
 #define BUFFERED 1
 #endif
-#define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
+#define UNROLLED _Pragma("unroll 4")  // several loads in flight
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
@@ -22,7 +22,7 @@
 #define BUFFERED 128
 #endif
 #define SIMD VECTORS(16)
-// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the
+// MASKED: the remainder of a row after its last whole vector is a masked vector, where the
 // processor has masks
 #if !defined(__CUDA_ARCH__) && defined(__AVX512BW__) && defined(__AVX512VL__)
 #define MASKED PRAGMA(clang loop vectorize_predicate(enable)) SIMD
@@ -31,13 +31,13 @@
 #endif
 #define SIMD8 VECTORS(8)
 #define SIMD64 VECTORS(64)
-FAST_MATH  // comes before the first declaration
+FAST_MATH  // must precede the first declaration
     enum {
         M = BUFFERED
     };  // cells that a row function buffers at a time
-// Ask for the cache lines that cells begin ... end of fields will need 512 elements later: the
-// processor's own prefetching does not keep up with a pass over seven fields or more whose rows are
-// short. So far ahead made such passes 20 to 25 % faster at 128^3 and 256^3.
+// Prefetch the cache lines of cells begin ... end of fields, 512 elements ahead. The hardware
+// prefetcher does not keep up with a pass over seven or more fields with short rows. This distance
+// made such passes 20 to 25 % faster at 128^3 and 256^3.
 #ifdef __CUDA_ARCH__
 const auto fetch = [](int begin, int end, const auto&... fields) {};
 #else
@@ -48,7 +48,7 @@ const auto fetch = [](int begin, int end, const auto*... fields) {
     (one(fields), ...);
 };
 #endif
-// What other threads, too, add to or make larger; the order changes nothing.
+// Atomic sum and maximum. The result does not depend on the order of the threads.
 const auto count_up = [](int* to, int v) {
 #ifdef __CUDA_ARCH__
     atomicAdd(to, v);
@@ -66,7 +66,7 @@ const auto make_at_least = [](double* to, double v) {
          !__atomic_compare_exchange(to, &was, &v, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED);) {}
 #endif
 };
-// a*b + c rounded once, of numbers or of vectors, whatever the compiler may do elsewhere
+// a*b + c with one rounding, of numbers or vectors, independent of the compiler's settings
 #ifdef __CUDA_ARCH__
 const auto fused = [](auto a, auto b, auto c) { return fma(a, b, c); };
 #else
@@ -76,16 +76,17 @@ const auto clipped = [](auto v, auto l, auto u) {
     const auto w = v < l ? l : v;
     return w > u ? u : w;
 };
-// else clang may divide each cell by v where it is used once
+// 1 / v, computed once: otherwise clang may divide each cell by v
 const auto reciprocal = [](auto v) { EXACT_MATH return 1 / v; };
-// body(2) if `pairs`, else body(1): a loop over so many cells is unrolled in quads
+// Call body(2) if `pairs`, else body(1). The count is constant: a loop over so many cells is
+// unrolled in quads.
 #ifdef QUADS
 #ifdef __CUDACC__
 #define METHOD __device__
 #else
 #define METHOD
 #endif
-typedef int Whole;  // Warp has a macro of the name of a conversion to int
+typedef int Whole;  // Warp has a macro with the name of a conversion to int
 struct One {
     METHOD constexpr operator Whole() const { return 1; }
 };
@@ -98,8 +99,8 @@ const auto with_pairs = [](bool pairs, auto body) {
     else
         body(One());
 };
-// body(plane, row) of an aggregate's rows, in quads compiled for each row: fields begin elsewhere
-// there
+// Call body(plane, row) for the rows of an aggregate. In quads the body is compiled for each row,
+// since fields begin at different addresses there.
 const auto each_row = [](int deep, int wide, auto body) {
     for (int z = 0; z < deep; ++z) {
         body(z, 0);
@@ -113,8 +114,8 @@ const auto each_row = [](int deep, int wide, auto body) {
         for (int y = 0; y < wide; ++y) body(z, y);
 };
 #endif
-// a / e. In quads a division of float32 has no branch, for loads do not merge across branches: it
-// is rounded as IEEE division is, but where e or the quotient is not a normal number.
+// a / e. In quads a float32 division has no branch, since loads are not merged across branches. It
+// is rounded like an IEEE division, unless e or the quotient is not a normal number.
 #if defined(QUADS) && defined(__CUDACC__)
 const auto quotient = [](auto a, auto e) {
     if constexpr (sizeof(a) == 4 && sizeof(e) == 4) {

@@ -1,30 +1,30 @@
-// A piece: cells in x that lie side by side. What a cell's address is, is known here and nowhere
-// else.
+// Piece: consecutive cells of a row along x. Only this header computes the addresses of cells.
 struct Piece {
-    long long p;  // element of the first cell
-    int n;  // cells
-    // offsets to the rows beside it: below and above along y, down and up along z
+    long long p;  // index of the first cell's element
+    int n;  // number of cells
+    // offsets to the adjacent rows: below and above along y (ym, yp) and along z (zm, zp)
     long long ym, yp, zm, zp;
-    // of a field that keeps three planes: offset to its place there, and from there to the planes
-    // around it
+    // ring buffer of three planes: offset of this plane's place, and from there to the planes below
+    // and above
     long long ring, down, up;
-    long long q;  // element of the other level that holds, or begins, the first cell
-    int k, j, first, row;  // plane, row in it, first cell, counted from 0; row of all
-    // place of the thread's sums, and whether something is there already
+    long long q;  // element of the other level that contains the first cell, or is its first one
+    int k, j, first, row;  // plane, row in it, first cell, all from 0; row number over all planes
+    // place of the thread's partial sums, and whether it holds a value already
     int t;
     bool more;
 };
-// of the sums of all threads; a number may hide the name
+// Number of partial sums of all threads. A kernel's number may hide the short name.
 const long long places_ = (L.planes + L.slab - 1) / L.slab * L.rows * L.chunks, places = places_;
-// along an axis, from level to level
+// index along an axis on another level: times f, or over -f if f < 0
 const auto over = [](int i, int f) -> long long { return f > 0 ? (long long)i * f : i / -f; };
-// of a plane of a field that keeps three: elements beyond plane k, and to the planes around it
+// Ring buffer of three planes: offset of plane k, and offsets from there to the planes below and
+// above
 struct Ring {
     long long place, down, up;
 };
 const auto ring_of = [&](int k) -> Ring {
-    // where the field has plane `at`: three in turn a slab, but those beside a cut as in a whole
-    // field
+    // Plane of the buffer that holds plane `at`: three planes in rotation per slab. The planes
+    // beside a cut are stored as in a whole field.
     const auto place = [&](int at) {
         if (!L.cut) return at % 3;
         const int s = at / L.cut < L.slabs ? at / L.cut : L.slabs - 1, first = s * L.cut,
@@ -33,14 +33,14 @@ const auto ring_of = [&](int k) -> Ring {
                    ? at
                    : from + (at - from) % 3;
     };
-    // the plane below the first of the ring stands below the first plane and above the last one,
-    // unless those are in turn
+    // The place below the ring serves as the plane below the first one and as the plane above the
+    // last one, unless those rotate too (L.turn).
     const int at = k + L.turn, here = place(at), below = at > 0 ? place(at - 1) : -1,
               above = k == L.planes - 1 && !L.turn ? -1 : place(at + 1);
     return {(here - k + L.lift) * L.s1, (below - here) * L.s1, (above - here) * L.s1};
 };
 const auto piece = [&](int k, int j, int c, const Ring& ring) -> Piece {
-    // not above 2^31
+    // these indices do not exceed 32 bits
     Piece P;
     int first = c * L.grain, last = L.nx - first < L.grain ? L.nx : first + L.grain;
     P.k = k;

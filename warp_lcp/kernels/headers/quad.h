@@ -1,17 +1,17 @@
-// A thread's quads on CUDA: four cells of a row in each plane of a slab. Index arithmetic is of 32
-// bits, and done once a thread.
+// Quads of a thread on CUDA: four cells of a row in each plane of a slab. Index arithmetic uses 32
+// bits and is done once per thread.
 //
 // Fields that are read are loaded once, however often the row function reads them: `__ldg` tells
-// the compiler that nothing in this launch changes them. Fields that are written are kept in
-// registers until the row function ends.
+// the compiler that this launch does not change them. Fields that are written are kept in registers
+// until the row function ends.
 //
-// Where it is known how far rows begin after multiples of four elements, fields are loaded in
-// blocks of 16 bytes (of bytes: 4), the two that hold a quad and the cells beside it. At is a
-// class: rows begin at FIRST after such a multiple, or if EITHER every second one at FIRST + 2;
-// FIRST < 0: anywhere, and each cell is loaded for itself. The row function is compiled for both,
-// so that nothing is selected: the compiler knows the last two bits of steps to other rows and
-// planes. Fields may be moved by such steps and even numbers of cells; beside cell k are x[k - 1]
-// and x[k + 1].
+// If the alignment of rows is known, fields are loaded in blocks of 16 bytes (byte fields: 4
+// bytes): the two blocks that contain a quad and the cells beside it. The class At describes the
+// alignment. FIRST >= 0: rows begin FIRST elements after a multiple of four; with EITHER, every
+// second row begins at FIRST + 2. FIRST < 0: unknown, and each cell is loaded on its own. The row
+// function is compiled for both beginnings, so that it selects nothing at run time: the compiler
+// knows the last two bits of the offsets to other rows and planes. Fields may be shifted by such
+// offsets and by even numbers of cells; x[k - 1] and x[k + 1] are the neighbors of cell k.
 #ifdef __CUDACC__
 const auto load_ = [](const auto* q) { return __ldg(q); };
 #else
@@ -19,22 +19,22 @@ const auto load_ = [](const auto* q) { return *q; };
 #endif
 struct Fixed_ {
     enum { FIXED = 1 };
-};  // of fields that nothing in this launch changes
+};  // for fields that this launch does not change
 struct Kept_ {
     enum { FIXED = 0 };
 };
-// there are no templates within a function, so the classes are those of lambdas
+// A function cannot contain templates: these are local classes of generic lambdas.
 const auto in_at_ = [](auto at, auto fixed, const auto* q, int first, bool half) {
     using V = decltype(load_(q));
     using At = decltype(at);
     constexpr bool FIXED = decltype(fixed)::FIXED;
     struct In {
         enum { REAL = (V)0.5 != (V)0 };
-        // an address is made of both by one instruction; p: of the block, FIRST or FIRST + 2 before
+        // One instruction adds q and p. p: offset of the block, FIRST or FIRST + 2 before the cell.
         const V* q;
         int p;
         bool half;
-        // V number i of the block at b
+        // element i of the block at b
         METHOD static V of_block(const V* b, int i) {
 #ifdef __CUDACC__
             if constexpr (sizeof(V) == 8) {
@@ -51,7 +51,7 @@ const auto in_at_ = [](auto at, auto fixed, const auto* q, int first, bool half)
             return b[i];
 #endif
         }
-        METHOD static unsigned word(const V* b) {  // four bytes
+        METHOD static unsigned word(const V* b) {  // four bytes as one word
 #ifdef __CUDACC__
             return FIXED ? __ldg((const unsigned*)b) : *(const unsigned*)b;
 #else
@@ -61,7 +61,7 @@ const auto in_at_ = [](auto at, auto fixed, const auto* q, int first, bool half)
         }
         METHOD V operator[](int k) const {
             if constexpr (At::FIRST >= 0) {
-                if ((unsigned)(k + 4) < 16u) {  // known when loops are unrolled
+                if ((unsigned)(k + 4) < 16u) {  // known at compile time when loops are unrolled
                     const V* b = q + p;
                     const int i = At::FIRST + k, j = i + 2;
                     if constexpr (sizeof(V) == 1) {
@@ -93,7 +93,7 @@ const auto in_at_ = [](auto at, auto fixed, const auto* q, int first, bool half)
     };
     return In{q, At::FIRST < 0 ? first : first - At::FIRST - 2 * half, half};
 };
-// a field that is written; cells beyond the quad are in memory
+// A field that is written. Cells beyond the quad are accessed in memory.
 const auto out_at_ = [&](auto* q, int first, bool half) {
     const auto before = in_at_(Ours_(), Kept_(), q, first, half);
     using V = decltype(load_(q));
@@ -165,7 +165,7 @@ const auto out_at_ = [&](auto* q, int first, bool half) {
     };
     return Out(q, first, before);
 };
-// functions of a field and its first element
+// accessors of a field, from the field and its first element
 const auto reading_ = [&](auto at, bool half) {
     return [=](const auto* q, int first) { return in_at_(at, Fixed_(), q, first, half); };
 };
@@ -176,7 +176,7 @@ struct Quad {
     int p, n, ym, yp, zm, zp, k, j, first, row;
     long long t;
     bool more;
-};  // as Piece
+};  // same members as Piece
 const auto row_of_ = [](auto at, int step) {
     using At = decltype(at);
     return At::EITHER ? (step & ~3) + 2 : At::FIRST < 0 ? step : step & ~3;
@@ -202,7 +202,8 @@ for (int k_i = begin_, p_ = (int)L.base + begin_ * plane_step_ + row_ * row_step
         from_ = from_ > span[0] ? from_ : span[0];
         to_ = to_ < span[1] ? to_ : span[1];
     }
-    int q = 0;  // of the other level, whose cells stand for one of ours along an axis, or for two
+    // Cell of the other level. One of its cells covers one or two cells of this level on an axis.
+    int q = 0;
     if constexpr (LEVELS) {
         const auto over = [](int i, int f) { return f < -1 ? i >> 1 : f > 1 ? 2 * i : i; };
         q = (int)L.o0 + over(k_i, L.fz) * (int)L.o1 + over(row_, L.fy) * (int)L.o2 +

@@ -1,8 +1,9 @@
 // Snippets for kernels of several areas.
 
-// snippet bytes: Loops that compile quickly. MASKED64, where MASKED_BYTES: bytes in one loop, what
-// is left after its last whole vector under a mask, where the processor has masks. OPAQUE: the
-// compiler forgets how a pointer was computed; else it looks long for terms that addresses share.
+// snippet bytes: Macros for loops that compile quickly. MASKED64, where MASKED_BYTES is 1: a loop
+// over bytes whose remainder after the last whole vector is masked, where the processor has masks.
+// OPAQUE hides from the compiler how a pointer was computed; otherwise it searches long for terms
+// that addresses have in common.
 #ifdef __CUDA_ARCH__
 #define OPAQUE(POINTER)
 #else
@@ -16,8 +17,8 @@
 #define MASKED_BYTES 0
 #endif
 
-// snippet entries: A matrix in compressed rows: ROWS {...} visits rows i, cells k of the piece,
-// ENTRIES the entries e of row i, too few for vectors.
+// snippet entries: Loops over a matrix in compressed sparse row format. ROWS {...} visits rows i,
+// cells k of the piece. ENTRIES visits the entries e of row i, which are too few for vectors.
 #define ROWS for (long long i = p, k = 0; k < n; ++i, ++k)
 #ifdef __CUDA_ARCH__
 #define ENTRIES for (int e = ptr[i]; e < ptr[i + 1]; ++e)
@@ -25,9 +26,10 @@
 #define ENTRIES PRAGMA(clang loop vectorize(disable)) for (int e = ptr[i]; e < ptr[i + 1]; ++e)
 #endif
 
-// snippet grid_coordinate: A particle's grid coordinate. It is rounded after each operation,
-// unlike the rest, so that every pass finds a particle in the same cell. Taking off the cells
-// before a part of a grid is exact, as they are a whole number below the coordinate.
+// snippet grid_coordinate: Grid coordinate of a particle, x / dx + 1 - before. Each operation is
+// rounded on its own, unlike other arithmetic, so that every pass finds a particle in the same
+// cell. Subtracting `before`, the cells of a larger grid before this part, is exact: it is a whole
+// number below the coordinate.
 auto grid_coordinate = [=](T x, int before = 0) -> T {
 #ifdef __CUDA_ARCH__
     if (sizeof(T) == 4)
@@ -41,8 +43,8 @@ auto grid_coordinate = [=](T x, int before = 0) -> T {
 #endif
 };
 
-// snippet fletcher_reeves: beta = |g|^2 / |g before|^2 of the squares `fresh` and `old` (0: none
-// before), and keep = 1, for x <- x + beta p, p <- beta p - keep g. Where beta > 1 both are 0: p
-// is forgotten ([Book] algorithm 8).
+// snippet fletcher_reeves: beta = |g|^2 / |g_old|^2 from the squares `fresh` and `old` (0: no
+// previous gradient), and keep = 1, for x <- x + beta p, p <- beta p - keep g. If beta > 1 both are
+// 0: p is reset ([Book] algorithm 8).
 const double ratio = old > 0.0 ? fresh / old : 0.0, beta = ratio > 1.0 ? 0.0 : ratio,
              keep = ratio > 1.0 ? 0.0 : 1.0;

@@ -1,13 +1,13 @@
-// A stencil at cell k of the piece, of 7 points or a compact one: e x - sum of w x_neighbor where e
-// != 0, else 0; `affine`: plus b, or as computed before.
-// of cell k after those of `at` elements
+// Stencil at cell k of the piece, of 7 points or compact. `product`: (A x)_k = e x_k - sum of w
+// x_neighbor if the diagonal e != 0, else 0. `affine`: A x + b, or its precomputed value.
+// `diagonal`: e of cell k in the row that begins `at` elements away.
 const auto diagonal = [&](int k, long long at = 0) -> T { return unit * (T)(d + at)[k]; };
-// how far elements of other rows lie from ours
+// offset to another row and plane, relative to this row
 const auto beside = [&](int rows, int planes, auto down, auto up) {
     return (rows < 0 ? ym : rows > 0 ? yp : 0) + (planes < 0 ? down : planes > 0 ? up : 0);
 };
-// x(k, rows beside ours, planes above ours) summed over the neighbors, of what need not be stored;
-// unrounded
+// Sum of w x(k, rows, planes) over the neighbors, at relative rows and planes. x is a function, so
+// that its values need not be stored; the sum is not rounded.
 #ifdef EACH_WEIGHT
 #define BEFORE(W, X, Y, Z) +W(k) * (T)x(k + (X), Y, Z)
 #define AND_AFTER(W, X, Y, Z) \
@@ -31,7 +31,7 @@ const auto around_of = [&](auto x, int k, long long at = 0) {
                cz * (x(k, 0, -1) + x(k, 0, 1));
 };
 #endif
-// of a field with other planes around it
+// the same for a field, with the offsets to the planes below and above
 const auto around = [&](const auto& x, int k, auto down, auto up, long long at = 0) {
     return around_of(
         [&](int i, int rows, int planes) { return (x + beside(rows, planes, down, up))[i]; }, k,

@@ -1,5 +1,6 @@
-// What a piece has found joins that of the thread's piece in the plane below: on CUDA, where it has
-// one in each, in registers until its last. Whole numbers are added as such there: float64 is slow.
+// Add the sums of a piece to those of the thread's piece in the plane below. On CUDA, where a
+// thread has a piece in each plane of a slab, they stay in registers until its last plane. Integers
+// are summed as integers there, since float64 is slow.
 double* sums_ = given.out.data + P.t;
 const auto joined_ = [](int s, auto a, auto b) { return s < SUMS ? a + b : b > a ? b : a; };
 #ifdef __CUDA_ARCH__

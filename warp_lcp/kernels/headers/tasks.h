@@ -1,5 +1,6 @@
-// Tasks, a row's chunk each in a slab of planes, from (i_, j_, c_) on: one a thread on CUDA, as
-// many as a team's thread takes on the CPU. The body that follows ends with three braces.
+// Loop over tasks from (i_, j_, c_) on. A task is a chunk of a row in each plane of a slab. On CUDA
+// a thread has one task; on the CPU it has as many as a thread of the pool takes at once. The body
+// follows and ends with three braces.
 const int per_plane_ = L.rows * L.chunks;
 int i_ = slab_, at_ = row_ * L.chunks + chunk_;
 #ifdef __CUDA_ARCH__

@@ -1,23 +1,23 @@
-// A team of threads works through a table of operations. The caller is thread 0; the others wait in
-// here, and are asleep when idle.
+// Thread pool that works through a table of operations. The caller is thread 0; the other threads
+// wait in this function and sleep when idle.
 //
-// Operations are cut into chunks, which lie in lanes: a thread takes those of its own lane from the
-// front, so that it meets again what its core has at hand, then those of others from the back. An
-// operation begins when all chunks before it are done, so nobody waits for a thread that holds
-// none, as one whose core another process has. Who takes a chunk changes no result. What is taken
-// of a lane is said with the table's number of runs, so that a thread that comes late takes
-// nothing, and nothing is set back.
+// Operations are cut into chunks, which are distributed over lanes. A thread takes the chunks of
+// its own lane from the front, so that it finds their data in its core's cache, then those of other
+// lanes from the back. An operation begins when all chunks before it are done. No thread waits for
+// another that holds no chunk, for example because another process uses its core. The results do
+// not depend on which thread takes a chunk. The counter of a lane includes the table's number of
+// runs, so that a thread that arrives late takes nothing, and counters are not reset.
 #ifndef __CUDA_ARCH__
-// not copied to where it is called: the compiler would take twice as long
+// not inlined: inlining doubles the compile time
 #define APART __attribute__((noinline))
 typedef unsigned long long Word;
 typedef long long Long;
 typedef void (*Call)(void*, void*);
-// what is asked for
+// modes
 enum { RUN, SERVE, CANCEL, QUIT };
-// operations
+// kinds of operations
 enum { ALONE, TASKS, SLABS, COPY };
-// words of a team
+// layout of a pool, in words
 enum {
     POSTED = 0,
     TABLE = 1,
@@ -29,9 +29,9 @@ enum {
     CALLS = 56,
     THREADS = 64
 };
-// functions of the system, from CALLS on
+// system functions, in the words from CALLS on
 enum { YIELD, CLOCK, NAP, LOCK, UNLOCK, WAIT, WAKE, CLOCK_NUMBER };
-// words of a table
+// layout of a table, in words
 enum {
     RUNS = 0,
     DONE = 8,
@@ -42,7 +42,7 @@ enum {
     UNFINISHED = 20,
     AGAIN = 21
 };
-// of an operation
+// layout of an operation
 enum {
     END,
     KIND,
@@ -59,7 +59,7 @@ enum {
     WHEN,
     WORDS
 };
-// of a stage
+// layout of a stage
 enum {
     FUNCTION,
     BOUNDS,
@@ -86,7 +86,7 @@ const auto now = [=] {
     call(CLOCK, (int)T[CALLS + CLOCK_NUMBER], (void*)t);
     return (Long)t[0] * 1000000000 + t[1];
 };
-// a little at first, then let others have the core, then sleep
+// Wait: spin at first, then yield the core, then sleep.
 const auto relax = [=](int spins, int most, int yields) APART {
     if (spins < most) {
 #if defined(__x86_64__)
@@ -107,18 +107,20 @@ const auto wake = [=] {
     call(UNLOCK, (void*)(T + MUTEX));
 };
 
-// arguments of our own, which begin with the range of tasks
+// Copy the arguments of a stage for this thread. They begin with the range of tasks.
 const auto take = [](const Word* made, char* arguments) {
     const Word* from = (const Word*)made[ARGUMENTS];
     Word* to = (Word*)arguments;
     for (Word w = 0; w < (made[BYTES] + 7) / 8; ++w) to[w] = from[w];
-    // what changes from run to run is read where it stands: windows, lists, numbers
+    // Patches: arguments that change from run to run (windows, lists, numbers) are read from their
+    // source.
     const Word* patch = (const Word*)made[PATCHES];
     if (!patch) return;
     for (Word left = *patch++; left > 0; --left, patch += 3)
         __builtin_memcpy(arguments + patch[0], (const void*)patch[1], patch[2]);
 };
-const auto copy = [](const Word* made, Long begin, Long end) {  // bytes of a field, or zeros
+// Copy bytes of a field, or clear them.
+const auto copy = [](const Word* made, Long begin, Long end) {
     const char* from = (const char*)made[FUNCTION];
     char* to = (char*)made[ARGUMENTS];
     if (from)
@@ -131,11 +133,11 @@ const auto run = [](const Word* made, char* arguments, Long begin, Long end) {
     ((int*)arguments)[1] = (int)end;
     ((Call)made[FUNCTION])((void*)made[BOUNDS], arguments);
 };
-// plane i of the finest rows, if its turn has come
+// Run plane i, counted on the finest level, if it is due.
 const auto plane = [=](const Word* made, char* arguments, Long i, Long least, Long most) APART {
     const Long finer = (Long)made[FINER], planes = (Long)made[PLANES];
     Long k = i;
-    if (finer > 1) {  // a coarser level's plane is done once, with its last finer one
+    if (finer > 1) {  // a coarser level's plane runs once, with its last finer plane
         const Long all = (Long)made[FINER_PLANES];
         if (i >= all || ((i + 1) % finer != 0 && i != all - 1)) return;
         k = i / finer;
@@ -147,7 +149,7 @@ const auto plane = [=](const Word* made, char* arguments, Long i, Long least, Lo
 };
 
 const auto start_of = [](const Word* op, Word lane) { return lane * op[CHUNKS] / op[LANES]; };
-// a chunk, if it is wanted; else -1
+// Take a chunk of a lane and return it. -1: none is left, or the next one is not `wanted`.
 const auto take_of = [=](const Word* op, Word lane, Word runs, bool back, Long wanted)
                          APART -> Long {
     Word* word = (Word*)op[TAKEN] + lane * LANE_WORDS;
@@ -171,15 +173,17 @@ const auto take_any = [=](const Word* op, Word runs) -> Long {
     }
     return -1;
 };
-const auto take_next = [=](const Word* op, Word runs, Word chunk) {  // whether the chunk is ours
+// Whether this thread now owns the chunk.
+const auto take_next = [=](const Word* op, Word runs, Word chunk) {
     for (Word l = 0; l < op[LANES]; ++l)
         if (chunk < start_of(op, l + 1)) return take_of(op, l, runs, false, (Long)chunk) >= 0;
     return false;
 };
 
-// A wave streams through memory once: each stage follows some planes behind the one before. Who
-// takes slab after slab goes on; else there is a gap beside the cut, as wide as a stage lags: what
-// it would need is the neighbor's. Who is done last with the two beside it fills it.
+// Fused kernel: stream through memory once, each stage some planes (its lag) behind the one before.
+// A thread that also takes the next slab continues across the cut. Otherwise it leaves a gap beside
+// the cut, as wide as a stage's lag, since the values there need those of the neighboring slab. Of
+// the two threads beside the gap, the one that finishes last fills it.
 const auto stream = [=](const Word* op, Word runs, Long c, const Word** stages,
                         char (*room)[ROOM]) -> Word {
     const int count = (int)op[STAGE_COUNT];
@@ -210,13 +214,13 @@ const auto stream = [=](const Word* op, Word runs, Long c, const Word** stages,
     return (Word)(c + 1 - from);
 };
 
-// on a chunk and those that follow; how many
+// Execute a chunk and those that follow it; return their number.
 const auto work = [=](const Word* op, Word runs, Long c) -> Word {
     // the condition changes between operations only
     if (op[WHEN] && !*(const volatile int*)op[WHEN]) return 1;
-    // Tasks whose number is known when they run: as many pieces as they fill, up to the chunks, as
-    // many for each lane; piece q is of the chunk c with c*pieces/chunks <= q < (c +
-    // 1)*pieces/chunks, so that pieces lie in all lanes.
+    // SIZED: the number of tasks is known at run time. Use as many pieces as they fill, at most
+    // CHUNKS, equally many for each lane. Piece q belongs to chunk c if c*pieces/chunks <= q < (c +
+    // 1)*pieces/chunks, so that all lanes have pieces.
     Long all = (Long)op[ALL], each = (Long)op[EACH], first = c;
     if (op[SIZED]) {
         all = *(const Long*)op[SIZED];
@@ -250,7 +254,7 @@ const auto work = [=](const Word* op, Word runs, Long c) -> Word {
     return 1;
 };
 
-// work through a table; 1: the caller's time is over first
+// Work through a table. Returns 1 if the caller's time is over first.
 const auto help = [=](Word* H, Word runs, Long limit) APART -> int {
     const Word* op = (const Word*)H[OPERATIONS];
     const Word* last = op + WORDS * H[COUNT];
@@ -271,7 +275,7 @@ const auto help = [=](Word* H, Word runs, Long limit) APART -> int {
         }
         if (op == last) return 0;
         if (!me && now() - began > limit) return 1;
-        // what is small is left to the caller
+        // small operations are left to the caller
         const bool theirs = me && (op[KIND] == ALONE || (op[CHUNKS] == 1 && spins < SPINS));
         const Long chunk = theirs ? -1 : take_any(op, runs);
         if (chunk >= 0) {
@@ -288,7 +292,7 @@ if (mode == QUIT) {
     set(T + QUITS, 1);
     wake();
 } else if (mode == CANCEL) {
-    // nobody takes any more, who comes later neither; wait for those who have
+    // Mark all chunks as taken, also for threads that arrive later, and wait for those in progress.
     const Word runs = get(H + RUNS), after = (runs + 1) & 0xffffffff;
     Word left = 0;
     int spins = 0;
@@ -302,8 +306,8 @@ if (mode == QUIT) {
         }
     while (get(H + DONE) + left < H[TOTAL]) relax(++spins, SPINS, YIELDS);
     set(H + RUNS, after);
-} else if (mode == RUN) {  // share & 1: with the team; share & 2: go on with what is unfinished
-    // 0: once; else until the number there is 0
+} else if (mode == RUN) {  // share & 1: with the pool; share & 2: resume an unfinished run
+    // 0: run once; else repeat until the number at this address is 0
     const volatile int* again = (const volatile int*)H[AGAIN];
     const Long until = now() + limit_;
     for (bool resumes = share & 2;; resumes = false) {
@@ -322,19 +326,19 @@ if (mode == QUIT) {
             H[UNFINISHED] = 2;
             break;
         }
-    }  // between two runs
+    }  // 2: stopped between two runs
 } else {
     Word* ours = T + THREADS + 8 * me;
     Word seen = 0;
-    // between tables the interpreter takes a tenth of a millisecond: on a busy machine a thread
-    // that yields then loses its core for several
+    // Between tables the interpreter needs a tenth of a millisecond. On a busy machine a thread
+    // that yields in this time loses its core for longer.
     const int most = (int)T[IDLE_SPINS];
     for (int spins = 0;;) {
         if (get(T + QUITS)) break;
         const Word posted = get(T + POSTED);
         if (posted != seen) {
             const Word table = get(T + TABLE);
-            set(ours, table);  // from here on nobody frees it
+            set(ours, table);  // the table is not freed from here on
             if (table && get(T + POSTED) == posted) {
                 help((Word*)table, get((Word*)table + RUNS), 0);
                 seen = posted;

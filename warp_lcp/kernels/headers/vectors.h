@@ -1,6 +1,6 @@
 // Kernels of vectors.
 
-// kernel vectors.dot: a'b
+// kernel vectors.dot: Dot product a'b
 //   compute    float64
 //   reads      A a; B b
 //   sums       ab
@@ -13,7 +13,7 @@ SIMD for (int k = 0; k < n; ++k) ab += (double)a[k] * (double)b[k];
 //   writes     S x
 SIMD for (int k = 0; k < n; ++k) x[k] += z[k];
 
-// snippet add_up: The sum of every stride-th of n partials from `start` on.
+// snippet add_up: Sum of every `stride`-th of n partial sums, from `start` on.
 const double* v = partials.data + offset;
 double s = 0;
 if (stride == 1) {
@@ -22,7 +22,7 @@ if (stride == 1) {
     for (int i = start; i < n; i += stride) s += v[i];
 return s;
 
-// kernel vectors.add_up: Sums of columns of partial sums
+// kernel vectors.add_up: Sums of the columns of partial sums
 //   compute    float64
 //   whole      float64 partials, scalars
 //   numbers    int count, slot
@@ -35,7 +35,7 @@ for (int k = 0; k < n; ++k) {
     scalars[slot + P.first + k] = s;
 }
 
-// kernel vectors.convert: b = a, in another type
+// kernel vectors.convert: b = a, converted to another type
 //   compute    B
 //   reads      A a
 //   writes     B b

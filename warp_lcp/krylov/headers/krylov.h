@@ -1,6 +1,6 @@
 // Kernels of Krylov methods: conjugate gradients and GMRES.
 
-// kernel krylov.norm: r'r, weighted where there are weights
+// kernel krylov.norm: r'r, or with weights r'W r
 //   compute    S
 //   reads      S r, w?
 //   sums       rr
@@ -20,8 +20,8 @@ if (w) {
 const T beta = scalars[RZ_OLD] > 0 ? (T)(scalars[RZ] / scalars[RZ_OLD]) : (T)0;
 SIMD for (int k = 0; k < n; ++k) direction[k] = z[k] + beta * direction[k];
 
-// kernel conjugate_gradient.update: x += alpha direction, r -= alpha q, and r'r, weighted where
-// there are weights
+// kernel conjugate_gradient.update: x += alpha direction, r -= alpha q, alpha = r'z / direction'q;
+// r'r of the new r, or with weights r'W r
 //   compute    S
 //   reads      S direction, q, w?
 //   writes     S x, r
@@ -43,7 +43,7 @@ if (w)
 else
     update([](int) { return 1.0; });
 
-// kernel gmres.residual: q = w^(1/2) (b - q); without weights they are 1
+// kernel gmres.residual: q = w^(1/2) (b - q); w = 1 without weights
 //   compute    S
 //   reads      S b, w?
 //   writes     S q
@@ -53,7 +53,7 @@ if (w) {
     SIMD for (int k = 0; k < n; ++k) q[k] = b[k] - q[k];
 }
 
-// kernel gmres.weigh: q = w^(1/2) q, or w^(-1/2) q
+// kernel gmres.weigh: q = w^(1/2) q; `inverse`: q = w^(-1/2) q
 //   compute    S
 //   reads      S w
 //   writes     S q
@@ -64,7 +64,7 @@ if (inverse) {
     SIMD for (int k = 0; k < n; ++k) q[k] *= sqrt(w[k]);
 }
 
-// kernel gmres.dots: Products of the first fields of a basis with x, a column of sums each
+// kernel gmres.dots: Products v_j'x of the first fields of a basis with x, a column of sums each
 //   compute    S
 //   reads      S x
 //   whole      S basis
@@ -82,7 +82,7 @@ for (int j = 0; j < count; ++j) {
         *sum = P.more ? *sum + vx : vx;
 }
 
-// kernel gmres.combine: x += sign times the sum of factors_j v_j, and x'x
+// kernel gmres.combine: x += sign times sum_j factors_j v_j; x'x
 //   compute    S
 //   writes     S x
 //   whole      S basis; float64 factors
@@ -97,7 +97,7 @@ for (int j = 0; j < count; ++j) {
 double xx = 0;
 SIMD for (int k = 0; k < n; ++k) xx += (double)x[k] * x[k];
 
-// kernel gmres.store: A field of a basis = x over the root of x'x; 0 where that is 0
+// kernel gmres.store: Store x / sqrt(x'x) as a field of a basis; 0 if x'x = 0
 //   compute    S
 //   reads      S x
 //   whole      S basis; float64 sums

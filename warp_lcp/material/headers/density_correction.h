@@ -1,7 +1,7 @@
-// Kernels of the correction of crowded and sparse cells.
+// Kernels of the density correction of overfull and sparse cells.
 
 // kernel warp_lcp.material.density_correction.prepare_correction: Unknowns, right-hand side and
-// guess; over-full cells, and 1 and the most above what fits, `densest`
+// initial guess. `full`: number of overfull cells; `densest`: 1 + the largest density - capacity
 //   compute    float64
 //   box        int8 kind; float64 b, x; float32 density, capacity; int8 base; uint8 contact?,
 //              inside?
@@ -34,7 +34,7 @@ full = fuller;
 densest = 1.0 + (double)worst;
 
 // kernel warp_lcp.material.density_correction.even: Equations instead of bounds for cells with
-// material all around them; `lacks`: such cells that hold too little
+// material all around them. `lacks`: number of such cells that hold too little
 //   compute    float64
 //   box        int8 kind; float64 b, x; float32 density, capacity; uint8 inside?; float64 lower
 //   numbers    float32 least; int planes
@@ -63,8 +63,8 @@ for (int start = first; start < last; start += M) {
 }
 lacks = lacking;
 
-// kernel warp_lcp.material.density_correction.displace: Displacement d [m] on the lower faces of
-// one axis
+// kernel warp_lcp.material.density_correction.displace: Displacement d [m] of the lower faces along
+// one axis: d = dx (x_(i-1) - x_i) / the mean filled share, at most `most` cells
 //   compute    float64
 //   box        float64 x; int8 kind; float32 open?, d, density, capacity
 //   numbers    int axis; float32 most, dx
@@ -84,8 +84,8 @@ SIMD8 for (int i = first; i < last; ++i) {
     d[i] = passes ? clipped * dx : 0.0f;
 }
 
-// kernel warp_lcp.material.crowding.crowd: What cells hold too much, `above`, all that they hold,
-// and 1 and the most above what fits, `densest`
+// kernel warp_lcp.material.crowding.crowd: `above`: sum of the density above `most` capacity;
+// `all`: sum of the density; `densest`: 1 + the largest density - capacity
 //   compute    float64
 //   box        float32 density, capacity; int8 base
 //   numbers    float32 most

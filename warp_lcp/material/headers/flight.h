@@ -1,8 +1,9 @@
 // Kernels of ballistic fragments.
 
-// snippet trees: Parents have the smaller numbers, so that trees are the same whatever the order
-// of the threads. A lost race is seen in what the atomic minimum returns, and tried again. Rows in
-// native form take a third of the time: they know most roots from the cell before.
+// snippet trees: Union-find. A parent has a smaller number than its children, so that trees do not
+// depend on the order of threads. The value that the atomic minimum returns shows a lost race; the
+// union is then repeated. Rows in native form take a third of the time, since they know most roots
+// from the cell before.
 int* P = parent;
 const long long q = k * s1 + j * s2;
 auto find = [&](int i) {
@@ -24,8 +25,8 @@ auto unite = [&](int i, int j) {
     }
 };
 
-// kernel warp_lcp.material.ballistic_fragments.unite: Cells with a face between them that
-// particles gave weight belong together
+// kernel warp_lcp.material.ballistic_fragments.unite: Unite cells if particles gave weight to the
+// face between them
 //   compute    float32
 //   whole      int32 parent
 //   box        float32 u, v, w?
@@ -33,7 +34,7 @@ auto unite = [&](int i, int j) {
 //   ordered
 #include "trees"
 auto weighs = [](float weight) { return weight > (float)TINY_WEIGHT; };
-// a face with weight is none of the array's edge: the cell below it is there
+// A face with weight is not on the array's edge: the cell below it exists.
 for (int i = first; i < last; ++i) {
     const int c = (int)(q + i), x = weighs(u[i]);
     if (x) {
@@ -44,12 +45,12 @@ for (int i = first; i < last; ++i) {
 #endif
             unite(c, c - 1);
     }
-    // where the cells to the left of both are joined to them, and to each other, there is no need
+    // no union is needed if the cells to the left of both are united with them and with each other
     if (weighs(v[i]) && !(x && weighs(v[i - 1]) && weighs(u[i - s2]))) unite(c, c - s2);
     if (w && weighs(w[i]) && !(x && weighs(w[i - 1]) && weighs(u[i - s1]))) unite(c, c - s1);
 }
 
-// kernel warp_lcp.material.ballistic_fragments.alone: Every cell is a tree of its own
+// kernel warp_lcp.material.ballistic_fragments.alone: Initialize: every cell is a tree of its own
 //   compute    float32
 //   whole      int32 parent; uint8 held, several
 //   box        int8 kind
@@ -60,8 +61,8 @@ for (int i = first; i < last; ++i) {
     several[c] = 0;
 }
 
-// kernel warp_lcp.material.ballistic_fragments.number: Number the trees of several cells that
-// nothing holds; other cells get -1
+// kernel warp_lcp.material.ballistic_fragments.number: Number the trees of several cells that no
+// wall holds; other cells get -1
 //   compute    float32
 //   whole      int32 parent; uint8 held, several; int32 number, count
 //   box        int8 kind
@@ -71,8 +72,8 @@ for (int i = first; i < last; ++i) {
     number[c] = parent[c] == c && !held[c] && several[c] ? wp::atomic_add(count, 1) : -1;
 }
 
-// kernel warp_lcp.material.ballistic_fragments.hold: Tell which trees reach a wall, and which have
-// several cells: those without weight stay alone
+// kernel warp_lcp.material.ballistic_fragments.hold: Mark the trees that reach a wall, and those of
+// several cells; cells without weight stay alone
 //   compute    float32
 //   whole      int32 parent; uint8 held, several
 //   box        int8 kind; uint8 touch

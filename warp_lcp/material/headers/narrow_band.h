@@ -1,9 +1,9 @@
 // Kernel of the narrow band of particles.
 
-// kernel warp_lcp.material.narrow_band.relax_depth: One pass of depth_i = min over the 3^dimension
-// - 1 cells around i of depth_n + |i - n|. In place: a value only falls, and ends at the same
-// minimum whatever order the cells come in. Rows are taken from the last on if there is a
-// `last_row`.
+// kernel warp_lcp.material.narrow_band.relax_depth: One pass of depth_i = min of depth_n + |i - n|
+// over the 3^dimension - 1 cells n around i. In place: values only decrease, to a minimum that does
+// not depend on the order of cells. If there is a `last_row`, rows are processed from the last one
+// on.
 //   compute    float32
 //   whole      int32 changed
 //   box        float32 depth
@@ -22,7 +22,7 @@ for (int start = first; start < last; start += M) {
         best[m] = here[m];
         deep |= (int)(here[m] > (T)0.5);
     }
-    if (!deep) continue;  // nothing but air and its shore
+    if (!deep) continue;  // only air and the cells beside it
     const int low = start > 0 ? 0 : 1, high = start + n < nx ? n : n - 1;
     for (int c = planes == 2 && k > 0 ? -1 : 0; c <= (planes == 2 && k + 1 < nz ? 1 : 0); ++c)
         for (int b = j > 0 ? -1 : 0; b <= (j + 1 < ny ? 1 : 0); ++b) {

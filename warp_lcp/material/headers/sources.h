@@ -1,9 +1,9 @@
-// Kernel of sources: which points of the lattice that moves with a source come into its cells.
+// Kernel of sources: points of a source's moving lattice that enter its cells.
 
-// kernel warp_lcp.material.sources.enter: Follow the points of a source's lattice, which all go the
-// same straight way, through its cells: the cells in which they begin and into which they come
-// last, 0 for none, how often they come in, and where they are at the end. The way is looked at
-// between each two planes of the grid that it crosses
+// kernel warp_lcp.material.sources.enter: Trace the points of a source's lattice, which all move
+// along the same straight line, through its cells. For each point: the cell in which it begins, and
+// the cell that it entered last, 0 if none; how often it entered; where it is at the end. The path
+// is tested between each two planes of the grid that it crosses
 //   compute    float64
 //   whole      int32 slots, owner, filled, slot; vec3 point; float64 span
 //   box        int32 entries
@@ -11,13 +11,13 @@
 //              float64 dx, distance, jitter, grazed, margin, size_x, size_y, size_z
 EXACT_MATH
 typedef unsigned long long Word;
-// times: the way of the lattice since the source's start is span[3*time + axis]
+// times: span[3*time + axis] is the displacement of the lattice since the source's start
 enum { SINCE, UNTIL, NOW };
 const double* lowest = span + 9;
 const long long wide = (long long)span[12], high = (long long)span[13];
 const int stored[3] = {nx, ny, nz}, origin[3] = {before_x, before_y, before_z};
 const double size[3] = {size_x, size_y, size_z};
-auto mixed = [](Word word) {  // the finalizer of SplitMix64
+auto mixed = [](Word word) {  // finalizer of SplitMix64
     word += 0x9E3779B97F4A7C15ull;
     word = (word ^ (word >> 30)) * 0xBF58476D1CE4E5B9ull;
     word = (word ^ (word >> 27)) * 0x94D049BB133111EBull;
@@ -66,7 +66,7 @@ put(zeroth, SINCE, a);
 put(zeroth, UNTIL, b);
 int crossed[3];
 for (int axis = 0; axis < 3; ++axis) {
-    way[axis] = (b[axis] - a[axis]) / dx;  // of all points, up to rounding: as of the first
+    way[axis] = (b[axis] - a[axis]) / dx;  // equal for all points up to rounding: that of the first
     crossed[axis] = (int)::ceil(way[axis] < 0 ? -way[axis] : way[axis]);
 }
 for (int p = first; p < last; ++p) {
@@ -83,7 +83,7 @@ for (int p = first; p < last; ++p) {
         }
         here = there;
     };
-    double from = 0;  // share of the way
+    double from = 0;  // fraction of the path
     while (from < 1) {
         double to = 1;
         int along = -1;

@@ -1,8 +1,8 @@
-// Kernels of velocities beside walls.
+// Kernels of wall conditions for velocities.
 
 // snippet near_walls: Call act(i) on the faces first <= i < last of a row that a wall may change:
-// closed ones that are known, and those of the ring. A pass over marks and fractions finds them,
-// so that rows away from walls cost 5 bytes a face. Pointers are to whole fields.
+// known faces that are closed, and faces of the ghost ring. A pass over marks and fractions finds
+// them, so that rows away from walls cost 5 bytes per face. Pointers are to whole fields.
 const int nx = given.known.shape[2] - 2, ny = given.known.shape[1] - 2,
           nz = given.known.shape[0] - 2;
 const long long row = k * s1 + j * s2;
@@ -34,8 +34,10 @@ auto each = [&](auto act) {
     if (last == nx + 2 && end == nx + 1) act(nx + 1);
 };
 
-// kernel warp_lcp.material.cut_wall.constrain: Write what a component's closed faces become; old
-// values alone are read, so that the order of faces does not matter
+// kernel warp_lcp.material.cut_wall.constrain: Wall condition for a component's closed faces:
+// remove the velocity along the normal n relative to the wall, u - ((v - v_wall) . n) n, if it is
+// into the wall, or if the material stays on the wall. Only old values are read, so that the order
+// of faces does not matter
 //   compute    float32
 //   whole      mat33 turn; vec3 shift; uint8 separating
 //   box        float32 open, result, distance; int8 known; float32 u?, v?, w?; int8 known_u?,
@@ -61,8 +63,8 @@ const unsigned char* contact = given.contact.data;
 const unsigned char* separating = given.separating.data;
 const long long stride[3] = {1, s2, s1};
 const int counts[3] = {nx, ny, nz};
-// does the material beside the wall stay on it: asked of the nearest open cell along the normal,
-// from where the wall is
+// Whether the material beside the wall stays on it. The nearest open cell along the normal decides;
+// the search begins at the wall.
 auto holds = [&](const float* center, const float* n, float depth, int number) {
     int cell[3] = {1, 1, 1};
     long long e = -1;
@@ -77,7 +79,8 @@ auto holds = [&](const float* center, const float* n, float depth, int number) {
     if (kind[e] != FLUID) return false;
     if (!separating[number]) return true;
     if (contact[e] != TOUCHES_NOTHING) return contact[e] != RELEASED;
-    // it touches the wall with an edge or a corner: its neighbors on the side of the wall know
+    // The cell touches the wall with an edge or a corner: its neighbors on the side of the wall
+    // decide.
     bool released = false;
     for (int d = 0; d <= planes; ++d) {
         const long long beside = e - (n[d] > 0 ? stride[d] : -stride[d]);
@@ -88,12 +91,12 @@ auto holds = [&](const float* center, const float* n, float depth, int number) {
 };
 auto constrain = [&](int i) {
     int at[3] = {i, j, k};
-    // behind the domain's wall: no tent reaches it
+    // behind the domain's wall: no interpolation reads it
     if (at[axis] == 0) {
         result[row + i] = field[axis][row + i];
         return;
     }
-    for (int d = 0; d <= planes; ++d) {  // the ring follows what lies beside it
+    for (int d = 0; d <= planes; ++d) {  // faces of the ghost ring follow those beside them
         const int most = counts[d] + (d == axis ? 1 : 0);
         at[d] = at[d] < 1 ? 1 : (at[d] < most ? at[d] : most);
     }
@@ -106,13 +109,13 @@ auto constrain = [&](int i) {
     result[here] = own;
     if (open[e] > 0) return;
     const int number = wall[axis][e] > 0 ? wall[axis][e] : 0;
-    // that wall; of other nodes than its own, to the nearest
+    // Distance to wall `number`; at nodes of other walls it is that to the nearest wall.
     auto distance_to = [&](long long node) {
         return owner && owner[node] != number && next_owner[node] == number ? next[node]
                                                                             : distance[node];
     };
-    // the distance at the face's nodes (b along the first tangential axis, c along the second), and
-    // its gradient at the center
+    // Distance at the face's nodes (b along the first tangential axis, c along the second), and its
+    // gradient at the center of the face.
     const int p = axis == 0 ? 1 : 0, q = axis == 2 ? 1 : 2, nodes = planes == 2 ? 2 : 1;
     const long long back = -stride[axis], ahead = at[axis] <= counts[axis] ? stride[axis] : 0;
     float s = 0, n[3] = {0, 0, 0};
@@ -136,13 +139,13 @@ auto constrain = [&](int i) {
     const float share = 0.5f / (float)nodes,
                 size = share * sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
     s *= share;
-    // within a thin plate the normal means nothing
+    // inside a thin plate there is no useful normal
     if (s < -(float)DEPTH || !(size > 0.1f)) return;
     for (int d = 0; d < 3; ++d) n[d] *= share / size;
     float center[3];
     const int before[3] = {before_x, before_y, before_z};
     for (int d = 0; d < 3; ++d) center[d] = (float)at[d] + (d == axis ? 0.0f : 0.5f);
-    // its velocity at the center; on the domain's faces that of a solid that covers them
+    // Velocity of the wall at the center; on the domain's faces that of a solid that covers them.
     auto of_wall = [&](int d) {
         if (!moving[0]) return 0.0f;
         if (number == 0) return d == axis ? moving[axis][e] : 0.0f;
@@ -170,17 +173,16 @@ auto constrain = [&](int i) {
 };
 each(constrain);
 
-// kernel warp_lcp.material.cut_wall.take: Take the results of `constrain`
+// kernel warp_lcp.material.cut_wall.take: Copy the results of `constrain`
 //   compute    float32
 //   box        float32 open, result, field; int8 known
 //   numbers    int axis, planes
 #include "near_walls"
 each([&](int i) { field[i] = result[i]; });
 
-// kernel warp_lcp.material.wall.keep_spray: Open faces that are still unknown but carry weight
-// become known, and so do the extrapolated ones. Without fractions a face is open between cells
-// that are not SOLID; one with weight is no face of the array's edge: its particles lie in the
-// domain.
+// kernel warp_lcp.material.wall.keep_spray: Mark open faces as known that are unknown but carry
+// weight, and extrapolated ones. Without fractions a face is open between cells that are not SOLID.
+// A face with weight is not on the array's edge, since its particles lie in the domain.
 //   compute    float32
 //   box        float32 weight, open?; int8 known, kind
 //   numbers    int axis

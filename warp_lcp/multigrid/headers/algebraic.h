@@ -1,7 +1,7 @@
 // Kernels of algebraic multigrid.
 
-// kernel algebraic.fill: A row of P A P + P D P into a pattern with a whole diagonal, and what
-// follows from it
+// kernel algebraic.fill: A row of P A P + P D P in a pattern with a full diagonal, and the values
+// derived from it
 //   compute    S
 //   reads      A d; float64 shift?
 //   writes     S inverse, scale, weight
@@ -28,7 +28,7 @@ ROWS {
     weight[k] = mid > 0 ? (T)(1.0 / mid) : (mid < 0 ? (T)(-1.0 / mid) : (T)(own ? 1 : 0));
 }
 
-// kernel algebraic.scale_rows: the rows of a matrix, each times its scale
+// kernel algebraic.scale_rows: Rows of a matrix, each times its scale
 //   compute    S
 //   reads      S scale
 //   whole      int32 ptr; S a, scaled
@@ -39,8 +39,8 @@ ROWS {
     ENTRIES scaled[e] = f * a[e];
 }
 
-// kernel algebraic.multiply: A row of A B into a known pattern: `place` says where in it each
-// product of an entry of A and one of B is added
+// kernel algebraic.multiply: A row of A B in a known pattern: `place` is the place of each product
+// of an entry of A and one of B
 //   compute    S
 //   reads      int64 begins
 //   whole      int32 ptr, col; S a; int32 right; S b; int32 starts; uint16 place; S result
@@ -60,7 +60,8 @@ ROWS {
     }
 }
 
-// kernel algebraic.inverse: one over the sum of the magnitudes of each row; 0 for rows of zeros
+// kernel algebraic.inverse: Reciprocal of the sum of the magnitudes of each row (l1 norm); 0 for
+// rows of zeros
 //   compute    S
 //   writes     S inverse
 //   whole      int32 ptr; S a
@@ -72,8 +73,8 @@ ROWS {
     inverse[k] = s > 0 ? (T)1 / s : (T)0;
 }
 
-// kernel algebraic.smooth: y = x + omega (b - A x) over the rows' l1 norms, x taken for 0 if
-// from_zero
+// kernel algebraic.smooth: Jacobi sweep with l1 norms: y = x + omega (b - A x) / (norm of the row),
+// from x = 0 if from_zero
 //   compute    S
 //   reads      S inverse, b
 //   writes     S y
@@ -91,7 +92,7 @@ if (from_zero) {
     }
 }
 
-// kernel algebraic.remainder: y = b - A x
+// kernel algebraic.remainder: Residual y = b - A x
 //   compute    S
 //   reads      S b
 //   writes     S y

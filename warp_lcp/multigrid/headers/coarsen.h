@@ -1,9 +1,9 @@
-// Kernels that build coarser levels: Galerkin products over aggregates, and the matrix of the
-// coarsest one.
+// Kernels that build coarse levels: Galerkin products over aggregates, and the matrix of the
+// coarsest level.
 
 // kernel coarsen.aggregates: Diagonals and weights of aggregates from the rows of the finer level,
-// if one of those or one beside them has changed: their faces depend on both their cells. A row is
-// the same to the last bit whichever kernel makes it. Equal weights: faces are counted in bytes,
+// if one of these rows or one beside them has changed, since a face depends on both its cells. All
+// kernels compute a row with the same bits. With equal weights the faces are counted in bytes and
 // scaled at the end.
 //   compute    S
 //   stencil    F, S
@@ -41,7 +41,7 @@ if (make) {
     };
     typedef decltype(counted(*d)) B;
     constexpr bool COUNTS = sizeof(B) == 1;
-    // of a diagonal: an excess below it is what rounding left
+    // of the diagonal: a smaller excess is rounding error
     constexpr T least = sizeof(T) == 4 ? (T)1e-6 : (T)1e-14;
     struct No {
         enum { value = 0 };
@@ -49,13 +49,14 @@ if (make) {
     struct Yes {
         enum { value = 1 };
     };
-    // offsets to the rows around: a ghost beyond the first or the last one, unless they wrap around
+    // Offsets to the rows around: a ghost row beyond the first or the last one, unless they wrap
+    // around.
     const long long below_x = periodic_x ? cells - 1 : -1, above_x = periodic_x ? 1 - cells : 1;
     const long long below_y = begins_y && periodic_y ? (L.n2 - 1) * yp : -yp,
                     above_y = ends_y && periodic_y ? (1 - L.n2) * yp : yp;
     const long long below_z = begins_z && periodic_z ? (L.n1 - 1) * zp : -zp,
                     above_z = ends_z && periodic_z ? (1 - L.n1) * zp : zp;
-    // a periodic axis of two cells has one aggregate, and no outer faces
+    // a periodic axis of two cells has one aggregate and no outer faces
     const bool whole_x = fx == 2 && below_x == 1, whole_y = wide == 2 && below_y == yp,
                whole_z = deep == 2 && below_z == zp;
     const T scale = COUNTS ? unit : (T)1, se = scale * (all ? held : stiffen),
@@ -70,7 +71,7 @@ if (make) {
                              : scale * stiffen;
     B excess[2 * M], bx[2 * M], ax[2 * M], by[2 * M], ay[2 * M], bz[2 * M], az[2 * M], none[2 * M];
     const auto one = [](B v) { return (unsigned char)(v < (B)1 ? v : (B)1); };
-    // the weight of a face between two cells of these diagonals
+    // weight of the face between two cells with these diagonals
     const auto face = [&](auto here, auto there, T c, const auto* w, int i) -> B {
         if constexpr (COUNTS)
             return (B)(one(here) & one(there) & (unsigned char)(c > 0));
@@ -88,16 +89,17 @@ if (make) {
         const int m = n - begin < M ? n - begin : (int)M, last = cells - 1 - fx * (P.first + begin);
         const long long p = fx * begin;
         // Cell i of row y in one plane or both: what it adds to the aggregate's excess and to the
-        // outer faces below and above it. Rows go one after another, for memory is fetched ahead
-        // best along them; planes together, which halves the passes. One loop serves both rows:
-        // this kernel takes longest to compile.
+        // outer faces below and above it. Rows are processed one after another, since prefetching
+        // works best along them; planes together, which halves the passes. One loop serves both
+        // rows, since this kernel takes longest to compile.
         const auto row = [&](auto both, int y, int begin, int end, long long left,
                              long long right) {
             enum { BOTH = decltype(both)::value };
             const long long at = p + y * yp, low_y = y ? -yp : below_y;
             const long long high_y = y || wide == 1 ? above_y : yp;
             B* first_by = y ? none : by;
-            struct Plane {  // a row of it: diagonals of cells and their neighbors, weights between
+            // One row of a plane: diagonals of cells and their neighbors, weights between them.
+            struct Plane {
                 const decltype(d + 0) e, e_left, e_right, e_below, e_above, e_down, e_up;
                 decltype(wx + 0) left, right, below, above, down, up;
             };
@@ -153,7 +155,7 @@ if (make) {
             SIMD64 for (int i = begin; i < bytes; ++i) cell(i);
             SIMD for (int i = bytes; i < end; ++i) cell(i);
         };
-        // all; again those whose neighbor is at the other end of the row
+        // all cells; then those again whose neighbor is at the other end of the row
         for (int part = 0; part < 3; ++part) {
             const int from = part == 2 ? last : 0, to = part == 0 ? fx * m : from + 1;
             if (part == 1 && (P.first + begin > 0 || below_x == -1)) continue;
@@ -187,7 +189,7 @@ if (make) {
                     sx * (T)ax[b] + sy * (T)(B)(ay[a] + ay[b]) + sz * (T)(B)(az[a] + az[b]);
                 dc[k] = se * (T)(B)(excess[a] + excess[b]) + x + y + z + above;
             }
-            // the last cell of an odd row is an aggregate
+            // the last cell of an odd row is an aggregate of its own
             if (last < 2 * m && last % 2 == 0) dc[last / 2] += sx * (T)ax[last];
         } else {
             SIMD for (int k = 0; k < m; ++k) {
@@ -202,8 +204,8 @@ if (make) {
     }
 }
 
-// kernel coarsen.compact: As coarsen.aggregates, of a compact stencil: an aggregate's weights by
-// offset, sums over what its cells share with those of others
+// kernel coarsen.compact: As coarsen.aggregates, for a compact stencil: an aggregate's weight to
+// another one, by offset, is the sum of the weights between their cells
 //   compute    S
 //   stencil    F, W
 //   writes     S coarse_d
@@ -228,7 +230,7 @@ const bool make = due();
 coarse_changed[P.row] = make;
 if (make) {
     EXACT_MATH
-    // of a diagonal: an excess below it is what rounding left
+    // of the diagonal: a smaller excess is rounding error
     constexpr T least = sizeof(T) == 4 ? (T)1e-6 : (T)1e-14;
     const bool all = fx * L.fy * L.fz == 8 || (L.n1 == 1 && fx * L.fy >= 4);
     const int counts[3] = {cells, L.n2, L.n1}, factors[3] = {fx, L.fy, L.fz};
@@ -244,7 +246,8 @@ if (make) {
                     const T e = diagonal((int)i);
                     T rest = e;
                     if (e == 0) continue;
-                    // along which axes a neighbor is in another aggregate, and whether it is free
+                    // axes along which a neighbor is in another aggregate, and whether the neighbor
+                    // is free
                     const auto visit_turning = [&](int X, int Y, int Z, T w) {
                         const int at[3] = {first[0] + x + X, first[1] + y + Y, first[2] + z + Z};
                         const int steps[3] = {X, Y, Z};
@@ -258,7 +261,7 @@ if (make) {
                             if (beyond) q -= beyond * counts[a] * strides[a];
                             const int there = at[a] / factors[a], here = first[a] / factors[a],
                                       o = beyond ? beyond : there - here;
-                            // else one aggregate, beside itself
+                            // otherwise there is one aggregate, which is its own neighbor
                             if (!(beyond && counts[a] <= factors[a]))
                                 place += o * (a == 0 ? 1 : a == 1 ? 3 : 9);
                         }
@@ -305,7 +308,7 @@ if (make) {
     }
 }
 
-// kernel coarsen.hold: out = d where `free`, else 0; the row is marked if that changes it
+// kernel coarsen.hold: out = d where `free`, else 0; mark the row if that changes it
 //   compute    B
 //   reads      A d; uint8 free
 //   writes     B out_d
@@ -322,7 +325,7 @@ SIMD64 for (int k = 0; k < bytes; ++k) moved |= hold(k);
 SIMD for (int k = bytes; k < n; ++k) moved |= hold(k);
 if (moved) changed[P.row] = 1;
 
-// kernel coarsen.assemble: Rows of a small level's matrix, of a compact stencil; cells that are no
+// kernel coarsen.assemble: Rows of a small level's matrix from a compact stencil; cells that are no
 // unknowns have a row of zeros
 //   compute    float64
 //   stencil    F, W
@@ -372,9 +375,9 @@ for (int k = 0; k < n; ++k) {
     visit_all(0);
 }
 
-// kernel coarsen.eliminate: The inverse, transposed, of a small level's matrix by Gauss-Jordan
-// elimination; where there is no unknown, or a pivot is what rounding left of its diagonal, the
-// inverse has a row of zeros.
+// kernel coarsen.eliminate: Inverse, transposed, of a small level's matrix by Gauss-Jordan
+// elimination. The inverse has a row of zeros where there is no unknown, or where a pivot is
+// rounding error compared with its diagonal.
 //   compute    float64
 //   whole      float64 matrix, inverse, own
 //   numbers    int m; float64 least
@@ -402,8 +405,8 @@ for (int c = 0; c < m; ++c) {
         }
 }
 
-// kernel coarsen.invert: Columns of the inverse from the factors L D L' (L has ones on its
-// diagonal, where it stores the pivots), if a row of cells has changed
+// kernel coarsen.invert: Columns of the inverse from the factors L D L', if a row of cells has
+// changed. The diagonal of L is 1; the pivots are stored in its place
 //   compute    float64
 //   whole      uint8 changed; float64 matrix, inverse
 //   numbers    int m, flags
@@ -436,8 +439,8 @@ if (due()) {
     }
 }
 
-// kernel coarsen.solve: x = inverse b of the cells nx, ny, nz of a small grid, by its dense
-// symmetric inverse; each thread reads columns beside its neighbor's
+// kernel coarsen.solve: x = inverse b for the cells nx, ny, nz of a small grid, by its dense
+// symmetric inverse; adjacent threads read adjacent columns
 //   compute    float64
 //   whole      float64 inverse; S b, x
 //   numbers    int nx, ny, nz
@@ -461,7 +464,8 @@ for (int begin = 0; begin < n; begin += R) {
     }
 }
 
-// kernel renew.clear: Clear what lies in a row's old span and not in its new one, and mark the row
+// kernel renew.clear: Clear the part of a row's old span that is not in its new one, and mark the
+// row
 //   compute    S
 //   writes     S x, b, t; F diagonals; S lower_x?, lower_y?, lower_z?
 //   by_row     vec2i spans, known; uint8 changed
@@ -473,7 +477,7 @@ if (old[0] != now[0] || old[1] != now[1]) {
 #ifdef __CUDA_ARCH__
             for (int k = from; k < to; ++k) field[k] = 0;
 #else
-            // no loop to vectorize, seven times over
+            // memset, since a loop would be vectorized and compiled seven times
             if (from < to) __builtin_memset(field + from, 0, (to - from) * sizeof(*field));
 #endif
         };
@@ -493,13 +497,13 @@ if (old[0] != now[0] || old[1] != now[1]) {
     changed[P.row] = 1;
 }
 
-// kernel renew.sign: Mark the row if 64 bits that its weights hash to are others than they were
+// kernel renew.sign: Mark the row if the 64-bit hash of its weights has changed
 //   compute    S
 //   reads      S weight_x, weight_y, weight_z
 //   by_row     uint64 signs; uint8 changed
 unsigned one = 0, two = 0;
 const auto add = [&](const auto* w, unsigned seed) {
-    // the last cell's upper face as well
+    // including the last cell's upper face
     const unsigned* bits = (const unsigned*)w;
     const int words = (n + 1) * (int)(sizeof(*w) / 4);
     SIMD for (int k = 0; k < words; ++k) {

@@ -1,12 +1,13 @@
 // Kernels of multigrid cycles on grids.
 
-// snippet relax: x + weight (b - A x) / diagonal at cell k, of what x is there, and what it is
-// around.
+// snippet relax: x + weight (b - A x) / diagonal at cell k, from x there and the weighted sum of x
+// around it.
 const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T {
     return x + weight * (quotient(b[k] + sum_around, e) - x);
 };
 
-// snippet sweep: y = a value clipped to the bounds if projected, 0 where there is no unknown
+// snippet sweep: y = the relaxed value, clipped to the bounds if projected; 0 where there is no
+// unknown.
 #include "relax"
 const auto from_b = [&](int k, T e) -> T { return quotient(omega * b[k], e); };
 const auto from_x = [&](int k, T e) -> T {
@@ -27,8 +28,8 @@ const auto clips = [&](auto value) {
         sweep(value, [&](int k, T v) { return v < lower[k] ? lower[k] : v; });
 };
 
-// kernel cycle.sweep: y = x + omega (b - A x) / diagonal, clipped to the bounds if projected;
-// from_zero: as if x were 0
+// kernel cycle.sweep: Jacobi sweep: y = x + omega (b - A x) / diagonal, clipped to the bounds if
+// projected; from_zero: with x = 0
 //   compute    S
 //   stencil    F, S
 //   reads      S x, b, lower?, upper?
@@ -40,9 +41,9 @@ if (from_zero)
 else
     clips(from_x);
 
-// snippet sweep_again: y = a sweep of `value(k, at)` at cell k of a row `at` elements from ours,
-// which is made again for each neighbor; `choose_clip` hands over how values are clipped to the
-// bounds
+// snippet sweep_again: y = a sweep of `value(k, at)`, the value at cell k of a row `at` elements
+// from this one. Values are computed again for each neighbor instead of stored. `choose_clip`
+// passes a function that clips values to the bounds.
 const auto diagonal_of = [&](int k, int at) -> T { return unit * (T)(d + at)[k]; };
 const auto sweep_again = [&](auto value, auto clip) {
     SIMD for (int k = 0; k < n; ++k) {
@@ -66,7 +67,7 @@ const auto choose_clip = [&](auto sweeps) {
         });
 };
 
-// kernel cycle.out_of_ring: As cycle.sweep, out of a ring of planes, never from zero
+// kernel cycle.out_of_ring: As cycle.sweep, from a ring buffer of planes, never from zero
 //   compute    S
 //   stencil    F, S
 //   reads      S x, b, lower?, upper?
@@ -77,8 +78,8 @@ const auto choose_clip = [&](auto sweeps) {
 #include "sweep"
 clips(from_x);
 
-// kernel cycle.into_ring: As cycle.sweep, into a ring of planes: what the plane that was here
-// before had may be wider, where rows beside this one look
+// kernel cycle.into_ring: As cycle.sweep, into a ring buffer of planes. The buffer's previous plane
+// may be wider: clear what rows beside this one read of it
 //   compute    S
 //   stencil    F, S
 //   reads      S x, b, lower?, upper?
@@ -104,8 +105,8 @@ if (L.spans.data) {
 }
 #include "cycle.sweep"
 
-// kernel cycle.restrict: The sums of b - A x over the cells of aggregates: pairs along x or single
-// ones, of `deep` planes and `wide` rows
+// kernel cycle.restrict: Restriction: sums of b - A x over the cells of aggregates, which are pairs
+// along x or single cells, in `deep` planes and `wide` rows
 //   compute    S
 //   stencil    F, S
 //   writes     S coarse
@@ -134,8 +135,8 @@ with_pairs(pairs, [&](auto fx) {
     }
 });
 
-// kernel cycle.correct: x += scale times the correction of its aggregate, clipped to the bounds if
-// projected
+// kernel cycle.correct: Prolongation: x += scale times the correction of its aggregate, clipped to
+// the bounds if projected
 //   compute    S
 //   stencil    F, S
 //   reads      S lower?, upper?
@@ -144,8 +145,8 @@ with_pairs(pairs, [&](auto fx) {
 //   numbers    S scale; bool projected
 //   module     multigrid
 if (projected) {
-    T e[2 *
-        M];  // the correction of each cell, so that what follows reads all fields in steps of one
+    // Correction of each cell, so that the next loop reads all fields with stride one.
+    T e[2 * M];
     for (int begin = 0; begin < n; begin += 2 * M) {
         const int m = n - begin < 2 * M ? n - begin : (int)(2 * M);
         const auto* c = coarse + (pairs ? begin / 2 : begin);
@@ -180,9 +181,9 @@ if (projected) {
     if (n % 2) x[n - 1] += d[n - 1] != 0 ? scale * coarse[n / 2] : (T)0;
 }
 
-// kernel cycle.two_sweeps: y = what two sweeps make of 0, of the weights `first` and `omega`, each
-// clipped to the bounds if projected. A sweep from 0 needs no neighbors, so that it is made again
-// for each of them; on CUDA, where a launch costs more.
+// kernel cycle.two_sweeps: y = two sweeps from 0 with the weights `first` and `omega`, each clipped
+// to the bounds if projected. A sweep from 0 needs no neighbors, so that it is computed again for
+// each of them. For CUDA, where a launch costs more.
 //   compute    S
 //   stencil    F, S
 //   reads      S b, lower?, upper?
@@ -190,7 +191,7 @@ if (projected) {
 //   numbers    S first, omega; bool projected
 #include "sweep_again"
 const auto sweeps = [&](auto clip) {
-    // the first sweep at a cell of a row `at` elements from ours
+    // first sweep at a cell of a row `at` elements from this one
     sweep_again(
         [&](int k, int at) -> T {
             const T e = diagonal_of(k, at), v = quotient(first * (b + at)[k], e != 0 ? e : (T)1);
@@ -201,7 +202,8 @@ const auto sweeps = [&](auto clip) {
 choose_clip(sweeps);
 
 // kernel cycle.correct_and_sweep: y = a sweep of x + scale times the correction of its aggregate,
-// both clipped to the bounds if projected: the correction is made again for each neighbor, on CUDA
+// both clipped to the bounds if projected. For CUDA: the correction is computed again for each
+// neighbor
 //   compute    S
 //   stencil    F, S
 //   reads      S x, b, lower?, upper?
@@ -209,7 +211,8 @@ choose_clip(sweeps);
 //   other      S coarse
 //   numbers    S scale, omega; bool projected
 #include "sweep_again"
-// how far the aggregates of the rows or planes beside ours lie from our own, of `stride` elements
+// Offset from this row's or plane's aggregates to those of one beside it; they are `stride`
+// elements apart.
 const auto aside = [](int at, int by, int factor, long long stride) -> int {
     return (int)stride * (factor < -1 ? ((at + by) >> 1) - (at >> 1) : by);
 };
@@ -236,7 +239,7 @@ with_pairs(pairs, [&](auto fx) {
     choose_clip(sweeps);
 });
 
-// kernel cycle.bounds: Bounds of a coarse correction: the tightest of its cells' gaps, divided by
+// kernel cycle.bounds: Bounds of a coarse correction: the smallest gaps of its cells, divided by
 // the over-correction; 0 is always allowed
 //   compute    S
 //   stencil    F, S

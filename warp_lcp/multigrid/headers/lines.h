@@ -1,7 +1,7 @@
-// Kernels of black-box multigrid in 2-D: transfers that follow the operator, relaxation of lines.
+// Kernels of black-box multigrid in 2-D (Dendy): operator-dependent transfers, line relaxation.
 
-// kernel lines.fill: Weights and diagonal of a level that is stored whole: those of free
-// neighbors, of free cells; the diagonal has the shift
+// kernel lines.fill: Weights and diagonal of a level that is stored whole: weights from free cells
+// to free neighbors; the diagonal includes the shift
 //   compute    S
 //   stencil    D, W
 //   reads      uint8 free; float64 shift?
@@ -32,8 +32,8 @@ for (int k = 0; k < n; ++k) {
     if (weight) weight[k] = e != 0 ? 1 / e : (T)0;
 }
 
-// snippet transfer: Weights of a compact level whose transfers are made: v(x, y, k) is that from
-// cell k to a neighbor; for restriction that from the neighbor to the cell, for prolongation the
+// snippet transfer: Weights of a compact level for transfers: v(x, y, k) is the weight from cell k
+// to a neighbor (SAME); for restriction that from the neighbor to the cell; for prolongation the
 // mean of both.
 const auto of_row = [&](int x, int y, long long k) -> T {
     const int o = 3 * y + x + 4;
@@ -48,9 +48,10 @@ const auto v = [&](int x, int y, long long k) -> T {
     }
 };
 
-// kernel lines.edges: How cells share in coarse ones, which are every second cell: as themselves;
-// or, between two along an axis, by the weights towards them, summed across, over these and what
-// holds the row (Dendy's black-box multigrid).
+// kernel lines.edges: Shares of cells in coarse cells, which are every second cell. A coarse cell
+// has the share 1 in itself. A cell between two coarse ones along an axis has the weights towards
+// them, summed across the axis, divided by the sum of these weights and what holds the row (Dendy's
+// black-box multigrid).
 //   compute    S
 //   reads      S d
 //   whole      S weights, shares
@@ -89,15 +90,16 @@ for (int k = 0; k < n; ++k) {
             b = 0;
         }
     }
-    // one alone: two coarse cells that share in one would be the same
+    // Without positive weights one coarse cell alone gets a share: two that share in the same cell
+    // only would be equal.
     shares[at] = odd_x || odd_y ? a : e != 0 ? (T)1 : (T)0;
     shares[size + at] = odd_x && !odd_y ? b : (T)0;
     shares[2 * size + at] = odd_y && !odd_x ? b : (T)0;
     shares[3 * size + at] = 0;
 }
 
-// kernel lines.corners: Cells amid four coarse ones: what the cell's row gives of its neighbors'
-// shares
+// kernel lines.corners: Shares of cells between four coarse ones: the cell's row applied to its
+// neighbors' shares
 //   compute    S
 //   reads      S d
 //   whole      S weights, shares
@@ -123,8 +125,8 @@ if (fx == 2 && fy == 2 && P.j % 2)
             inverse * (v(1, 1, at) + north * share(1, 0, 1) + east * share(2, 1, 0));
     }
 
-// kernel lines.galerkin: A row of R A P, R and P by the shares of fine cells in the four coarse
-// ones around; of compact stencils it is one
+// kernel lines.galerkin: A row of R A P. R and P are the shares of fine cells in the four coarse
+// ones around them. The product of compact stencils is compact
 //   compute    S
 //   writes     S coarse_d
 //   other      S unused
@@ -173,14 +175,14 @@ for (int k = 0; k < n; ++k) {
         if (o != 4) coarse_weights[(o < 4 ? o : o - 1) * coarse_size + p + k] = kept ? -C[o] : (T)0;
 }
 
-// kernel lines.factor: Elimination along lines of cells, `step` apart: one over the pivots, and
-// the multiples by which they are coupled to the next cell
+// kernel lines.factor: Factor the tridiagonal matrices of lines of cells, `step` apart: reciprocals
+// of the pivots, and multiples that couple cells to the next ones
 //   compute    S
 //   reads      S unused
 //   whole      S weights, diagonals, pivots, multiples
 //   numbers    int64 size, step; int count
 //   by_cell
-// lines that go side by side
+// lines that are processed side by side
 const int before = step == 1 ? 3 : 1, after = step == 1 ? 4 : 6, side = step == 1 ? 1 : n;
 const T *e = diagonals + p, *w = weights + before * size + p, *v = weights + after * size + p;
 T *f = pivots + p, *q = multiples + p;
@@ -192,7 +194,8 @@ for (int i = 0; i < count; ++i, e += step, w += step, v += step, f += step, q +=
         q[k] = e[k] != 0 ? v[k] * inverse : (T)0;
     }
 
-// kernel lines.zebra_x: Solve for all cells of a row at once, if it has the color
+// kernel lines.zebra_x: Line relaxation along x: solve for all cells of a row at once, if it has
+// the color
 //   compute    S
 //   stencil    S, S
 //   reads      S b, pivots, multiples
@@ -219,8 +222,8 @@ if (P.j % 2 == color) {
     SIMD for (int k = 0; k < n; ++k) x[k] += t[k];
 }
 
-// kernel lines.zebra_y: Solve for all cells of each column of the color at once; beside it are
-// columns of the other one, which move by 0
+// kernel lines.zebra_y: Line relaxation along y: solve for all cells of each column of the color at
+// once; the columns beside it have the other color and do not move
 //   compute    S
 //   stencil    S, S
 //   reads      S b, pivots, multiples
@@ -251,7 +254,7 @@ for (long long at = 0; at < end; at += step) {
     SIMD for (int k = 0; k < n; ++k) u[k] += s[k];
 }
 
-// kernel lines.residual: t = b - A x
+// kernel lines.residual: Residual t = b - A x
 //   compute    S
 //   stencil    S, S
 //   reads      S x, b
@@ -261,7 +264,7 @@ SIMD for (int k = 0; k < n; ++k) {
     t[k] = e != 0 ? v : (T)0;
 }
 
-// kernel lines.down: Sums of a fine field over coarse cells' shares
+// kernel lines.down: Restriction: sums of a fine field over the shares of coarse cells
 //   compute    S
 //   writes     S coarse
 //   other      S t, shares
@@ -287,7 +290,7 @@ for (int k = 0; k < n; ++k) {
     coarse[k] = v;
 }
 
-// kernel lines.up: x += the coarse field by the cells' shares, or x = that
+// kernel lines.up: Prolongation: x += the coarse field weighted by the cells' shares, or x = that
 //   compute    S
 //   reads      S d
 //   writes     S x

@@ -1,6 +1,6 @@
 // Kernels of connected components: union-find over the faces between FLUID cells.
 
-// snippet joined: Where faces join cells, and the roots of their trees
+// snippet joined: Which faces join cells, and the roots of their trees.
 const auto* c = cells;
 int* P_ = parent;
 const long long s1 = zp, s2 = yp;
@@ -13,7 +13,7 @@ const auto find = [&](int i) {
 };
 const bool uniform = !fx && !fy && !fz;
 
-// kernel components.singletons: every cell is a tree of its own, and hangs on nothing
+// kernel components.singletons: Initialize: every cell is a tree of its own that nothing holds
 //   compute    float32
 //   writes     int32 parent; uint8 grounded
 //   module     grid
@@ -23,9 +23,9 @@ for (int k = 0; k < n; ++k) {
     grounded[k] = 0;
 }
 
-// kernel components.unite: Join cells to their lower neighbors. Parents have smaller numbers, so
-// that trees do not depend on the order of threads; a lost race is seen in what the atomic minimum
-// returns, and tried again
+// kernel components.unite: Unite cells with their lower neighbors. A parent has a smaller number
+// than its children, so that trees do not depend on the order of threads. The value that the atomic
+// minimum returns shows a lost race; the union is then repeated
 //   compute    float32
 //   reads      int8 cells; F fx?, fy?, fz?
 //   whole      int32 parent
@@ -33,7 +33,7 @@ for (int k = 0; k < n; ++k) {
 //   ordered
 //   module     components
 #include "joined"
-// from there a periodic axis leads to the last cell, from other rows to the one below
+// From the first row a periodic axis leads to the last one, from other rows to the one below.
 const bool first = P.first == 0;
 const long long wrap_x = L.nx - 1, wrap_y = P.j == 0 ? (L.rows - 1) * L.s2 : -L.s2,
                 wrap_z = P.k == 0 ? (L.planes - 1) * L.s1 : -L.s1;
@@ -51,9 +51,9 @@ const auto unite = [&](int i, int j) {
         b = find(b);
     }
 };
-// what to join is found in bytes, many cells at a time: 1 the cell to the left, 2 the one below
-// along y, 4 along z; the cell to the left has been joined to its own lower neighbors, and those
-// joined to ours need no more
+// Unions are found in bytes, many cells at a time: 1 the cell to the left, 2 the one below along y,
+// 4 along z. The cell to the left has been united with its own lower neighbors. If those are united
+// with the lower neighbors of this cell, no further union is needed.
 const unsigned char ax = nx > 0, ay = ny > 0, az = nz > 0;
 unsigned char join[M];
 for (int begin = 0; begin < n; begin += M) {
@@ -79,7 +79,7 @@ for (int begin = 0; begin < n; begin += M) {
                 in ? (unsigned char)(left | y_here << 1 | z_here << 2) : (unsigned char)0;
         }
     }
-    // the neighbor to the left of a first cell is the last one: no chain to rely on
+    // the neighbor to the left of a first cell is the last one, which has not been united yet
     if (first && begin == 0 && join[0] & 1) {
         const int k = 0;
         join[0] = 1 | (c[k - s2] == 1 && y(k)) << 1 | (c[k - s1] == 1 && z(k)) << 2;
@@ -104,7 +104,7 @@ for (int begin = 0; begin < n; begin += M) {
     }
 }
 
-// kernel components.ground: Mark the roots of what AIR or a shift holds
+// kernel components.ground: Mark the roots of trees that AIR or a shift holds
 //   compute    float32
 //   reads      int8 cells; F fx?, fy?, fz?, shift?
 //   whole      int32 parent; uint8 grounded
@@ -140,7 +140,7 @@ for (int k = 0; k < n; ++k) {
     if (hit) grounded[find((int)(p + k))] = 1;
 }
 
-// kernel components.count: How many roots nothing holds
+// kernel components.count: Number of trees that nothing holds
 //   compute    float32
 //   reads      int8 cells; int32 parent; uint8 grounded
 //   whole      int32 count

@@ -1,6 +1,6 @@
 // Kernels of dense matrices, and of matrices of low rank.
 
-// kernel dense.product: y = A x or A' x, in the order of the columns
+// kernel dense.product: y = A x or A' x, summed in the order of the columns
 //   compute    S
 //   writes     S y
 //   whole      A a; S x
@@ -14,8 +14,8 @@ for (int k = 0; k < n; ++k) {
     y[k] = s;
 }
 
-// kernel dense.relax: x = clip(x - omega (A x + b) / d, lower, upper), row after row forward or
-// backwards, so that each sees those before it
+// kernel dense.relax: Projected SOR: x = clip(x - omega (A x + b) / d, lower, upper), row after row
+// forward or backward; each row uses the values before it
 //   compute    S
 //   reads      S b, lower, upper
 //   writes     S x
@@ -31,7 +31,8 @@ for (int k = 0; k < n; ++k) {
     x[i] = wp::clamp(x[i] - (T)omega * s / (T)row[i], lower[i], upper[i]);
 }
 
-// snippet times: a product that is rounded with the sum that it is added to, or not
+// snippet times: A product that is rounded on its own, or once together with the sum that it is
+// added to.
 const auto times = [](double u, double f) {
     if constexpr (FUSED)
         return u * f;
@@ -40,8 +41,8 @@ const auto times = [](double u, double f) {
     }
 };
 
-// kernel low_rank.gather: U'x over the columns' entries, a column of sums each; rows whose mask is
-// 0 count for nothing
+// kernel low_rank.gather: U'x over the entries of the columns, a column of sums each; rows with
+// mask 0 are left out
 //   compute    float64
 //   whole      int32 entry_rows, blocks; V values; int32 count; S x; K mask?
 //   numbers    int width, rank
@@ -61,8 +62,8 @@ for (int k = 0; k < n && p + k < last; ++k) {
 }
 const double first = P.more ? 0 : sums[0];
 
-// kernel low_rank.scatter: result = base + sign U f on U's rows where the mask is not 0; the first
-// entry of a row writes for all of them
+// kernel low_rank.scatter: result = base + sign U f on the rows of U with a mask other than 0; the
+// first entry of a row writes the sum of all
 //   compute    float64
 //   whole      int32 entry_rows, blocks; V values; int32 count; float64 factors; K mask?; S base,
 //              result

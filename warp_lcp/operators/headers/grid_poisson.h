@@ -21,8 +21,8 @@ const auto face_z = [&](int k, long long at = 0) -> T {
         return nz;
 };
 
-// kernel grid_poisson.count_faces: Diagonal of unit coefficients: the number of open faces of a
-// FLUID cell along the axes that count
+// kernel grid_poisson.count_faces: Diagonal for unit coefficients: number of open faces of a FLUID
+// cell along the axes that count
 //   compute    uint8
 //   reads      int8 cells
 //   writes     uint8 diagonal
@@ -46,8 +46,8 @@ if (MASKED_BYTES) {
     SIMD for (int k = whole; k < n; ++k) count(k);
 }
 
-// kernel grid_poisson.diagonal: The sum of the coefficients over a FLUID cell's open faces, plus
-// the shift
+// kernel grid_poisson.diagonal: Diagonal: sum of the coefficients over a FLUID cell's open faces,
+// plus the shift
 //   compute    S
 //   reads      int8 cells; S fx?, fy?, fz?, shift?
 //   writes     S diagonal
@@ -63,8 +63,8 @@ SIMD for (int k = 0; k < n; ++k) {
     diagonal[k] = cells[k] == 1 ? v : (T)0;
 }
 
-// kernel grid_poisson.weights: The weight of a lower face is its coefficient where it joins two
-// FLUID cells, else 0; ghost cells above the last ones have them too
+// kernel grid_poisson.weights: Weight of a lower face: its coefficient if it joins two FLUID cells,
+// else 0; also in the ghost cells above the last ones
 //   compute    S
 //   reads      int8 cells; S fx?, fy?, fz?
 //   writes     S wx, wy, wz
@@ -77,13 +77,13 @@ SIMD for (int k = 0; k < n; ++k) {
     wz[k] = ((cells[k] == 1) & ((cells + zm)[k] == 1)) ? face_z(k) : (T)0;
 }
 
-// kernel grid_poisson.face_gradient: (mu_i - mu_j) (x_i - x_j) of lower faces, 0 where one of the
-// two cells is SOLID, and mu_i x_i; and their sums
+// kernel grid_poisson.face_gradient: Derivatives by coefficients: (mu_i - mu_j) (x_i - x_j) of
+// lower faces, 0 where one of the two cells is SOLID; mu_i x_i for the shift; and their sums
 //   compute    float64
 //   reads      int8 cells; float64 multiplier, x
 //   writes     float64 face_x?, face_y?, face_z?, shift?
 //   sums       sum_x, sum_y, sum_z, sum_shift
-// and the cell `left` to the left of that at `to`
+// across a face to the cell `left` elements before that at `to`
 const auto across = [&](int k, int left, long long to) -> T {
     const bool open = (cells[k] != 2) & ((cells + to)[k - left] != 2);
     return open ? (multiplier[k] - (multiplier + to)[k - left]) * (x[k] - (x + to)[k - left])
@@ -101,18 +101,17 @@ if (face_y) SIMD for (int k = 0; k < n; ++k) face_y[k] = across(k, 0, ym);
 if (face_z) SIMD for (int k = 0; k < n; ++k) face_z[k] = across(k, 0, zm);
 if (shift) SIMD for (int k = 0; k < n; ++k) shift[k] = cells[k] == 1 ? multiplier[k] * x[k] : (T)0;
 
-// kernel grid_poisson.copy_cells: a copy of the cells' labels
+// kernel grid_poisson.copy_cells: Copy the labels of the cells
 //   compute    int8
 //   reads      int8 source
 //   writes     int8 to
 SIMD for (int k = 0; k < n; ++k) to[k] = source[k];
 
-// kernel grid_operator.find_spans: Find the span of a row: what lies between its first and its last
-// FLUID cell, both included, grown to whole vectors of 16 cells, so that aggregates stay whole,
-// too. Rows that have one are marked in `reach`, the chunks of flat fields that they lie in in
-// `chunks`; what is marked stays so. On the CPU eight cells at a time: a byte of v is 0 where a
-// cell is FLUID, and there alone v - 1 sets a highest bit that ~v has, but for bytes behind one of
-// them.
+// kernel grid_operator.find_spans: Span of a row: from its first to its last FLUID cell, both
+// included, widened to whole vectors of 16 cells, so that aggregates stay whole too. Rows with a
+// span are marked in `reach`, and the chunks of flat fields that contain them in `chunks`; older
+// marks stay. On the CPU eight cells are tested at a time. A byte of v is 0 where a cell is FLUID.
+// Only there v - 1 sets a highest bit that ~v has, apart from bytes behind one of them.
 //   compute    float32
 //   reads      int8 cells
 //   by_row     vec2i spans, reach

@@ -1,5 +1,5 @@
-// Kernels of sparse matrices in compressed rows. ptr: where each row begins, col: columns of the
-// entries.
+// Kernels of sparse matrices in compressed sparse row format. ptr: begin of each row; col: column
+// of each entry.
 
 // kernel sparse.product: y = A x, or A x + plus
 //   compute    S
@@ -14,8 +14,8 @@ ROWS {
     y[k] = s;
 }
 
-// kernel sparse.relax: x = clip(x - omega (A x + b) / d, lower, upper), row after row: all forward
-// or backwards, or those listed from place `first` on
+// kernel sparse.relax: Projected SOR: x = clip(x - omega (A x + b) / d, lower, upper), row after
+// row: all rows forward or backward, or the listed ones from place `first` on
 //   compute    S
 //   whole      int32 ptr, col; A a, d; int32 list?; S b, lower, upper, x
 //   numbers    float64 omega; bool forward; int first
@@ -31,15 +31,15 @@ const auto relax = [&](long long i) {
 for (int k = 0; k < n; ++k)
     relax(list ? (long long)list[first + p + k] : forward ? p + k : p + n - 1 - k);
 
-// kernel sparse.survey: Each row's largest magnitude and diagonal; entries below the diagonal
-// without an equal one above it, and how many more lie on one side
+// kernel sparse.survey: Largest magnitude and diagonal of each row. Counts: entries below the
+// diagonal without an equal one above it, and by how many entries one side has more
 //   compute    float64
 //   writes     float64 largest, diagonal
 //   whole      int32 ptr, col; float64 a
 //   sums       differ, more
 //   by_cell
 #include "snippets.h:entries"
-// a_ij, of row i, whose columns ascend; beyond the last one, where there is none
+// Place of a_ij in row i, whose columns ascend. If there is none: where it would be.
 const auto across = [&](int i, int j) {
     int first = ptr[i], last = ptr[i + 1];
     while (first < last) {
@@ -72,7 +72,7 @@ ROWS {
     diagonal[k] = own;
 }
 
-// kernel sparse.gather: entries in another order; 0 for an index below 0
+// kernel sparse.gather: Entries in another order; 0 for an index below 0
 //   compute    S
 //   reads      int32 order
 //   writes     S taken

@@ -10,8 +10,8 @@ if (b)
 else
     SIMD for (int k = 0; k < n; ++k) y[k] = product(x, k);
 
-// kernel stencil.transposed: y = A' x of a compact stencil: a neighbor's weight for this cell
-// times the neighbor
+// kernel stencil.transposed: y = A' x of a compact stencil: sum over the neighbors of their weight
+// for this cell times their x
 //   compute    S
 //   stencil    D, W
 //   reads      S x
@@ -25,8 +25,8 @@ for (int k = 0; k < n; ++k) {
 }
 #undef ADD
 
-// kernel stencil.relax: The cells of one color of a sweep of projected SOR: red or black, of a
-// compact stencil those whose indices are even or odd as its bits say
+// kernel stencil.relax: Projected SOR over the cells of one color: red or black; for a compact
+// stencil, even or odd along each axis as the color's bits say
 //   compute    S
 //   stencil    D, W
 //   reads      S b, lower, upper
@@ -46,8 +46,8 @@ for (int k = ours ? start : n; k < n; k += 2) {
     }
 }
 
-// kernel stencil.gradient: mu_i x_(i + o), or mu_i x_i where that neighbor is SOLID: what its
-// coefficient counts for, and their sum
+// kernel stencil.gradient: Derivative by a coefficient: mu_i x_(i + o), or mu_i x_i where that
+// neighbor is SOLID; and the sum
 //   compute    float64
 //   reads      int8 cells; float64 multiplier, x
 //   writes     float64 part?
@@ -67,8 +67,8 @@ T sum = 0;
 SIMD for (int k = 0; k < n; ++k) sum += value(k);
 if (part) SIMD for (int k = 0; k < n; ++k) part[k] = value(k);
 
-// kernel stencil.diagonal: The center's coefficient plus those of closed neighbors, whose value is
-// the cell's own, plus the shift
+// kernel stencil.diagonal: Diagonal: coefficient of the center plus those of closed neighbors,
+// whose value is the cell's own, plus the shift
 //   compute    S
 //   stencil    S, W
 //   reads      int8 cells; S center?, shift?
@@ -84,8 +84,8 @@ for (int k = 0; k < n; ++k) {
     made[k] = cells[k] == 1 ? v : (T)0;
 }
 
-// kernel stencil.wrap: Ghost cells before the first and after the last of `cells`, which are
-// `step` elements apart, along a periodic axis
+// kernel stencil.wrap: Fill the ghost cells before the first and after the last of `cells` along a
+// periodic axis; cells are `step` elements apart
 //   compute    S
 //   writes     S x
 //   numbers    int cells; int64 step
@@ -95,8 +95,9 @@ for (int k = 0; k < n; ++k) {
     x[k + (cells + 1) * step] = x[k + step];
 }
 
-// kernel matrix_stencil.recognize: Rows of a sparse matrix as those of a compact stencil on a box
-// of cells: how many are none, differ from the middle one, or are no M-matrix's
+// kernel matrix_stencil.recognize: Compare the rows of a sparse matrix with those of a compact
+// stencil on a box of cells. Counts: rows that are not of this form, that differ from the middle
+// one, or that are not of an M-matrix
 //   compute    float64
 //   writes     float64 made
 //   whole      int32 ptr, col; float64 a, middle, weights?
@@ -106,7 +107,7 @@ for (int k = 0; k < n; ++k) {
 int wrong = 0, centers = 0, differ = 0, positive = 0, count = 0, reached = 0;
 const int plane = nx * ny;
 double row[27], usual[27];
-// neighbors that there are, and their fields; what the middle row's entries would be
+// Existing neighbors and their fields; the entries of a row equal to the middle one.
 int places[27], columns[27], steps[27];
 bool rises = false, within = true;
 for (int o = 0, field = 0; o < 27; ++o) {
@@ -128,7 +129,7 @@ const auto inside = [&](int o, int x) {
 };
 for (int k = 0; k < n; ++k) {
     const int x = P.first + k, i = (P.k * ny + P.j) * nx + x, begin = ptr[i];
-    // most rows are the middle one
+    // most rows equal the middle one
     if (within && !weights && x > 0 && x < nx - 1 && ptr[i + 1] - begin == reached) {
         bool same = true;
         for (int q = 0; q < reached; ++q)

@@ -1,7 +1,7 @@
-// Kernels of bounds that are kept as a code per cell.
+// Kernels of bounds that are stored as a code per cell.
 
-// kernel bounds.encode: Which bounds are finite, as bits, and how many finite ones are not the
-// given number, or NaN
+// kernel bounds.encode: Bits of finite bounds. Count: finite bounds that differ from the given
+// number, or are NaN
 //   compute    float64
 //   reads      float64 lower?, upper?
 //   writes     uint8 code
@@ -30,8 +30,8 @@ if (lower && upper) {
     }
 }
 
-// kernel bounds.code_rows: Bits of a side whose field has no ghost cells, and how many of its
-// finite values are others
+// kernel bounds.code_rows: Bits of one side, whose field has no ghost cells. Count: finite values
+// that differ from the number
 //   compute    float64
 //   writes     uint8 code
 //   whole      float64 source
@@ -45,7 +45,7 @@ SIMD for (int k = 0; k < n; ++k) {
     code[k] += (a & !none) ? bit : 0;
 }
 
-// kernel bounds.decode: The field of bounds that a code stands for
+// kernel bounds.decode: Field of bounds from a code
 //   compute    float64
 //   reads      uint8 code
 //   writes     float64 field

@@ -1,8 +1,8 @@
-// Kernels of the natural residual, and of what a problem checks and settles before a solve.
+// Kernels of the natural residual, and of the checks of a problem before a solve.
 
-// kernel residual.natural: The square of r = d (x - clip(x - y/d, l, u)) = max(d (x - u), min(d (x
-// - l), y)): no division, and a NaN in y stays one; 0 x makes NaN of an x that is not finite where
-// its column of A is empty, so that y says nothing of it.
+// kernel residual.natural: Square of the natural residual r = d (x - clip(x - y/d, l, u)) = max(d
+// (x - u), min(d (x - l), y)). The second form has no division, and a NaN of y stays NaN. The term
+// 0 x gives NaN if x is not finite and its column of A is empty, so that y does not show it.
 //   compute    float64
 //   bounds
 //   reads      float64 x, y; D d; int8 unknown
@@ -18,7 +18,7 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel residual.unknown_square: The square of a field over the unknowns
+// kernel residual.unknown_square: Sum of the squares of a field over the unknowns
 //   compute    float64
 //   reads      float64 b; int8 unknown
 //   sums       square
@@ -40,8 +40,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel residual.settle_isolated: Where A's row is empty, y = b: x is the bound that b's sign
-// asks for
+// kernel residual.settle_isolated: Unknowns whose row of A is empty, so that y = b: x is the bound
+// that the sign of b determines
 //   compute    float64
 //   bounds
 //   reads      D d; float64 b; int8 unknown
@@ -54,8 +54,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel problem.check: Of the unknowns: values that are not finite, NaN among the bounds, crossed
-// bounds, bounds that no x can meet
+// kernel problem.check: Counts over the unknowns: values that are not finite, NaN among the bounds,
+// crossed bounds, bounds that no x meets
 //   compute    float64
 //   bounds
 //   reads      float64 b; int8 unknown

@@ -1,7 +1,7 @@
 // Kernels of active sets and of the systems of their free unknowns.
 
-// kernel active_set.classify: The free set of the minimum map: unknowns with x - y / d within the
-// bounds. The others go onto them; g = -scale y on the free set
+// kernel active_set.classify: Free set of the minimum map: unknowns with x - y / d within the
+// bounds. The others move onto their bounds; g = -scale y on the free set
 //   compute    float64
 //   stencil    D, W
 //   bounds
@@ -27,13 +27,14 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel active_set.all_free: Every unknown is free
+// kernel active_set.all_free: All unknowns are free
 //   compute    float64
 //   reads      int8 unknown
 //   writes     uint8 free
 SIMD64 for (int k = 0; k < n; ++k) free[k] = unknown[k] == 1;
 
-// kernel active_set.on_free: g = -scale y on the free set, 0 off it, and the square of y there
+// kernel active_set.on_free: g = -scale y on the free set, 0 elsewhere; the sum of y^2 on the free
+// set
 //   compute    float64
 //   reads      float64 y; uint8 free
 //   writes     S g
@@ -46,9 +47,9 @@ SIMD for (int k = 0; k < n; ++k) {
     square += v * v;
 }
 
-// kernel active_set.step: The direction z + beta `along` in the place of `along`, where there is a
-// z, and `to` = x + step `along`, onto the bounds where that is not 0. An x that is `guarded`
-// stays as it is where the step is not finite. `kept` receives x.
+// kernel active_set.step: `along` = z + beta `along` if z is given; `to` = x + step `along`,
+// clipped to the bounds where `along` is not 0. With `guarded`, x stays where the step is not
+// finite. `kept` receives x.
 //   compute    float64
 //   bounds
 //   reads      float64 x?; S z?
@@ -56,11 +57,11 @@ SIMD for (int k = 0; k < n; ++k) {
 //   numbers    float64 beta, step; bool guarded
 const S part = (S)beta;
 const bool fresh = part == 0, open = !guarded;
-// rounded twice: a selection
+// two roundings, because of the selection
 if (z && (to || fresh))
     SIMD for (int k = 0; k < n; ++k) along[k] = fresh ? z[k] : z[k] + part * along[k];
 else if (z)
-    SIMD for (int k = 0; k < n; ++k) along[k] = z[k] + part * along[k];  // rounded once
+    SIMD for (int k = 0; k < n; ++k) along[k] = z[k] + part * along[k];  // one rounding
 if (kept) SIMD8 for (int k = 0; k < n; ++k) kept[k] = x[k];
 if (to)
     with_bounds([&](auto lower, auto upper) {
@@ -70,8 +71,8 @@ if (to)
         }
     });
 
-// kernel principal_system.shift: diagonal = unit d + shift on the free set, 0 elsewhere; weight =
-// 1 / |diagonal|, 1 where that is 0, 0 off the free set
+// kernel principal_system.shift: diagonal = unit d + shift on the free set, 0 elsewhere; weight = 1
+// / |diagonal|, 1 where the diagonal is 0, 0 off the free set
 //   compute    S
 //   reads      D d; uint8 free; float64 shift?
 //   writes     S diagonal, weight
@@ -87,7 +88,7 @@ SIMD for (int k = 0; k < n; ++k) {
     weight[k] = a > 0 ? (T)1 / a : (T)(free[k] != 0);
 }
 
-// kernel principal_system.mask: q + D direction on the free set, 0 off it
+// kernel principal_system.mask: q + D direction on the free set, 0 elsewhere
 //   compute    float64
 //   reads      float64 direction; uint8 free; float64 shift?
 //   writes     float64 q
@@ -100,7 +101,7 @@ if (shift) {
     SIMD for (int k = 0; k < n; ++k) q[k] = free[k] ? q[k] : 0.0;
 }
 
-// kernel principal_system.divide: z = r / d, r where d is 0
+// kernel principal_system.divide: z = r / d; z = r where d is 0
 //   compute    float64
 //   reads      float64 r, d
 //   writes     float64 z
@@ -109,8 +110,8 @@ SIMD for (int k = 0; k < n; ++k) {
     z[k] = d[k] != 0 ? v : r[k];
 }
 
-// kernel equilibrated.units: A field times units, or over them: powers of 2, so that nothing is
-// rounded, and infinities stay what they are
+// kernel equilibrated.units: Multiply a field by units, or divide it. Units are powers of 2, so
+// that nothing is rounded; infinities do not change
 //   compute    float64
 //   reads      float64 x, units
 //   writes     float64 scaled

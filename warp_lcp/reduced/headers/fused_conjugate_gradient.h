@@ -1,6 +1,6 @@
 // Kernels of conjugate gradients on a grid in fused passes.
 
-// kernel grid_conjugate_gradient.direct: The direction q = z + beta q
+// kernel grid_conjugate_gradient.direct: Direction q = z + beta q
 //   compute    S
 //   reads      S z
 //   writes     S q
@@ -14,8 +14,8 @@ if (beta == 0) {
     SIMD for (int k = 0; k < n; ++k) q[k] = z[k] + beta * q[k];
 }
 
-// kernel grid_conjugate_gradient.step: x moved along the direction q, A q taken off the residual,
-// and the residual's square, weighted by 1 / d or not
+// kernel grid_conjugate_gradient.step: Move x along the direction q, subtract A q from the
+// residual; the residual's square, weighted by 1 / d or not
 //   compute    S
 //   stencil    F, S
 //   reads      S q

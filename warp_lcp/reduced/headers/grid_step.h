@@ -1,6 +1,6 @@
 // Kernels of the projected multigrid method.
 
-// kernel projected_multigrid.update: The direction q = z + beta q, and x moved along it, onto the
+// kernel projected_multigrid.update: Direction q = z + beta q; move x along it and clip it to the
 // bounds
 //   compute    float64
 //   bounds
@@ -11,14 +11,14 @@
 //   module     projected_multigrid.steps
 const S beta = (S)scalars[BETA];
 const T step = scalars[STEP], inverse = step != 0 ? reciprocal(step) : 0;
-const bool fresh = beta == 0;  // then q may hold anything, a NaN too
+const bool fresh = beta == 0;  // q may hold anything then, also NaN
 fetch(0, n, x, z, q);
 with_bounds([&](auto lower, auto upper) {
     SIMD8 for (int k = 0; k < n; ++k) {
-        // held unknowns leave the direction
+        // the direction of held unknowns is 0
         const auto s = (fresh | (z[k] == 0)) ? z[k] : z[k] + beta * q[k];
         const T v = x[k] + step * (T)s, c = clipped(v, lower(k), upper(k));
-        // a NaN or infinite step leaves x as it was
+        // a step that is NaN or infinite leaves x unchanged
         const bool moves = (s != 0) & (v - v == 0), cut = moves & (c != v);
         const T left = (c - x[k]) * inverse;
         q[k] = cut ? left : (T)s;
@@ -26,15 +26,14 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// snippet mark: what stands in place of a right-hand side where an unknown is held
-// in place of a right-hand side, of order one: a held unknown that is not at its bound, below 0 for
-// the lower one
+// snippet mark: Marker in a right-hand side, whose entries are of order one: a held unknown that is
+// not at its bound, below 0 for the lower one.
 const S mark = (S)1e30f;
 
-// kernel projected_multigrid.assess: y = A x + b: the natural residual, the energy, the free set,
-// and g = -y / SIZE on it, a right-hand side. An unknown is held if it sits at a bound with y of
-// the right sign; by the MINIMUM_MAP, if x - y / d lies outside the bounds: where such a one is
-// not at its bound yet, g is a mark and its row is flagged in `away`.
+// kernel projected_multigrid.assess: y = A x + b: natural residual, energy, free set, and on it the
+// right-hand side g = -y / SIZE. An unknown is held if it is at a bound and y has the right sign;
+// with MINIMUM_MAP if x - y / d lies outside the bounds. If such an unknown is not at its bound
+// yet, g is a marker and its row is flagged in `away`.
 //   compute    float64
 //   stencil    D, W
 //   bounds
@@ -46,8 +45,9 @@ const S mark = (S)1e30f;
 //   sums       norm, moved, active, energy
 //   constants  SIZE, BETA, STEP, PER_SIZE, MINIMUM_MAP = 0, ROUNDED = 0
 #include "mark"
-const auto near = [](T v) -> T { return ROUNDED ? (T)(float)v : v; };  // a bound as x can hold it
-// a count of faces, or what it is worth
+// A bound as x can represent it.
+const auto near = [](T v) -> T { return ROUNDED ? (T)(float)v : v; };
+// a number of faces, or the value that it stands for
 const auto stored = [&](int k) -> F { return sizeof(F) > sizeof(*d) ? (F)diagonal(k) : (F)d[k]; };
 const T inverse = scalars[PER_SIZE];
 T norm = 0, energy = 0;
@@ -96,7 +96,7 @@ for (int begin = 0; begin < n; begin += M) {
             }
         }
     });
-    SIMD for (int k = begin; k < end; ++k) {  // bytes only, where the diagonal is one
+    SIMD for (int k = begin; k < end; ++k) {  // bytes only, if the diagonal is a byte
         const unsigned char h = hold[k - begin];
         const F now = h ? (F)0 : stored(k);
         const unsigned char one = free[k] != now, two = h & unknown[k];
@@ -114,7 +114,7 @@ if constexpr (MINIMUM_MAP) {
     if (off) away[P.row] = 1;
 }
 
-// kernel projected_multigrid.measure: The products of a correction z that beta and the step need
+// kernel projected_multigrid.measure: Products of a correction z for beta and the step length
 //   compute    S
 //   stencil    F, S
 //   reads      S z, q, g
@@ -129,8 +129,8 @@ SIMD for (int k = 0; k < n; ++k) {
     gp += g[k] * q[k];
 }
 
-// kernel projected_multigrid.measure_again: As measure, in the places of some rows among those
-// of all
+// kernel projected_multigrid.measure_again: As projected_multigrid.measure, for some rows, into
+// their places among those of all
 //   compute    S
 //   stencil    F, S
 //   reads      S z, q, g
@@ -144,7 +144,7 @@ sum[places] = (double)zap;
 sum[2 * places] = (double)gz;
 sum[3 * places] = (double)gp;
 
-// kernel projected_multigrid.hold: Marked unknowns of flagged rows go onto their bounds
+// kernel projected_multigrid.hold: Move the marked unknowns of flagged rows onto their bounds
 //   compute    float64
 //   bounds
 //   reads      S g
@@ -161,8 +161,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel projected_multigrid.right_side: g = -(A x + b) / SIZE on the free set, in flagged rows
-// and those beside them
+// kernel projected_multigrid.right_side: g = -(A x + b) / SIZE on the free set, in flagged rows and
+// rows beside them
 //   compute    float64
 //   stencil    D, W
 //   reads      float64 x, b; F free
@@ -190,8 +190,8 @@ for (int begin = 0; begin < n; begin += M) {
     }
 }
 
-// kernel projected_multigrid.gaps: Bounds of a correction in units of SIZE; finite, and 0 off the
-// unknowns
+// kernel projected_multigrid.gaps: Bounds of a correction in units of SIZE: finite, 0 where there
+// is no unknown
 //   compute    float64
 //   bounds
 //   reads      float64 x; int8 unknown
@@ -217,7 +217,7 @@ with_bounds([&](auto lower, auto upper) {
 //   writes     uint8 mask
 SIMD for (int k = 0; k < n; ++k) mask[k] = free[k] != 0;
 
-// kernel projected_multigrid.undo: Where the last step began, as far as no bound has cut it
+// kernel projected_multigrid.undo: Undo the last step, as far as no bound has cut it
 //   compute    float64
 //   bounds
 //   reads      float64 x; S q; int8 unknown

@@ -1,7 +1,6 @@
-// Kernels of the Woodbury preconditioner of a term of low rank.
+// Kernels of the Woodbury preconditioner for a term of low rank.
 
-// kernel low_rank_correction.squares: The diagonal of U'U on the unknowns, then the rows of each
-// block
+// kernel low_rank_correction.squares: Diagonal of U'U on the unknowns, then the rows of each block
 //   compute    float64
 //   whole      int32 entry_rows, blocks; V values; int32 count; D d; float64 squares
 //   numbers    int width, rank
@@ -16,7 +15,8 @@ for (int e = 0; e < count[0]; ++e) {
     }
 }
 
-// kernel low_rank_correction.squares_by_turns: The same, a column of sums each, by many threads
+// kernel low_rank_correction.squares_by_turns: As low_rank_correction.squares, by many threads, a
+// column of sums each
 //   compute    float64
 //   whole      int32 entry_rows, blocks; V values; int32 count; D d
 //   numbers    int width, rank
@@ -37,7 +37,7 @@ for (int k = 0; k < n && p + k < last; ++k) {
 }
 const double first = P.more ? 0 : sums[0];
 
-// kernel low_rank_correction.dots: Products of the fields in slots with r, a column of sums each
+// kernel low_rank_correction.dots: Products of r with the fields in slots, a column of sums each
 //   compute    S
 //   reads      S r
 //   whole      S Z
@@ -56,7 +56,7 @@ for (int s = 0; s < slots; ++s) {
         *column = P.more ? *column + (double)sum : (double)sum;
 }
 
-// kernel low_rank_correction.subtract: z -= the sum of factors_s Z_s, on the unknowns
+// kernel low_rank_correction.subtract: z -= sum_s factors_s Z_s on the unknowns
 //   compute    S
 //   reads      D d
 //   writes     S z

@@ -1,8 +1,8 @@
-// Kernels of nonsmooth Newton methods: the maps, their derivatives, and steps. Constants say what
-// of the maps a problem needs: the rest is not computed.
+// Kernels of nonsmooth Newton methods: maps, derivatives and steps. Constants say which
+// parts of the maps a problem needs; other parts are not computed.
 
-// snippet map_numbers: The type R of a map's values, its numbers, and a root that is vectorized in
-// that type.
+// snippet map_numbers: Type R of a map's values, its constants, and a square root that is
+// vectorized in this type.
 #if FUSED
 typedef S R;
 const R part = (R)share, over_b = (R)(over / scale), tiny = (R)(kinks * scale);
@@ -21,11 +21,11 @@ const auto root = [](R v) -> R {
 #endif
 };
 
-// snippet fischer: f, p, q and the kink of a row, of what `map` says they are made of: Fischer and
-// Burmeister's function psi(a, b) = a + b - rho, rho = sqrt(a^2 + b^2), of a and h = -psi(-w, c),
-// and its derivatives 1 - a / rho and 1 - b / rho, penalized or not. Without cancellation these are
-// 2 a b / (a + b + rho) and b^2 / (rho (rho + a)). HOST: rho^2 is greater by 2 mu; and derivatives
-// are 0 where b is less than rounding beside a, so that factors find a singular Jacobian singular.
+// snippet fischer: f, p, q and the kink of a row, from the values of `map`. The Fischer-Burmeister
+// function is psi(a, b) = a + b - rho, rho = sqrt(a^2 + b^2), here of a and h = -psi(-w, c). Its
+// derivatives are 1 - a / rho and 1 - b / rho, penalized or not. Forms without cancellation are 2 a
+// b / (a + b + rho) and b^2 / (rho (rho + a)). HOST: rho^2 is greater by 2 mu, and a derivative is
+// 0 where b is below the rounding error of a, so that factorizations detect a singular Jacobian.
 #if HOST
 #define SMOOTHED(v) ((v) + twice_mu)
 #define LOWERED(v) ((v) - twice_mu)
@@ -68,9 +68,9 @@ const R f = inside ? f1 : (R)0, p = p1 + q1 * p2, q = q1 * q2;
 #undef SMOOTHED
 #undef LOWERED
 
-// snippet map: Of cell i: f, p, q, whether there is a kink, and what they are made of; R is the
-// type of it. FUSED: in units of `scale`, which makes them of order one; the map is free of
-// cancellation.
+// snippet map: f, p, q of cell i, whether it has a kink, and the values that these are computed
+// from; R is their type. FUSED: in units of `scale`, which makes them of order one; the map is free
+// of cancellation.
 #if FUSED
 const double at_ = diagonal(i), size = at_ != 0 ? at_ : 1.0, low_ = lower(i), high_ = upper(i),
              value = y[i - begin];
@@ -88,7 +88,7 @@ const bool inside = unknown[i] == 1,
            low = low_ > -(double)INFINITY, high = high_ < (double)INFINITY;
 const R a = low ? size * (x[i] - low_) : 0.0, c = high ? size * (high_ - x[i]) : 0.0, w = y[i];
 #endif
-#if RANDOM  // an element of the unit disc's first quadrant for each kink, a hash of its index
+#if RANDOM  // element of the unit disc's first quadrant for each kink, from a hash of its index
 const unsigned long long z0 = ((unsigned long long)(p + i) + seed) * 0x9E3779B97F4A7C15ull,
                          z1 = (z0 ^ (z0 >> 29)) * 0xBF58476D1CE4E5B9ull;
 const R first = (double)(unsigned int)(z1 >> 32) * 2.3283064365386963e-10;
@@ -106,7 +106,7 @@ const R f = inside ? (top ? -c : least) : (R)0, p = (top | bottom) ? (R)1 : (R)0
 #include "fischer"
 #endif
 
-// kernel nonsmooth_map.merit: The sum of f^2
+// kernel nonsmooth_map.merit: Sum of f^2
 //   compute    float64
 //   bounds
 //   reads      float64 x, y; int8 unknown; D d
@@ -122,7 +122,7 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel nonsmooth_map.values: f
+// kernel nonsmooth_map.values: Values f of the map
 //   compute    float64
 //   bounds
 //   reads      float64 x, y; int8 unknown; D d
@@ -137,9 +137,9 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel nonsmooth_map.condense: Newton's system over q: D = d p / q, on top of A's diagonal if
-// FUSED, and -scale f / q; sums of f^2, of the natural residual and of the right-hand side in the
-// norm of its system.
+// kernel nonsmooth_map.condense: Newton's system over q: D = d p / q, added to A's diagonal if
+// FUSED, and the right-hand side -scale f / q. Sums of f^2, of the natural residual, and of the
+// right-hand side in the norm of its system.
 //   compute    float64
 //   bounds
 //   reads      float64 x, y; int8 unknown; D d
@@ -187,7 +187,8 @@ with_bounds([&](auto lower, auto upper) {
 });
 #endif
 
-// kernel nonsmooth_map.condense_at_rows: the same where y = A x + b is computed on the way
+// kernel nonsmooth_map.condense_at_rows: As nonsmooth_map.condense, with y = A x + b computed in
+// the same pass
 //   compute    float64
 //   stencil    F, W
 //   bounds
@@ -198,7 +199,7 @@ with_bounds([&](auto lower, auto upper) {
 //   constants  NATURAL = 0, UPPER = 0, PENALIZED = 0, RANDOM = 0, FUSED = 1
 #include "nonsmooth_map.condense"
 
-// kernel nonsmooth_map.weighted: d p f and q f, of which the gradient is made, and the sum of f^2
+// kernel nonsmooth_map.weighted: d p f and q f, the parts of the gradient, and the sum of f^2
 //   compute    float64
 //   bounds
 //   reads      float64 x, y; int8 unknown; D d
@@ -217,8 +218,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel nonsmooth_map.gradient: The gradient over d^2, from what stands in it and A' q f; squares
-// of it over d, and its product with the last one
+// kernel nonsmooth_map.gradient: Gradient over d^2, from its stored part and A' q f; its square
+// over d, and its product with the previous gradient
 //   compute    float64
 //   reads      float64 product, last; int8 unknown; D d
 //   writes     float64 gradient
@@ -233,7 +234,7 @@ SIMD for (int i = 0; i < n; ++i) {
     inner += g * size * last[i];
 }
 
-// kernel nonsmooth_map.advance: x = base + scale e, onto the bounds if projected
+// kernel nonsmooth_map.advance: x = base + scale e, clipped to the bounds if projected
 //   compute    float64
 //   bounds
 //   reads      float64 base; S e; int8 unknown
@@ -258,7 +259,7 @@ fetch(0, n, x, e);
 SIMD8 for (int k = 0; k < n; ++k) x[k] += step * (double)e[k];
 
 // kernel nonsmooth_map.host: f, p, q and the kink of rows first <= i < last on the host. `reals`
-// holds x, y, d, the bounds, and the element (kp, kq) that stands at each kink.
+// holds x, y, d, the bounds, and the element (kp, kq) that is used at each kink.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 value, by_x, by_y, kinked
@@ -281,7 +282,8 @@ for (int i = first; i < last; ++i) {
     kinked[i] = kink;
 }
 
-// kernel finite_difference.difference: over (q - f) on the free unknowns, 0 elsewhere
+// kernel finite_difference.difference: Difference quotient: over (q - f) on the free unknowns, 0
+// elsewhere
 //   compute    float64
 //   reads      uint8 free; float64 f
 //   writes     float64 q
@@ -291,7 +293,7 @@ SIMD for (int k = 0; k < n; ++k) {
     q[k] = free[k] ? v : 0.0;
 }
 
-// kernel finite_difference.scale: z = r / |d|, r where d is 0
+// kernel finite_difference.scale: z = r / |d|; z = r where d is 0
 //   compute    float64
 //   reads      float64 r, d
 //   writes     float64 z

@@ -1,5 +1,5 @@
-// Kernel of contacts between rigid bodies. one, other: a contact's bodies; starts: an island's
-// first contact.
+// Kernel of contacts between rigid bodies. one, other: the bodies of a contact; starts: the first
+// contact of each island.
 
 // snippet island: One island t of the kernel below: its x, `residual[t]` and `rounds[t]`.
 for (;;) {
@@ -95,11 +95,11 @@ for (;;) {
 
 // kernel warp_lcp.rigid.contacts.nncg: Solve the islands first <= t < last, whose contacts follow
 // each other, by nonlinear conjugate gradients on projected sweeps. `reals` holds x, J, b, e, d,
-// mu, then room for g, way, best and w. J: rows, 2 q entries each, for the first and the second
-// body of the row's contact; w = J' x, q entries a body. `indices` holds a contact's bodies, and an
-// island's first contact. `residual` and `rounds` are of each island: relative to the residual of x
-// = 0, and iterations taken. EACH iterations lie between looks at the residual, which costs as much
-// as a sweep.
+// mu, then room for g, way, best and w. J has rows of 2 q entries, for the first and the second
+// body of the row's contact; w = J' x has q entries per body. `indices` holds the bodies of each
+// contact, and the first contact of each island. Of each island, `residual` is relative to the
+// residual of x = 0, and `rounds` is the number of iterations. The residual is tested every EACH
+// iterations, since it costs as much as a sweep.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 residual, rounds

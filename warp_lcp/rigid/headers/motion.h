@@ -1,7 +1,7 @@
-// Motion of rigid bodies, see `rigid/body.py`. Matrices are stored by rows; `values` are the 26
+// Motion of rigid bodies, see `rigid/body.py`. Matrices are stored row by row; `values` are the 26
 // numbers of a body's state.
 
-// snippet spins: Angular velocities R I^-1 R' L.
+// snippet spins: Angular velocity from the angular momentum: omega = R I^-1 R' L.
 const auto spin_of = [&](const double* R, const double* inverse, const double* L, double* w) {
     double u[3], v[3];
     apply_transposed(R, L, u);
@@ -9,8 +9,8 @@ const auto spin_of = [&](const double* R, const double* inverse, const double* L
     apply(R, v, w);
 };
 
-// snippet turns: Matrices of rotations, and the step of `advance_states`.
-// K x = v x x; zeros are products, so that what is not finite spreads
+// snippet turns: Rotation matrices, and the step of `advance_states`.
+// K x = v x x (cross product). Zeros are products, so that values that are not finite propagate.
 const auto cross_matrix = [&](const double* v, double* K) {
     const double zero = fused(v[2], 0.0, fused(v[1], 0.0, v[0] * 0.0));
     K[0] = K[4] = K[8] = zero;
@@ -21,7 +21,7 @@ const auto cross_matrix = [&](const double* v, double* K) {
     K[6] = zero - v[1];
     K[7] = zero + v[0];
 };
-const auto rotation_by = [&](const double* v, double* R) {  // by |v| about v
+const auto rotation_by = [&](const double* v, double* R) {  // rotation by the angle |v| about v
     const double pi = 3.141592653589793, angle = length(v) / pi;
     const auto sinc = [&](double x) {
         double y = pi * x;
@@ -55,8 +55,8 @@ const auto advance = [&](double* values, double mass, const double* inverse, dou
     for (int i = 0; i < 3; ++i) half[i] *= 2.0;
     rotation_by(half, turn);
     product(turn, R, turned);
-    // R (3 - R'R)/2: Newton's step to the nearest rotation (Newton-Schulz), |R'R - 1| = d becomes
-    // 3/4 d^2, which is below rounding
+    // Newton-Schulz step to the nearest rotation, R (3 - R'R)/2: |R'R - 1| = d becomes 3/4 d^2,
+    // which is below the rounding error.
     double scaled[9], rest[9];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
@@ -69,8 +69,8 @@ const auto advance = [&](double* values, double mass, const double* inverse, dou
     values[19] += dt;
 };
 
-// kernel warp_lcp.rigid.motion.advance: Move bodies along their velocities, each for its own time.
-// `reals` holds values, masses, inverse inertias and times of `count` bodies, of which values
+// kernel warp_lcp.rigid.motion.advance: Move bodies along their velocities, each by its own time.
+// `reals` holds the values, masses, inverse inertias and times of `count` bodies; the values
 // change.
 //   compute    float64
 //   whole      float64 reals; int32 indices
@@ -85,8 +85,8 @@ const double *mass = reals + 26 * count, *inverse = mass + count, *dt = inverse 
 for (int t = first; t < last; ++t) advance(reals + 26 * t, mass[t], inverse + 9 * t, dt[t]);
 
 // kernel warp_lcp.rigid.motion.poses: Poses of bodies at `times` times, see `BodyMotion.poses_of`.
-// `reals` holds values, masses, inverse inertias, centers and times; then come rotations and
-// translations, time by time, and the velocity fields of now: turns and shifts.
+// `reals` holds values, masses, inverse inertias, centers and times. The results follow: rotations
+// and translations, time by time, and the present velocity fields, turns and shifts.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 found

@@ -1,10 +1,11 @@
 // Contacts of bodies in a plane, see `rigid/planar_contacts.py`: the loops of
-// `ContactDetection.find` and `ContactSolve.assembled`, with their bits.
+// `ContactDetection.find` and `ContactSolve.assembled`, equal to the last bit.
 
-// snippet distances: Signed distances of points to shapes, and directions outward. A shape is SHAPE
-// numbers: kind, radius, size, points, whether it is a ball; its bounds; its points; of a round one
-// start, axis, its square, a direction across and a length that is none; of a box center, axes,
-// half sides and that length. `rows` is how many points NumPy would have in the same product.
+// snippet distances: Signed distances of points to shapes, and outward directions. A shape is SHAPE
+// numbers: kind, radius, size, points, whether it is a ball; its bounds; its points. Then, of a
+// round shape: start, axis, square of the axis, a direction across it, and a length that counts as
+// 0. Of a box: center, axes, half sides, and that length. `rows`: number of points that NumPy has
+// in the same product, which decides the rounding.
 enum { ROUND, BOX, MOST = 64 };
 struct Touch {
     int count;
@@ -60,8 +61,8 @@ const auto distance_of = [&](const double* shape, int rows, const double* p, dou
     return inside ? beyond[deepest] : far;
 };
 
-// snippet points: Which points of one shape are near another, or a plane; `sign` = -1 turns
-// normals.
+// snippet points: Points of one shape that are near another one, or near a plane; `sign` = -1
+// reverses normals.
 const auto add = [](Touch& touch, const double* p, const double* normal, double gap, double depth,
                     double sign) {
     if (touch.count >= MOST) return;
@@ -110,8 +111,8 @@ const auto on_plane = [&](const double* shape, const double* R, const double* t,
     }
 };
 
-// snippet boxes: Contact points of two boxes by the axis of least overlap, see `box_contacts.py`,
-// both thick along z. False where edges touch, which those of a plane do not.
+// snippet boxes: Contact points of two boxes by the axis of least overlap, see `box_contacts.py`.
+// Both boxes are thick along z. Returns false if edges touch, which does not occur in a plane.
 const auto box_on_box = [&](const double* a, const double* Ra, const double* ta, const double* b,
                             const double* Rb, const double* tb, double margin, Touch& touch) {
     double center[2][3], R[2][9], half[2][3], between[3], axes[15][3], apart[15], off[15];
@@ -272,12 +273,13 @@ const auto spread = [&](const Touch& touch, double size, int* chosen) {
     return count;
 };
 
-// kernel warp_lcp.rigid.planar_contacts.find: Contacts of a step with their rows. `reals` holds
-// values, masses, inverse inertias, centers, middles of bounds, halves of these without radius,
-// reaches, frictions, restitutions and shapes of the bodies; of each obstacle its margin and either
-// `planes` points and normals, or a shape, rotation, translation, middle and half of its bounds;
-// then come work and, field by field, `capacity` contacts. `indices` holds each obstacle's planes,
-// -1 for a shape. `total`: how many there are; -1: this loop does not find them.
+// kernel warp_lcp.rigid.planar_contacts.find: Contacts of a step with their rows. `reals` holds, of
+// the bodies, values, masses, inverse inertias, centers, middles of bounds, half sizes of these
+// without radius, reaches, frictions, restitutions and shapes. Of each obstacle it holds the margin
+// and either `planes` points and normals, or a shape, rotation, translation, middle and half size
+// of its bounds. Then come work and, field by field, `capacity` contacts. `indices` holds each
+// obstacle's number of planes, -1 for a shape. `total`: number of contacts; -1: this loop cannot
+// find them.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 total
@@ -407,7 +409,7 @@ for (int o = 0; o < obstacles; ++o) {
             const double *p = points + 3 * m, *normal = normals + 3 * m;
             double absolute[3], place[3];
             for (int a = 0; a < 3; ++a) absolute[a] = fabs(normal[a]);
-            const bool rows = (n > 1) == (planes > 1);  // how NumPy takes the product
+            const bool rows = (n > 1) == (planes > 1);  // the form of NumPy's product
             const double level = (p[0] * normal[0] + p[1] * normal[1]) + p[2] * normal[2];
             const double height = (rows ? along(c, 1, normal, 1) : across(c, normal)) - level;
             if (!(height - (rows ? along(half + 3 * i, 1, absolute, 1)

@@ -1,15 +1,16 @@
 // Impulses of contacts in a plane, see `rigid/planar_contacts.py`: the loops of
-// `ContactSolve.push_apart`, `ContactMemory` and `SupportedContacts`, with their bits.
+// `ContactSolve.push_apart`, `ContactMemory` and `SupportedContacts`, equal to the last bit.
 
-// kernel warp_lcp.rigid.planar_impulses.push: Impulses of contacts, as `ContactSolve.push_apart`
-// has them. `reals` holds values, masses, inverse inertias and their roots of `count` bodies;
-// `contacts` contacts' points, frames, sizes, rows for both bodies, walls' velocities, targets,
-// frictions and gaps; `old` remembered ones, or impulses to start from if `resumed`. Then come
-// impulses, what to remember of the contacts, of each body G'J'JG of the rows that hold it, the
-// diagonal of G, ways that reduce overlaps, and whether there are rows that hold it; then work.
-// `indices` holds the contacts' bodies; then comes work. Values get the impulses, if `worst` is no
-// more than `unsolved`. `iterations`: the most of an island. `deep`: how many contacts will overlap
-// in `dt`. `stacked`: how many touch a body that is held, and another one.
+// kernel warp_lcp.rigid.planar_impulses.push: Impulses of contacts, as in
+// `ContactSolve.push_apart`. `reals` holds the values, masses, inverse inertias and their roots of
+// `count` bodies. It then holds the points, frames, sizes, rows for both bodies, velocities of
+// walls, targets, frictions and gaps of `contacts` contacts, and `old` remembered ones, or initial
+// impulses if `resumed`. The results follow: the impulses; the data of contacts to remember; of
+// each body G'J'JG of the rows that hold it, the diagonal of G, displacements that reduce overlaps,
+// and whether rows hold it. Then comes work. `indices` holds the contacts' bodies; then comes work.
+// The values include the impulses if `worst` is at most `unsolved`. `iterations`: largest number
+// over the islands. `deep`: number of contacts that will overlap in `dt`. `stacked`: number of
+// contacts between a body that is held and another one.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 worst, iterations, deep, stacked
@@ -63,7 +64,7 @@ for (int i = 0; i < n; ++i) {
     roots[3 * i + 2] = along(values + 26 * i + 9, 1, inertias + 9 * i + 2, 3);
     least[i] = i;
 }
-// impulses to start from: those of the nearest contact of the same pair, each used once
+// Initial impulses: those of the nearest contact of the same pair, each used once.
 for (int k = 0; k < contacts; ++k) {
     const int i = first_of[k];
     double arm[3];
@@ -102,7 +103,7 @@ for (int k = 0; k < contacts && !resumed; ++k) {
     for (int r = 0; r < dim && mine; ++r)
         start[dim * k + r] = across(frames + 6 * k + 3 * r, before + 8 * o + 5);
 }
-// contacts sorted by islands, of which each has the number of its least body
+// Contacts sorted by islands. An island has the number of its first body.
 const auto root = [&](int i) {
     while (least[i] != i) i = least[i];
     return i;
@@ -172,7 +173,7 @@ if (worst[0] <= unsolved)
         momentum[5] += pushes[3 * i + 2];
         find_velocity(i);
     }
-// what the end of the step asks for: overlaps, and what to remember
+// data for the end of the step: overlaps, and contacts to remember
 for (int k = 0; k < contacts; ++k) {
     double* kept = memory + 8 * k;
     kept[0] = first_of[k];
@@ -185,7 +186,7 @@ for (int k = 0; k < contacts; ++k) {
     }
     deep[0] += gaps[k] + dt * velocity_of(k, 0) < -SLOP * sizes[k];
 }
-// the smallest ways that reduce these overlaps, see `ContactSolve.separation`: no friction
+// Smallest displacements that reduce these overlaps, see `ContactSolve.separation`: no friction.
 for (int i = 0; i < 3 * n; ++i) ways[i] = 0.0;
 if (deep[0] > 0.0) {
     const int dim = 1, most = ROUGH_MOST;
@@ -193,7 +194,7 @@ if (deep[0] > 0.0) {
     for (int p = 0; p < contacts; ++p) {
         const int k = order[p];
         const double gap = gaps[k] + dt * velocity_of(k, 0);
-        for (int a = 0; a < m; ++a) J[m * p + a] = J[m * 2 * p + a];  // the normals' rows
+        for (int a = 0; a < m; ++a) J[m * p + a] = J[m * 2 * p + a];  // rows of the normals
         const double* row = J + m * p;
         b[p] = gap < -SLOP * sizes[k] ? RATE * gap : (gap > 0.0 ? gap : 0.0);
         x[p] = e[p] = mu[p] = 0.0;
@@ -212,7 +213,7 @@ if (deep[0] > 0.0) {
             pushes[3 * second_of[k] + a] += far[k] * others[6 * k + a] + 0.0;
     for (int i = 0; i < 3 * n; ++i) ways[i] = roots[i] * (roots[i] * pushes[i] + 0.0) + 0.0;
 }
-// what walls and other solids hold, see `SupportedContacts`: G' J' J G of its rows
+// Bodies held by walls and other solids, see `SupportedContacts`: G' J' J G of their rows.
 for (int i = 0; i <= n; ++i) largest[i] = 0.0;
 for (int i = 0; i < n; ++i) {
     holding[i] = 0.0;

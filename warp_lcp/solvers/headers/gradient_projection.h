@@ -1,8 +1,8 @@
-// Kernels of methods of projected gradients: MPRGP, NNCG, subspace minimization, accelerated
+// Kernels of gradient projection methods: MPRGP, NNCG, subspace minimization, accelerated
 // gradients; and of staggering.
 
-// kernel mprgp.split: y = A x + b: the natural residual and its parts on held and free unknowns,
-// the free set, g = -y / size on it, and the chopped step; y is not stored
+// kernel mprgp.split: From y = A x + b, which is not stored: the natural residual and its parts on
+// held and free unknowns, the free set, g = -y / size on it, and the chopped step
 //   compute    float64
 //   stencil    D, W
 //   bounds
@@ -28,7 +28,7 @@ for (int begin = 0; begin < n; begin += M) {
                        held = in & ((x[k] <= l + reach(l)) | (x[k] >= u - reach(u)));
             const T r0 = natural_residual(v, f * (x[k] - l), f * (x[k] - u)), r = in ? r0 : (T)0,
                     h = held ? r : (T)0;
-            // division is what would take longest in double precision
+            // the division would take longest in float64
             const S w = (S)(-h * inverse) / (S)f;
             norm += r * r;
             chopped += h * h;
@@ -51,8 +51,8 @@ for (int begin = 0; begin < n; begin += M) {
     active += count;
 }
 
-// kernel mprgp.split_known: What `mprgp.split` finds, where y is known; the chopped step is not
-// rounded before it is summed
+// kernel mprgp.split_known: As mprgp.split, with y known; the chopped step is not rounded before it
+// is summed
 //   compute    float64
 //   stencil    D, W
 //   bounds
@@ -85,8 +85,9 @@ with_bounds([&](auto lower, auto upper) {
 SIMD for (int k = 0; k < n; ++k) energy +=
     unknown[k] == 1 ? (T)0.5 * x[k] * (known[k] + b[k]) : (T)0;
 
-// kernel mprgp.release: x moved along the chopped step, onto the bounds; what moves is free. The
-// right-hand side g loses `part` q and gains rows: e step = -y / size
+// kernel mprgp.release: Move x along the chopped step and clip it to the bounds; unknowns that move
+// are free. The right-hand side g loses `part` q and gains the rows of these unknowns: e step = -y
+// / size
 //   compute    float64
 //   stencil    D, W
 //   bounds
@@ -106,7 +107,7 @@ with_bounds([&](auto lower, auto upper) {
 });
 SIMD64 for (int k = 0; k < n; ++k) free[k] = free[k] | (unsigned char)(step[k] != 0);
 
-// kernel mprgp.gain: What a direction gains, g'p, and its curvature p'q, q = A p
+// kernel mprgp.gain: Products of a direction p with q = A p: the decrease g'p and the curvature p'q
 //   compute    float64
 //   reads      S along, q, g
 //   sums       gain, curvature
@@ -116,8 +117,8 @@ SIMD for (int k = 0; k < n; ++k) {
     curvature += (T)q[k] * (T)along[k];
 }
 
-// kernel nncg.taken: g holds x before a sweep; it becomes the gradient, what the sweep took away.
-// Its square
+// kernel nncg.taken: g holds x before a sweep; it becomes the gradient, x before - x. The sum of
+// its squares
 //   compute    float64
 //   reads      float64 x; int8 unknown
 //   writes     float64 g
@@ -129,8 +130,8 @@ SIMD for (int k = 0; k < n; ++k) {
     square += v * v;
 }
 
-// kernel nncg.carry_on: Restart where the gradient has grown, else x += beta p and p = beta p - g;
-// `squares`: of the gradient now, before (0: none)
+// kernel nncg.carry_on: Restart if the gradient has grown, else x += beta p and p = beta p - g.
+// `squares`: of the present and the previous gradient (0: none)
 //   compute    float64
 //   bounds
 //   reads      float64 g; int8 unknown
@@ -148,8 +149,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel subspace.between: Free is what lies between its bounds ([Book] eq. 2.92): how many
-// unknowns moved, and how many are held
+// kernel subspace.between: Free set: unknowns between their bounds ([Book] eq. 2.92). Counts:
+// unknowns that entered or left it, and held ones
 //   compute    float64
 //   bounds
 //   reads      float64 x; int8 unknown
@@ -165,8 +166,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel subspace.follow: x moved with bounds that have moved: what was at one stays at it, the
-// rest is projected
+// kernel subspace.follow: Move x with its bounds: an unknown that was at a bound stays at it, the
+// others are projected
 //   compute    float64
 //   bounds
 //   reads      float64 old_lower, old_upper
@@ -193,7 +194,7 @@ SIMD for (int k = 0; k < n; ++k) {
     size += one * d[k] * x[k] * x[k];
 }
 
-// kernel accelerated.extrapolate: x and y extrapolated to z and y_z, and the projected gradient
+// kernel accelerated.extrapolate: Extrapolate x and y to z and y_z, and take the projected gradient
 // step from there
 //   compute    float64
 //   bounds
@@ -212,8 +213,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel partition.select: x, less what is to be left out, on the members; elsewhere what was
-// there, or 0
+// kernel partition.select: x on the members, minus `less` if given; elsewhere the previous value,
+// or 0
 //   compute    float64
 //   reads      float64 x, less?; uint8 member
 //   writes     float64 target

@@ -1,7 +1,7 @@
 // Kernels of the interior-point method. UPPER: whether there are upper bounds.
 
-// snippet path_cells: A loop over the cells of the piece, written out: the compiler orders factors
-// by what it sees in a loop. Sums keep the order they have on grids and elsewhere.
+// snippet path_cells: Macro of a loop over the cells of the piece: the compiler orders factors by
+// what it sees in a loop. Sums keep the order that they have on grids and elsewhere.
 #define EACH_CELL(...)                      \
     if constexpr (FUSED) {                  \
         SIMD8 for (int i = 0; i < n; ++i) { \
@@ -13,8 +13,8 @@
         }                                   \
     }
 
-// kernel interior_point.inside: x moved at least width / d inside its bounds, w and v its
-// distances to them, and which unknowns move
+// kernel interior_point.inside: x at least width / d inside its bounds, its distances w and v to
+// them, and which unknowns move
 //   compute    float64
 //   bounds
 //   reads      int8 unknown; D d
@@ -46,8 +46,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel interior_point.multipliers: s and t at y's sides, at least `least`; the sum of w s and v
-// t, and how many there are
+// kernel interior_point.multipliers: Multipliers s and t from the signs of y, at least `least`; the
+// sum of w s and v t, and the number of multipliers
 //   compute    float64
 //   reads      float64 y, w, v
 //   writes     float64 s, t
@@ -71,8 +71,8 @@ SIMD for (int i = 0; i < n; ++i) {
     }
 }
 
-// kernel interior_point.condense: The system of the next step: D = s / w + t / v, without A's
-// diagonal unless FUSED, and the right-hand side
+// kernel interior_point.condense: System of the next step: D = s / w + t / v, with A's diagonal
+// only if FUSED, and the right-hand side
 //   compute    float64
 //   stencil    F, W
 //   bounds
@@ -117,8 +117,8 @@ if constexpr (FUSED) {
         D[i] = free[i] ? shift : 0.0; r[i] = free[i] ? scale * g : 0.0;)
 }
 
-// snippet path_direction: Of the step dx = scale e + joined dp, on top of the predictor's dp =
-// scale a: ds and dt. A product with an infinite w or v is 0. Macros, see snippet path_cells.
+// snippet path_direction: Directions ds and dt of the step dx = scale e + joined dp, on top of the
+// predictor's dp = scale a. A product with an infinite w or v is 0. Macros, see snippet path_cells.
 #define LOWER_DIRECTION                                                                       \
     const double dp = second * scale * (double)a[i], dx = scale * (double)e[i] + joined * dp; \
     const double iw = 1.0 / w[i], dsp = -s[i] - s[i] * iw * dp,                               \
@@ -128,7 +128,7 @@ if constexpr (FUSED) {
                  dt = (tau + dp * dtp) * iv - t[i] + t[i] * iv * dx;
 #include "path_cells"
 
-// kernel interior_point.move: x, w, v, s and t moved along the direction; the sum of w s and v t
+// kernel interior_point.move: Move x, w, v, s and t along the direction; the sum of w s and v t
 // there
 //   compute    float64
 //   bounds
@@ -158,8 +158,8 @@ with_bounds([&](auto lower, auto upper) {
     }
 });
 
-// kernel interior_point.ratios: The reciprocal of the longest step that keeps w, v, s and t
-// positive, and the sum of dw ds + dv dt
+// kernel interior_point.ratios: Reciprocal of the longest step that keeps w, v, s and t positive,
+// and the sum of dw ds + dv dt
 //   compute    float64
 //   reads      S a, e; float64 w, v, s, t
 //   whole      float64 longest
@@ -169,7 +169,7 @@ with_bounds([&](auto lower, auto upper) {
 #include "path_direction"
 long long most = 0;
 double products = 0;
-// bits of numbers above 0 are ordered as these are; compilers vectorize only this
+// The bits of positive numbers have the order of these numbers; compilers vectorize only this form.
 const auto note = [&](double m) {
     const double positive = m > 0 ? m : 0.0;
     const long long bits = __builtin_bit_cast(long long, positive);
@@ -202,8 +202,8 @@ if (FUSED && second == 0) {  // the predictor: ds = -s (1 + dx / w), dt = -t (1 
 }
 make_at_least(longest, __builtin_bit_cast(double, most));
 
-// kernel interior_point.center: The corrector's right-hand side, what the predictor has left of
-// its own and the terms of second order; a keeps the predictor's e
+// kernel interior_point.center: Right-hand side of the corrector: the remainder of the predictor's,
+// and the terms of second order; a keeps the predictor's e
 //   compute    float64
 //   reads      S e; float64 y?; uint8 free; S D?; float64 w, v, s, t
 //   writes     S a, r

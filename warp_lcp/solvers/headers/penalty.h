@@ -1,7 +1,7 @@
 // Kernels of the penalty method.
 
-// kernel penalty.move: z = x + size e; unknowns with springs stay at their bounds, from which the
-// step takes them by O(1/rho) only
+// kernel penalty.move: z = x + size e; unknowns with springs stay at their bounds, since the step
+// moves them by O(1/rho) only
 //   compute    float64
 //   reads      S e; int8 unknown, side
 //   writes     float64 x

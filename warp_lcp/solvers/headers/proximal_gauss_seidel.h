@@ -1,8 +1,8 @@
 // Kernels of proximal Gauss-Seidel sweeps over frictional contacts.
 
-// kernel warp_lcp.proximal_gauss_seidel.sweep: Contacts first <= s < last of one color, which
-// share no body that moves, w = J'r: r_n <- max(0, r_n - rho_n u_n), then r_t <- the nearest point
-// of |r_t| <= mu r_n to r_t - rho_t u_t; g = r before - r.
+// kernel warp_lcp.proximal_gauss_seidel.sweep: Sweep over the contacts first <= s < last of one
+// color, which share no moving body. With w = J'r: r_n <- max(0, r_n - rho_n u_n), then r_t <-
+// projection of r_t - rho_t u_t onto |r_t| <= mu r_n; g = r before - r.
 //   compute    float64
 //   whole      float64 J, b, e, laws, w, r, g, state
 //   box        int32 contact, one, other
@@ -50,8 +50,9 @@ for (int s = first; s < last; ++s) {
         for (int c = 0; c < Q; ++c) theirs[c] = v[Q + c];
 }
 
-// kernel warp_lcp.proximal_gauss_seidel.residual: |d (r - P(r - u^/d))|^2 with u^ = (u_n + mu
-// |u_t|, u_t), P the projection onto |r_t| <= mu r_n, d the mean of the contact's diagonal
+// kernel warp_lcp.proximal_gauss_seidel.residual: Squared residual |d (r - P(r - u^/d))|^2 with u^
+// = (u_n + mu |u_t|, u_t), P the projection onto |r_t| <= mu r_n, d the mean of the contact's
+// diagonal
 //   compute    float64
 //   whole      float64 J, b, e, laws, w, r
 //   box        int32 contact, one, other
@@ -102,7 +103,7 @@ for (int t = first; t < last; ++t) {
 }
 
 // kernel proximal_gauss_seidel.carry: r <- r + beta p, p <- beta p - g with beta = |g|^2 / |g
-// before|^2; p <- 0 where that is above 1
+// before|^2; p <- 0 if beta > 1
 //   compute    float64
 //   reads      float64 g
 //   writes     float64 r, way
@@ -117,8 +118,8 @@ SIMD8 for (int k = 0; k < n; ++k) {
     way[k] = beta * along - keep * back;
 }
 
-// kernel proximal_gauss_seidel.follow: the same of w = J'r, whose change by the last sweep is w -
-// before
+// kernel proximal_gauss_seidel.follow: As proximal_gauss_seidel.carry, for w = J'r; its change by
+// the last sweep is w - before
 //   compute    float64
 //   writes     float64 w, before, way
 //   whole      float64 state

@@ -1,7 +1,7 @@
-// Kernels of Gauss-Seidel sweeps, over lines of a grid too.
+// Kernels of Gauss-Seidel sweeps, also over lines of a grid.
 
-// kernel sweep.change: The largest |x - old|, old set to x; clang vectorizes no largest value of
-// doubles, as one may be NaN; out_of[0] is 0 before
+// kernel sweep.change: Largest |x - old|; then old = x. clang does not vectorize a maximum of
+// float64, since a value may be NaN. out_of[0] is 0 before
 //   compute    float64
 //   reads      float64 x
 //   writes     float64 old
@@ -14,10 +14,10 @@ for (int i = 0; i < n; ++i) {
 }
 make_at_least(out_of, s);
 
-// kernel grid_lines.solve: The line of n cells along an axis that begins at this one, if it has
-// the color: no two of that touch. Its active set is changed until none is wrong. s: 1 free, 0 at
-// l, 2 at u, 3 no unknown. Rows: -before z[k-st] + e z[k] - after z[k+st] + c = 0 where free, z =
-// bound elsewhere. The rows are of each line's first cell.
+// kernel grid_lines.solve: Solve the line of n cells along an axis that begins at this cell, if it
+// has the color; lines of one color do not touch. The active set is changed until it is consistent.
+// s: 1 free, 0 at l, 2 at u, 3 no unknown. Rows: -before z[k-st] + e z[k] - after z[k+st] + c = 0
+// where free, z = bound elsewhere. The launch is over the first cells of the lines.
 //   compute    float64
 //   stencil    D, W
 //   reads      float64 b, l, u

@@ -16,7 +16,8 @@ import numpy as np
 import warp as wp
 import warp_lcp as wl
 import warp_lcp.grid.surface_mesh_kernels
-result = wl.solve(wl.LCP(np.eye(3) * 2.0, np.array([-1.0, 1.0, -1.0]), lower=0.0), wl.ProjectedSOR(order="magnitude"))
+result = wl.solve(wl.LCP(np.eye(3) * 2.0, np.array([-1.0, 1.0, -1.0]), lower=0.0), \
+wl.ProjectedSOR(order="magnitude"))
 wp.load_module("warp_lcp.grid.surface_mesh", "cpu")
 print(result.status.name)
 """
