@@ -41,25 +41,26 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.memory import Scalar, scaled
 from warp_lcp.operators.grid_poisson import SOLID
 
-# cells; a particle that moves further in a step takes the careful way, which is always right
+# Cells. A particle that moves further in a step walks from cell to cell, which is always right.
 MAX_CLEARANCE = 6
 CENTERS = 3  # the `axis` of a field at cell centers
 
-# where particles are put: float32 positions in 10^3 cells round by less than the difference
+# Distance from walls [cells] at which particles are put. Float32 positions in 10^3 cells round by
+# less than its excess over MARGIN.
 AIM = 1.1 * MARGIN
 SLACK = 0.25  # cells by which the interpolated distance may exceed the way that is free
-# cells a particle goes near a wall before it looks again; shorter where it would come out on
-# another side
+# Stride [cells] of a particle near a wall before it evaluates the distance again; shorter where the
+# stride would end on another side of the wall.
 STRIDE = 0.5
 SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
 STRIDES = 64  # of a move: 32 cells along a wall
-# walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides
-# over
+# Cosine between the normals of two walls. Walls whose normals are further apart stop a particle
+# between them; along nearer ones it slides.
 CORNER = 0.5
 BEND = 0.9  # normals that are nearer than this are one wall
 LEG = 0.25  # cells of such a search in one direction
-# cells that a step may put a particle back: more than its stride and the diagonal of the walls'
-# rounding
+# Cells by which a step may put a particle back: more than its stride and the diagonal of the walls'
+# rounding.
 REACH = 1.0
 PUSH = 3.0  # cells that a wall may push a particle in a step
 
@@ -110,7 +111,10 @@ def carry_pass(axis: int) -> StencilKernel:
 def clearance_kernel(
     cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)
 ):
-    """Pass `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE; pass d marks those around cells of d - 1 with d.
+    """Mark cells with their distance to the nearest SOLID cell, one distance per launch.
+
+    The launch with `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE. The launch with
+    distance d marks the cells around those of d - 1 with d.
 
     In place without a race: a cell that another thread marks in this launch was more than d - 1 and
     becomes d, no source either way.

@@ -101,7 +101,7 @@ class LevelSet:
         self.compute(particles, window, capacity, base, fill=fill)
 
     def leave(self, window: Window) -> None:
-        """Clear what the last update has left in another window."""
+        """Clear what the last update has written to another window."""
         before, self._filled = self._filled, window.now
         if before is not None and (before.low, before.high) != (window.low, window.high):
             self._left.move_to(before)
@@ -119,15 +119,15 @@ class LevelSet:
         *,
         fill: Fill | None = None,
     ) -> None:
-        """Launch what `update` does after `leave`."""
+        """Launch the computation of `update` after `leave`."""
         grid = self.grid
         particle_density(grid, particles, window, self.particles_a_cell, self.density)
         if fill is not None:
             fill(window, self.density)
         density, smooth = self.density, None
         if self.smoothing:
-            # a pass looks one cell beyond the window, where an earlier update may have left
-            # something
+            # A pass reads one cell beyond the window, where an earlier update may have written
+            # values.
             clear(*self._scratch[:2])
             density = self._smoothed(window, self.density, self._scratch[0], self._scratch[1])
             if capacity is not None:

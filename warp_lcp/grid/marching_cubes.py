@@ -53,7 +53,10 @@ def _edge(a: int, b: int) -> Edge:
 
 
 def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Edge]]:
-    """Return what cuts off the runs of inside corners of a face, each from the edge before a run to the edge after it."""
+    """Return the segments that cut off the runs of inside corners of a face.
+
+    Each goes from the edge before a run to the edge after it.
+    """
     inside = [bool(case >> corner & 1) for corner in face]
     found = []
     for n in range(4):
@@ -66,7 +69,10 @@ def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Ed
 
 
 def _loops(case: int) -> list[Loop]:
-    """Return the closed lines in which the surface meets the cell's faces, counterclockwise seen from outside the material."""
+    """Return the closed lines in which the surface meets the cell's faces.
+
+    They are counterclockwise seen from outside the material.
+    """
     follows = dict(itertools.chain(*(_segments(case, face) for face in _faces())))
     loops = []
     while follows:
@@ -95,11 +101,14 @@ def _midpoint(edge: Edge) -> np.ndarray:
 
 @functools.cache
 def _cut(loop: Loop) -> Cut | None:
-    """Return the triangulation of a loop with the shortest diagonals, and their length; None: all have a diagonal within a face."""
+    """Return the triangulation of a loop with the shortest diagonals, and their length.
+
+    Returns None if every triangulation has a diagonal within a face.
+    """
     if len(loop) == 3:
         return 0.0, ((loop[0], loop[1], loop[2]),)
     best = None
-    # the corner opposite to the side between the loop's ends
+    # The corner opposite to the side between the loop's ends.
     for middle in range(1, len(loop) - 1):
         parts: list[Cut] = [(0.0, ((loop[0], loop[middle], loop[-1]),))]
         for part in (loop[: middle + 1], loop[middle:]):
@@ -154,7 +163,8 @@ def segment_table() -> np.ndarray:
     return table
 
 
-# of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
+# Fraction of an edge. A point keeps this distance from its ends, so that no triangle shrinks to
+# nothing.
 CLOSEST = 0.01
 
 
@@ -213,7 +223,7 @@ class MarchingCubes:
             grid.shape[1] - 1,
             grid.shape[2] - 1,
         )
-        # between the centers of cells and of their upper neighbors
+        # Cells between the centers of cells and of their upper neighbors.
         cells = Window(low, high, device)
         owned, made = self._counted(cells, phi)
         points = wp.empty(_total(owned[1]), dtype=wp.vec3, device=device)
@@ -237,8 +247,8 @@ class MarchingCubes:
         """Return the corners of the last surface that lie in given cells.
 
         Args:
-            phi: as `contour` was given it.
-            number: as it has left it.
+            phi: as passed to `contour`.
+            number: as `contour` has left it.
             cells: between the centers of these and of their upper neighbors.
         """
         return self._corners(cells, phi, number, self._counted(cells, phi)[1])
@@ -246,7 +256,10 @@ class MarchingCubes:
     def _counted(
         self, cells: Window, phi: wp.array
     ) -> tuple[tuple[wp.array, wp.array], tuple[wp.array, wp.array]]:
-        """Return how many points nodes of rows own, and triangles their cells have, each with sums up to and with each row."""
+        """Count the points that the nodes of each row own and the triangles of its cells.
+
+        Each count comes with its inclusive prefix sums over rows.
+        """
         owned, made = (wp.empty(cells.rows, dtype=wp.int32, device=cells.device) for _ in range(2))
         cells.run(
             COUNT,
@@ -267,7 +280,7 @@ class MarchingCubes:
     def _corners(
         self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]
     ) -> wp.array:
-        """Return the triangles of cells, whose rows have so many."""
+        """Return the triangles of cells, given the number of them in each row."""
         corners = wp.empty(
             (_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device
         )
@@ -286,5 +299,5 @@ class MarchingCubes:
 
 
 def _total(ends: wp.array) -> int:
-    """Return the last of sums."""
+    """Return the last of the prefix sums."""
     return int(ends[-1:].numpy()[0])

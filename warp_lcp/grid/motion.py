@@ -25,7 +25,8 @@ from warp_lcp.kernels.host_kernel import HostKernel
 Vector = Sequence[float] | np.ndarray
 
 ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
-# [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
+# [m/s] or [degrees/s], between keyframes of a smooth motion, whose cubics use squares and higher
+# powers.
 FASTEST = 1e18
 SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
 TOP_SPEED = HostKernel(
@@ -94,7 +95,10 @@ class Pose:
 
     @classmethod
     def _of(cls, rotation: np.ndarray, translation: np.ndarray) -> Pose:
-        """Return a pose that follows from others: to check it takes ten times as long as to find it."""
+        """Return a pose without checks, which take ten times as long as making it.
+
+        The values follow from poses that have been checked.
+        """
         made = object.__new__(cls)
         for name, array in (("rotation", rotation), ("translation", translation)):
             array.flags.writeable = False
@@ -336,7 +340,7 @@ class Motions:
         self._groups: list[tuple[Any, list[int], list[Any]]] = [
             (kind, numbers, [motions[n] for n in numbers]) for kind, numbers in of_kind.items()
         ]
-        # the kind of all
+        # The common type of all motions.
         self._alone: Any = next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None
         self._prescribed = [n for n, is_rigid in enumerate(rigid) if not is_rigid]
 
@@ -413,7 +417,7 @@ class Motions:
 
 
 def boxes_of(bounds: Sequence[np.ndarray | None]) -> np.ndarray:
-    """Return bounds, shape (2, 3) each, as one array; None: without limits."""
+    """Return boxes, shape (2, 3) each, as one array; None is an unbounded box."""
     return np.array([UNLIMITED if box is None else box for box in bounds]).reshape(-1, 2, 3)
 
 
@@ -443,7 +447,7 @@ class _Curve:
         self.times, self.values = times, values
         self._spline = None
         if smooth:
-            # by slopes of almost 0: weights of slopes that are 0
+            # Slopes of almost 0 give infinite weights; these belong to slopes that are 0.
             with np.errstate(over="ignore", divide="ignore"):
                 if (np.abs(np.diff(values, axis=0)) > FASTEST * np.diff(times)[:, None]).any():
                     raise ValueError("times are too close to each other for a smooth motion")
@@ -485,7 +489,7 @@ class _Turns:
                 "rotate must change by less than 180 degrees from one keyframe to the next, not "
                 f"from {first} to {last}; add one between"
             )
-        # lower case: about fixed axes
+        # Lower case: rotations about fixed axes.
         rotations = transform.Rotation.from_euler("xyz", angles, degrees=True)
         self._slerp = transform.Slerp(np.arange(len(times)), rotations)
         steps = (rotations[1:] * rotations[:-1].inv()).as_rotvec(degrees=True)
