@@ -24,17 +24,17 @@ from warp_lcp.kernels.vectors import Tally
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
-# of the storage when it is full: n appended particles are copied 2 n times at most, a third of it
-# lies idle at most
+# Growth of the storage when it is full: n appended particles are copied at most 2 n times, and at
+# most a third of the storage is unused.
 GROWTH = 1.5
-# of the keys that are sorted: with more there is more to add up between two passes
+# Pieces of the keys in a sort. With more, the sums between two passes take longer.
 SORT_PIECES = 32
 # Places of particles in the order of all ranks' particles, see `warp_lcp.distributed.particles`.
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 NEW = 1 << 62  # places from which on particles have come since the last sort
 SORTED, UNSORTED = 0, 1  # steps in which `arrange` sorts, and in which it need not
-# steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL
-# 2, a sort costs 25 ns
+# Steps between sorts if nothing needs the order. At CFL 2 the transfers get no slower within 16
+# steps; a sort costs 25 ns a particle.
 SORT_EVERY = 8
 
 
@@ -94,8 +94,8 @@ class Column:
     Attributes:
         store: wp.vec3, shape (capacity,).
         count: vectors in use.
-        slot: where recorded launches find them; None: not yet known.
-        listed: their number, for recorded launches.
+        slot: address for recorded launches; None until it is known.
+        listed: number of vectors, for recorded launches.
     """
 
     slot: Slot | None = None
@@ -121,22 +121,22 @@ class Column:
         return self._view
 
     def use(self, count: int) -> None:
-        """Have so many vectors in use."""
+        """Set the number of vectors in use."""
         if count != self.count:
             self.count, self._view = count, None
 
     def publish(self, memory: ListMemory, name: str) -> None:
-        """Have recorded launches find the vectors in use by a name."""
+        """Publish the vectors in use to recorded launches, by a name."""
         self.slot, self.listed = memory.slot(name), memory
         self.slot.point_to_first(self.count, self.store)
         if self._view is not None:
             self._view.slot, self._view.listed = self.slot, memory
 
     def set_from(self, first: int, values: np.ndarray | float) -> None:
-        """Set the vectors in use from a number on.
+        """Set the vectors in use from an index on.
 
         Args:
-            first: that number.
+            first: that index.
             values: shape (count - first, 3), or one number for all.
         """
         if self._host is not None:
@@ -155,7 +155,7 @@ class Particles:
         position: [m], shape (n, 3); z = 0 in 2-D.
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
-        kept: a number of each particle that it takes along, shape (n,); None: they have none.
+        kept: a number that each particle carries, shape (n,); None if they carry none.
         indexed: sort every step and know where each cell's particles begin, for transfers that
             gather; those that need it on CUDA are the default there.
 
@@ -206,7 +206,7 @@ class Particles:
         )
         self._removal = LaunchGraph(device, self._launch_removal)
         self._removed = DeviceScalar(device, 2, wp.int32)
-        # of the memory and the count that they are for
+        # Arrays and number of particles for which the launches were recorded.
         self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None
         self._stays: wp.array | None = None  # beside them
         self._total_rows = rows_memory(device, LIST_ROOM)
@@ -344,7 +344,10 @@ class Particles:
         self._removal.run(marks, self._stays if mine else self._order[: self.count])
 
     def _launch_removal(self, marks: wp.array, stay: wp.array) -> None:
-        """Launch the removal; on a GPU only the count of those that go and, in `stay`, 1 for those that stay."""
+        """Launch the removal.
+
+        On a GPU only count the removed particles, and write to `stay` 1 for those that stay.
+        """
         device = self.grid.device
         if device.is_cuda:
             clear(self._removed.array)
@@ -426,12 +429,12 @@ class Particles:
             view.assign(arrays[name])
 
     def set_runs(self, runs: wp.array) -> None:
-        """Have sums take the particles in the order of `runs`."""
+        """Let sums take the particles in the order of `runs`."""
         self.runs = runs
         self._memory.take(self.count, {"runs": runs})
 
     def resize(self, count: int) -> None:
-        """Have this many particles; those beyond the particles there were hold anything."""
+        """Set the number of particles; new ones have undefined values."""
         before, self.count, self._known, self._totals_launched = self.count, count, None, False
         if count > self._capacity:
             self._grow(before)
@@ -440,7 +443,7 @@ class Particles:
         self._publish()
 
     def _publish(self) -> None:
-        """Tell recorded launches how many particles there are, and where."""
+        """Publish the number and the arrays of the particles to recorded launches."""
         count, memory = self.count, self._memory
         if count != memory.count.value and self._tally is not None:
             self._total_rows.take(self._rows_of_totals().summed)
@@ -455,7 +458,7 @@ class Particles:
         memory.take(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
-        """Make room for `count` particles and more, and keep those there were `before`."""
+        """Enlarge the storage to at least `count` particles; keep the first `before`."""
         device = self.grid.device
         self._capacity = max(int(self.exchange.room * self.count), int(GROWTH * self._capacity), 1)
         for name in self._names:
@@ -548,11 +551,13 @@ class Particles:
         return min(-(-self.count // step) * step, self._capacity)
 
     def _launch_sort(self, keys: int = 0) -> None:
-        """Launch the numbering, the sort of the numbers, and the move of each column to where the one before it was.
+        """Launch the sort: number the particles, sort the numbers, reorder each column.
+
+        Each column moves to the memory of the column before it.
 
         Args:
-            keys: how many a GPU sorts: those behind the particles' have the largest number, and
-                stay behind them.
+            keys: number of keys that a GPU sorts; those after the particles' have the largest
+                number, and stay at the end.
         """
         device, size, count = self.grid.device, self.grid.size, self._memory.count
         bits = size.bit_length()
@@ -618,13 +623,13 @@ class Particles:
         return found
 
     def _rows_of_totals(self) -> Rows:
-        """Return how the particles are shared out for sums over them."""
+        """Return the division of the particles into rows for sums."""
         return Rows.entries(
             self.count, self.grid.device, _chunk_of_totals(self.count, self.grid.device)
         )
 
     def _launch_totals(self) -> None:
-        """Launch the sums over the particles, and those of the threads' sums."""
+        """Launch the sums over the particles, and over the threads' partial sums."""
         rows = replace(self._rows_of_totals(), memory=self._total_rows)
         if self._tally is not None:
             self._tally.take(
@@ -648,7 +653,7 @@ class Particles:
         ).launch()
 
     def launch_totals(self) -> None:
-        """Launch the next `totals` on a GPU, so that others are read with it.
+        """Launch the next `totals` on a GPU, so that they share a readback with others.
 
         They are launched again if particles come or go before.
         """
@@ -695,7 +700,7 @@ class Particles:
 
 
 def _chunk_of_totals(count: int, device: wp.Device) -> int:
-    """Return how many particles a thread adds up."""
+    """Return how many particles a thread sums up."""
     return max(
         CUDA_CHUNK if device.is_cuda else CHUNK,
         -(-count // (CUDA_THREADS if device.is_cuda else THREADS)),
@@ -703,12 +708,12 @@ def _chunk_of_totals(count: int, device: wp.Device) -> int:
 
 
 def _piece_of_sort(count: int) -> int:
-    """Return how many keys are a piece of those that are sorted."""
+    """Return how many keys form one piece of a sort."""
     return max(CPU_GRAIN, -(-count // SORT_PIECES))
 
 
 def _rows_of_sort(count: int, device: wp.Device) -> Rows:
-    """Return the pieces in which keys are sorted."""
+    """Return the rows of a sort: one piece of keys a task."""
     return Rows.entries(count, device, _piece_of_sort(count), weight=4)
 
 
@@ -718,9 +723,9 @@ def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
 
 
 def digits_of(bits: int) -> tuple[int, int]:
-    """Return the rounds of the sort of keys of some bits, and the bits of a round."""
-    # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1
-    # cache
+    """Return the number of rounds of a radix sort, and the bits of a round."""
+    # An even number of rounds, so that the last one ends in the keys' own array. 2048 digits of a
+    # round stay in the L1 cache.
     rounds = 2 * -(-bits // 22)
     return rounds, -(-bits // rounds)
 
@@ -803,7 +808,7 @@ def lattice(
     moved = np.empty((len(z), len(y), len(x), dimension))
     for number, layer in enumerate(z):
         drawn = np.random.PCG64(random_seed)
-        # what the points before have drawn
+        # Skip the random numbers of the points before.
         drawn.advance(int((layer * whole[1] + low[1]) * whole[0]) * dimension)
         rows = np.random.Generator(drawn).random((len(y), whole[0], dimension))
         moved[number] = rows[:, low[0] : high[0]]

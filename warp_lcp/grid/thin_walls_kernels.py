@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""Exact geometry of thin solids: where a straight path meets them, and kernels that stop particles there.
+"""Exact geometry of thin solids: path intersections, and kernels that stop particles.
 
 All of it is float64: a particle keeps a distance of a thousandth of a cell from a wall, and that
-must survive the way from the domain's coordinates into those of a shape and back.
+must survive the transformation from the domain's coordinates into those of a shape and back.
 """
 
 import warp as wp
@@ -29,7 +29,10 @@ _TINY = wp.constant(wp.float64(1.0e-300))
 
 @wp.struct
 class ThinShape:
-    """A shape in the frame of its group: q = turn (p - shift) are its own coordinates [m] of a point p."""
+    """Shape in the frame of its group.
+
+    q = turn (p - shift) are the shape's own coordinates [m] of a point p of the group.
+    """
 
     kind: int
     solid: int  # its solid's number
@@ -44,7 +47,10 @@ class ThinShape:
 
 @wp.struct
 class ThinGroup:
-    """Shapes with one motion: x = turn p + shift of a point p of the group, before and after a step."""
+    """Shapes with one motion.
+
+    A point p of the group is at x = turn p + shift, before and after a step.
+    """
 
     first: int  # of its shapes
     end: int
@@ -103,7 +109,7 @@ def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
     t = hit_ball(a, d, radius)
     t = wp.min(t, hit_ball(a - axis, d, radius))
     size = wp.dot(axis, axis)
-    # the cylinder between: the parts of path and start across the axis
+    # The cylinder between the ends: the components of path and start across the axis.
     across = d - (wp.dot(d, axis) / size) * axis
     start = a - (wp.dot(a, axis) / size) * axis
     s = hit_ball(start, across, radius)
@@ -135,7 +141,10 @@ def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
 
 @wp.func
 def hit(shape: ThinShape, a: wp.vec3d, b: wp.vec3d):
-    """Return where the path from a to b enters a shape, from 0 to 1, `MISS` if it does not, and the normal there; of a group's frame."""
+    """Return where the path from a to b enters a shape, and the normal there.
+
+    The place is from 0 to 1, `MISS` if the path does not enter. Points are in the group's frame.
+    """
     t = _MISS
     n = wp.vec3d()
     near = bool(True)
@@ -162,9 +171,9 @@ def hit(shape: ThinShape, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
-    """Return the distance of a point [m], and the direction away from the shape, if it is less than `reach`; else `reach`.
+    """Return the distance [m] of a point from a shape, and the direction away from it.
 
-    Of a mesh, which has no inside here, the distance is that to its surface.
+    The distance is at most `reach`. A mesh has no inside here: its distance is that to its surface.
     """
     n = wp.vec3d()
     distance = reach
@@ -218,7 +227,7 @@ def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
 
 @wp.func
 def in_plane(n: wp.vec3d, planes: int):
-    """Return a direction within the plane of a 2-D scene; 0 if it has none there."""
+    """Project a normal onto the plane of a 2-D scene, at unit length; 0 if it has no part."""
     result = n
     if planes == 1:
         result = wp.normalize(wp.vec3d(n[0], n[1], _ZERO))
@@ -227,7 +236,10 @@ def in_plane(n: wp.vec3d, planes: int):
 
 @wp.func
 def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, but: int):
-    """Return where the path from a to b first enters one of some shapes, but for one of them, the normal there and the shape."""
+    """Return where the path from a to b first enters one of some shapes.
+
+    Returns the place, the normal there and the shape. The shape `but` is left out.
+    """
     t = _MISS
     n = wp.vec3d()
     which = int(-1)
@@ -245,7 +257,10 @@ def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, bu
 def clear_of(
     shapes: SHAPES, first: int, end: int, p: wp.vec3d, margin: wp.float64, planes: int, inside: bool
 ):
-    """Return a point moved off the shapes that it is nearer to than `margin`, or only off those that it lies in; and whether it was."""
+    """Move a point off the shapes that are nearer than `margin`.
+
+    With `inside`, only off those that it lies in. Returns the point, and whether it has moved.
+    """
     x = p
     moved = bool(False)
     for s in range(first, end):
@@ -280,13 +295,13 @@ def free_way(
     margin: wp.float64,
     planes: int,
 ):
-    """Return where a particle ends that goes from `start` towards `aim` among shapes that rest, and whether one was in its way.
+    """Return the end of a path from `start` towards `aim` among shapes at rest.
 
-    It slides on along the surface of what it meets, at a distance of `margin` [m]. Each piece of
-    its way is looked at; where no more can be done it stops at the end of the last one that was
-    free.
+    Also returns whether a shape was in its way. The particle slides along the surface of each shape
+    that it meets, at a distance of `margin` [m]. Each piece of its path is checked. If no further
+    piece is free, it stops at the end of the last free one.
     """
-    # loops whose counts are variables are not unrolled: a twelfth of the code
+    # Loops with variable counts are not unrolled: a twelfth of the code.
     pushes = int(PUSHES)
     slides = int(SLIDES)
     halvings = int(HALVINGS)
@@ -313,8 +328,8 @@ def free_way(
                     or not has_room(shapes, first, end, p, room)
                     or wp.dot(n, n) < wp.float64(0.5)
                 ):
-                    # the corner of two walls: as far as a place that rounding does not take into
-                    # one of them
+                    # Corner of two walls: go as far as rounding does not take the place into one of
+                    # the walls.
                     s = wp.max(t - margin / wp.max(wp.length(way), _TINY), _ZERO)
                     for half in range(halvings):
                         if not has_room(shapes, first, end, x + s * way, room):
@@ -337,7 +352,7 @@ def free_way(
 
 @wp.func
 def into_group(turn: wp.mat33d, shift: wp.vec3d, x: wp.vec3d):
-    """Return the place of a point in the frame of a group."""
+    """Return the position of a point in the frame of a group."""
     return wp.transpose(turn) * (x - shift)
 
 
@@ -354,12 +369,12 @@ def stop_kernel(
     low: wp.vec3d,
     high: wp.vec3d,
 ):
-    """Let no particle on its way from `start` to `position` pass a thin solid.
+    """Stop particles at thin solids on their way from `start` to `position`.
 
-    Within the frame of a group, from where its solids were to where they are, a straight way is
-    looked at. It is exact for translations; that of a particle beside a solid that turns differs by
-    its bend from the true one, and its ends do not. With `still` the solids have not moved. `low`
-    and `high` are corners of what particles may not leave.
+    A straight path is traced in the frame of each group, from the old place of its solids to the
+    new one. This is exact for translations. Beside a solid that turns, the path differs from the
+    true one by its bend, while its ends are exact. With `still` the solids have not moved. `low`
+    and `high` are the corners of the box that particles may not leave.
     """
     x = wp.vec3d(start[i])
     y = wp.vec3d(position[i])
@@ -404,7 +419,10 @@ def room_kernel(
     reach: wp.float64,
     room: wp.array(dtype=wp.float64),
 ):
-    """Measure the distance of points from the nearest thin solid [m], at most `reach`; from a mesh's surface on either side."""
+    """Measure the distance of points from the nearest thin solid [m].
+
+    It is at most `reach`; from a mesh it is measured to the surface on either side.
+    """
     x = wp.vec3d(points[i])
     least = reach
     for g in range(groups.shape[0]):

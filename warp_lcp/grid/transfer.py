@@ -32,8 +32,8 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.memory import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # below it a face counts as untouched
-# A particle that lies exactly on the boundary between cells would leave one face of its own cell
-# without weight, hence without gravity.
+# A particle exactly on the boundary between cells would leave one face of its own cell without
+# weight, hence without gravity.
 EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}
 KERNELS = KernelFile(Path(__file__).parent / "headers/transfer.h")
 

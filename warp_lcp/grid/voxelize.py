@@ -22,8 +22,8 @@ OPEN = -1
 DOMAIN_WALL = 0
 STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
 THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
-# of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be
-# missing
+# Share of a mesh's surface. More area that is inside out is no blemish: its inside would be
+# missing.
 INVERTED_SHARE = 0.01
 
 
@@ -282,7 +282,10 @@ def repair_notes(geometry: Geometry, name: str) -> list[str]:
 
 
 def _thin_notes(solid: PlacedSolid, grid: StaggeredGrid) -> list[str]:
-    """Return a warning when a mesh has walls that the cells may miss, so that what it is among may pass."""
+    """Return a warning if a mesh has walls that the cells may miss.
+
+    Material may then pass through them.
+    """
     geometry = solid.geometry
     if not isinstance(geometry, TriangleMesh) or geometry.invert:
         return []
