@@ -1,6 +1,6 @@
 """Density correction: LCP for a displacement that removes overfull cells.
 
-Also a monitor of the density ([Book] 1.3.3).
+The module also has a monitor of the density ([Book] 1.3.3).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
-    # that displacements are divided by: thin spray need not carry off what a full cell has too much
+    # Least density by which displacements are divided: thin spray need not take up the excess of a
+    # full cell.
     "LEAST_DENSITY": 0.5,
     "LEAST_CAPACITY": 0.1,  # that densities are divided by there
     "HALF": 0.5,  # of what a cell holds: with less it is at the surface
@@ -44,7 +45,7 @@ CROWD = KERNELS["warp_lcp.material.crowding.crowd"]
 
 @functools.cache
 def displacement_pass(cut: bool) -> StencilKernel:
-    """Return the kernel of the displacement; `cut`: faces have open fractions."""
+    """Return the kernel of the displacement; with `cut`, faces have open fractions."""
     name = "warp_lcp.material.density_correction"
     return KERNELS.kernel(f"{name}.displace", module=name + "_cut" * cut, constants={"CUT": cut})
 
@@ -59,8 +60,8 @@ def add_kernel(
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
 EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
-# of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells
-# deep
+# Fraction of the diagonal. It gives closed pockets a solution, and leaves 0.5 % of the excess 45
+# cells deep.
 SHIFT = 1e-5
 
 
@@ -95,9 +96,9 @@ class DensityMonitor:
         """Measure the density; `found` then returns the result.
 
         Args:
-            density: of the particles, in units of that at rest, float32; None: it is found here.
-            particles: the material; where the density is found here they must not have moved since
-                they were sorted.
+            density: of the particles, in units of that at rest, float32; computed here if None.
+            particles: the material; where the density is computed here they must not have moved
+                since they were sorted.
             window: cells that hold all particles, with two to spare on each side.
         """
         if density is None:
@@ -120,7 +121,7 @@ class DensityMonitor:
         The density at rest is 1.
         """
         if self._known is None:
-            # what is beyond what cells may hold, what there is, the largest density
+            # Excess over the limits, total amount, largest density.
             everyone = self.grid.part.ranks.gather(self._crowd.read())
             above, held = everyone[:, :2].sum(axis=0).tolist()
             self._known = above / held if held > 0.0 else 0.0, float(everyone[:, 2].max())
@@ -134,7 +135,7 @@ def density_of_all(
     particles_a_cell: int,
     density: wp.array,
 ) -> None:
-    """Find the density of all processes' particles; collective.
+    """Compute the density of all processes' particles; collective.
 
     Arguments as of `particle_density`.
     """
@@ -153,8 +154,8 @@ class DensityFields:
         b: right-hand side (written).
         x: solution of the last problem, the start of this one.
         density: of the material, in units of that at rest, float32.
-        capacity: open share of each cell's kernel, float32; None: 1.
-        inside: cells deep inside, which may lack material; None: none.
+        capacity: open fraction of each cell's kernel, float32; None for 1.
+        inside: cells deep inside, which may lack material; None if there are none.
     """
 
     kind: wp.array
@@ -170,7 +171,7 @@ class Correction:
     """Result of a density correction.
 
     Attributes:
-        result: of the solve; None: no cell was overfull, and nothing has moved.
+        result: of the solve; None if no cell was overfull and nothing has moved.
         over_full: cells above the largest density, and cells deep inside below the least.
         max_density: before the correction, in units of the density at rest: 1 and the most by which
             a cell exceeds what fits beside walls.
@@ -274,10 +275,10 @@ class DensityCorrection:
             if boundary.open or even
             else None
         )
-        # built when there is material: an empty problem is refused
+        # Made when there is material, since an empty problem is refused.
         self._problem: wl.LCP | None = None
         self._solved = grid.part.owned  # the cells of the problem
-        # fields of a rank's part, and those of its problem
+        # Fields of a rank's part, and those of its problem.
         self._copied: list[tuple[wp.array, wp.array]] = []
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
@@ -306,12 +307,13 @@ class DensityCorrection:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
             fill: adds the density of liquid without particles in a window.
-            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`;
-                None: they do not.
-            share: of the displacement that particles go.
+            contact: uint8, RELEASED where walls separate, see `warp_lcp.material.boundary_kernels`;
+                None if no wall separates.
+            share: fraction of the displacement by which particles move.
         """
         if particles.offsets is not None:
-            # they have moved: gathering needs the order, and gives the same bits on every run
+            # The particles have moved. Gathering needs the order, and gives the same bits on every
+            # run.
             particles.sort()
         particles.look_around()
         variant = window.near is None, contact is None, particles.runs is None
@@ -326,7 +328,7 @@ class DensityCorrection:
             self.x.zero_()
             return Correction(None, 0, most)
         result = self._solve(over_full) if result is None else result
-        # a closed room is too full: there is no way out
+        # A closed room is too full: the excess has no way out.
         if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):
             self.x.zero_()
             return Correction(result, over_full, most)
@@ -368,13 +370,13 @@ class DensityCorrection:
         self.boundary.displace(self.displacement, particles.position)
 
     def _take(self, x: wp.array) -> None:
-        """Take the solution of the problem."""
+        """Store the solution of the problem."""
         part = self.grid.part
         part.store(x, self.x, self._guess)
         part.fill(self._kind)
 
     def _prepare(self, contact: wp.array | None) -> None:
-        """Set up the problem, and count over-full cells."""
+        """Set up the problem, and count overfull cells."""
         b, most = self.boundary, self.max_density
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
         self._over.take(
@@ -393,7 +395,10 @@ class DensityCorrection:
                 )
 
     def _found(self) -> tuple[int, float]:
-        """Return how many cells are over-full or lack material deep inside, and the largest density; collective."""
+        """Count the cells that are overfull or lack material deep inside; collective.
+
+        Returns their number, and the largest density.
+        """
         lacking = 0.0
         if self._inside is not None:
             (lacking,) = self._lacking.read()
@@ -412,7 +417,7 @@ class DensityCorrection:
         return self._solved_to(criteria)
 
     def _begins_ahead(self) -> bool:
-        """Return whether a GPU begins the solve before the host knows of over-full cells."""
+        """Return whether a GPU starts the solve before the host knows of overfull cells."""
         return (
             self._problem is not None
             and not self.grid.part.shared
@@ -420,7 +425,10 @@ class DensityCorrection:
         )
 
     def _solve_counting(self) -> wl.SolveResult:
-        """Solve while the cells are counted: one readback has the count, too; without such cells nothing is solved."""
+        """Solve while the cells are counted, with one readback for both.
+
+        If the count is 0, nothing is solved.
+        """
         self._take_cells()
         counted = self._over.on_device() if self._inside is None else self._counted
         criteria = MeanCriteria(
@@ -439,7 +447,7 @@ class DensityCorrection:
         )
 
     def _take_cells(self) -> None:
-        """Give the problem the cells, and where solids meet them."""
+        """Copy the cells, and solids beside them, to the problem."""
         self._copying.run()
         if self.boundary.moves:
             self._copying_faces.run()
@@ -469,12 +477,12 @@ class DensityCorrection:
         return wl.LCP(self._operator, b, 0.0 if lower is None else lower, np.inf)
 
     def _copy_cells(self) -> None:
-        """Give a rank's problem what the fields of its part hold."""
+        """Copy the fields of a rank's part to its problem."""
         for field, box in self._copied:
             self.grid.part.copy_to_box(field, box)
 
     def _copy_faces(self) -> None:
-        """Give it the faces' open fractions."""
+        """Copy the faces' open fractions to a rank's problem."""
         for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
 

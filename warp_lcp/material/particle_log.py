@@ -1,4 +1,4 @@
-"""What a run's log says of a material that particles carry."""
+"""Log columns of a particle simulation."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def columns(own: Sequence[str], told: Mapping[str, bool], bodies: Sequence[str])
 
 
 class Moved(NamedTuple):
-    """A step that has been taken.
+    """Data of a step that has been taken.
 
     Attributes:
         particle_mass: [kg]; 2-D: [kg/m].
@@ -76,7 +76,7 @@ class Moved(NamedTuple):
 
 
 def solve_row(result: wl.SolveResult) -> Row:
-    """Return what the log says of a solve."""
+    """Return the log entries of a solve."""
     return {
         "solve_status": result.status.name,
         "solve_iterations": result.iterations,
@@ -86,7 +86,10 @@ def solve_row(result: wl.SolveResult) -> Row:
 
 
 def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: float) -> Row:
-    """Return what the log says of the particles at the end of a step, in cells of `spacing` [m]."""
+    """Return the log entries of the particles at the end of a step.
+
+    Cells have the width `spacing` [m].
+    """
     mass = totals.count * moved.particle_mass
     return {
         "particles": particles,
@@ -100,10 +103,11 @@ def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: fl
 
 
 def _kinetic_energy(totals: ParticleTotals, moved: Moved) -> float:
-    """Return the energy of motion at the end of a step over mass [m^2/s^2]; the particles' velocities are those of its middle.
+    """Return the kinetic energy per mass at the end of a step [m^2/s^2].
 
-    For half a step more gravity works on what moves, V, and by what it has changed V in this one:
-    nothing where solids bear it.
+    The particles' velocities are those of the middle of the step. Gravity acts for half a step more
+    on the mean velocity V, in proportion to the part of gravity that has changed V in this step:
+    not at all where solids carry the material.
     """
     g, dt = moved.gravity, moved.dt
     gained = float(g @ (totals.velocity - moved.velocity_before)) / moved.kick_dt

@@ -1,4 +1,4 @@
-"""A material on a staggered grid, carried by particles: what all such simulations do besides their own solve."""
+"""Particle simulations: the parts of a step besides the material's own solve."""
 
 from __future__ import annotations
 
@@ -35,13 +35,15 @@ from warp_lcp.material.wall import Join
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
-# relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and
-# bodies creep
+# Largest relative residual of bodies' contacts. Above it gravity's velocity of a step is wrong by a
+# hundredth, and bodies creep.
 CONTACTS_MISSED = 1e-2
 
 
 class ParticleSimulation(ParticleCheckpoints):
-    """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
+    """Simulation of particles on a staggered grid, without the material's own solve.
+
+    A subclass calls the parts of a step in its own `step`.
 
     Particles have the velocities of the middle of the last step, the grid in a step those of its
     middle: forces act for `kick_dt`, half of the last step and half of this one, and then particles
@@ -153,12 +155,12 @@ class ParticleSimulation(ParticleCheckpoints):
         particles.exchange.count()
 
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
-        """Allocate what belongs to a grid. Subclasses add theirs."""
+        """Allocate the parts that belong to a grid; subclasses add theirs."""
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
         self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
-        # [m]; a tent at the very end would reach beyond what is stored
+        # [m]. A tent at the very end would reach beyond the stored cells.
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
         self.sides, at_once = parts.boundary.sides, grid.part.at_once
@@ -166,14 +168,14 @@ class ParticleSimulation(ParticleCheckpoints):
             grid.device, self._launch_particles_to_grid, at_once=at_once
         )
         self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
-        # beside those FLIP copies velocities, as many as there are
+        # Near barriers FLIP copies velocities; a recorded launch would copy a fixed number.
         at_once |= grid.barriers is not None
         self._transfer_to_particles = LaunchGraph(
             grid.device, self._launch_grid_to_particles, at_once=at_once
         )
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        # without an interior, and ends where the grid does
+        # Active rows need a grid without ranks, without an interior and without periodic axes.
         if not (grid.part.shared or self.band is not None or scene.endless):
             self.vicinity = ActiveRows(grid, self.vicinity)
         self.flights = make_flights(scene, grid, self.boundary)
@@ -186,11 +188,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """Return the names of the log's columns that the material's own models fill."""
 
     def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
-        """Go on on another grid of the same domain.
+        """Continue on another grid of the same domain.
 
         Args:
             grid: the other one.
-            state: what to go on from; None: as it is.
+            state: the state to continue from; None for the current one.
         """
         before, kept = self.grid, self._fields() if state is None else state
         self._lay_anew(grid)
@@ -199,7 +201,7 @@ class ParticleSimulation(ParticleCheckpoints):
             self._take_fields(carry_over(kept, before, grid, self._fields()))
 
     def _lay_anew(self, grid: StaggeredGrid) -> None:
-        """Allocate another grid, whose fields then hold nothing yet."""
+        """Allocate another grid; its fields have no values yet."""
         assert self._make_parts is not None, "this grid is kept"
         for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
             delattr(self, name)
@@ -214,7 +216,10 @@ class ParticleSimulation(ParticleCheckpoints):
         self.boundary.place(self.time)
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
-        """Go on on another grid if the material leaves this one in a step or is much smaller, or in other boxes of ranks."""
+        """Change the grid or the boxes of ranks, if needed.
+
+        The grid changes if the material leaves it in a step, or if it is much too large.
+        """
         if self.grid.part.should_rebalance(self.step_count):
             self.rebalance()
         if self._coverage is None or (
@@ -224,7 +229,7 @@ class ParticleSimulation(ParticleCheckpoints):
         ):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
-        # `window`, a cell off the grid's end, where the step brings the material
+        # `window`, one cell off the grid's end, and the cells that the step adds.
         grow = self.reach + 3 + way
         low, high = cells_between(totals.low, totals.high, self.grid.spacing, grow)
         if self.scene.domain.boundless and (trouble := self._coverage.beyond(high)):
@@ -238,7 +243,10 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.regrid(grid)
 
     def stable_dt(self) -> float:
-        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
+        """Return the stable time step CFL dx / (v_max + sqrt(CFL g dx)) [s].
+
+        v_max is the largest speed of the material, and of solids and sources in the near future.
+        """
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = (
@@ -251,14 +259,17 @@ class ParticleSimulation(ParticleCheckpoints):
             for part in (self.boundary, self.sources)
             if part is not None
         ]
-        # gravity's own speed counts, so that a material at rest does not take off
+        # Gravity's own speed counts, so that the time step of a material at rest is bounded.
         speed = max(totals.max_speed, *driven) + math.sqrt(
             cfl * math.sqrt(self.gravity @ self.gravity) * dx
         )
         return cfl * dx / speed if speed > 0.0 else math.inf
 
     def events(self, until: float) -> list[float]:
-        """Return the times [s] later than now, up to `until`, at which a source or drain starts or stops or a solid's velocity jumps."""
+        """Return the times [s] of events later than now, up to `until`.
+
+        Events are starts and stops of sources and drains, and jumps of a solid's velocity.
+        """
         timed: list[Source | Drain] = [
             *(self.sources.sources if self.sources else ()),
             *(self.outlets.drains if self.outlets else ()),
@@ -270,7 +281,10 @@ class ParticleSimulation(ParticleCheckpoints):
         return [time for time in times if self.time < time <= until]
 
     def rebalance(self) -> None:
-        """Go on in the boxes of ranks in which the busiest has least to do, if they are much better than those there are; collective."""
+        """Continue in better boxes of ranks, if there are any; collective.
+
+        The busiest rank then has least work; the gain must be large enough.
+        """
         with self.watch.stage("repartitioning", self.particles.position):
             part = self.grid.part.rebalance(
                 self.particles, self.scene.particles.per_axis**self.grid.dimension
@@ -280,7 +294,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
-        """Return a context for a step: if it fails, bodies are where they were, and particles of other ranks are gone."""
+        """Return a context for a step that restores bodies and removes ghosts on failure."""
         try:
             yield
         except (StepFailed, SimulationFailed):
@@ -290,7 +304,7 @@ class ParticleSimulation(ParticleCheckpoints):
             raise
 
     def begin_step(self, dt: float) -> ParticleTotals:
-        """Check time step and particles, bring the particles into order, and return sums over them.
+        """Check time step and particles, arrange the particles, and return sums over them.
 
         Args:
             dt: time step [s].
@@ -321,7 +335,9 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals
 
     def solve_contacts(self) -> None:
-        """Solve for the rigid bodies' contacts with what the material has given them, before anything moves.
+        """Solve the rigid bodies' contacts with the impulses of the material.
+
+        Nothing has moved yet.
 
         Raises:
             StepFailed: they are far from solved; the bodies are where they were before the step.
@@ -342,12 +358,12 @@ class ParticleSimulation(ParticleCheckpoints):
             )
 
     def window(self, totals: ParticleTotals) -> Window:
-        """Return the cells that the particles can touch in a step: the step's `active` window, which is moved there."""
+        """Return the cells that particles can touch in a step, as the `active` window."""
         self.active.move_to(self._reached(totals))
         return self.active
 
     def _reached(self, totals: ParticleTotals) -> Window:
-        """Return the cells that the particles can touch in a step."""
+        """Return the cells that particles can touch in a step."""
         low, high = (self.particles.cell_of(corner) for corner in (totals.low, totals.high))
         box = self.grid.window(low, high, grow=self.reach + 2, shift=1)
         return (
@@ -357,18 +373,18 @@ class ParticleSimulation(ParticleCheckpoints):
         )
 
     def top_speed(self, totals: ParticleTotals) -> float:
-        """Return the scale of the velocities that `particles_to_grid` leaves [m/s]."""
+        """Return the scale of the velocities after `particles_to_grid` [m/s]."""
         return totals.max_speed + self.kick_dt * math.sqrt(self.gravity @ self.gravity)
 
     def particles_to_grid(self, window: Window) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
+        """Transfer the particles' velocities to the faces, and apply gravity for `kick_dt`."""
         p = self.particles
         with self.watch.stage(
             "particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights
         ):
             for kick, change in zip(self.kicks, self.gravity * self.kick_dt, strict=True):
                 kick.value = float(change)
-            # gravity may be turned between steps
+            # Gravity may change its direction between steps.
             acts = tuple(kick.value != 0.0 for kick in self.kicks)
             self._transfer_to_grid.run(window, variant=(window.near is None, acts, p.runs is None))
 
@@ -400,7 +416,9 @@ class ParticleSimulation(ParticleCheckpoints):
         contact: wp.array,
         dt: float = 0.0,
     ) -> None:
-        """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
+        """Extrapolate the velocity from the valid faces of a solve into air and walls.
+
+        See `warp_lcp.material.wall`.
 
         Args:
             window: faces to consider.
@@ -448,13 +466,20 @@ class ParticleSimulation(ParticleCheckpoints):
         contact: wp.array,
         join: Join | None,
     ) -> None:
-        """Continue the velocity among the boundary's walls; `join` is called after each layer."""
+        """Extrapolate the velocity among the boundary's walls.
+
+        `join` is called after each layer.
+        """
         self.boundary.extrapolate_velocity(
             window, self.velocity, self.weights, known, kind, contact, self.layers, join
         )
 
     def _layer_filled(self) -> Join | None:
-        """Return what is called with marks and field of a component when a layer of faces is filled: ghost cells, and ends, follow."""
+        """Return a function that is called after each layer of extrapolated faces.
+
+        Its arguments are the marks and the field of a component. It fills ghost cells and periodic
+        sides; None if there is nothing to fill.
+        """
         refill, sides = self.grid.part.refill(), self.sides
         if refill is None or sides is None:
             return refill if sides is None else sides.wrap
@@ -468,7 +493,10 @@ class ParticleSimulation(ParticleCheckpoints):
     def exchange(
         self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array
     ) -> None:
-        """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
+        """Exchange particles with the interior of a narrow band, if there is one.
+
+        Arguments as of `warp_lcp.material.narrow_band.NarrowBand`.
+        """
         if self.band is not None:
             with self.watch.stage(
                 "narrow band", *self.particles.arrays().values(), self.band.depth
@@ -478,7 +506,7 @@ class ParticleSimulation(ParticleCheckpoints):
                 )
 
     def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
-        """Find the bodies in flight, and give the particles the velocity of the faces.
+        """Find airborne bodies, and transfer the faces' velocity to the particles.
 
         Args:
             window: of the step.
@@ -509,15 +537,17 @@ class ParticleSimulation(ParticleCheckpoints):
         density: wp.array | None = None,
         contact: wp.array | None = None,
     ) -> Row:
-        """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
+        """Move particles and solids by dt [s], and finish the step.
+
+        Particles are exchanged with sources and outlets and redistributed; the clock advances.
 
         Args:
             dt: time step [s].
             window: of the step.
-            density: of the particles before they move, in units of that at rest; None: no step has
-                found it yet.
+            density: of the particles before they move, in units of that at rest; None if it is not
+                known.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED: the contact with walls in the step;
-                None: not known.
+                None if it is not known.
 
         Returns:
             What the log says of it and of the particles.
@@ -545,13 +575,13 @@ class ParticleSimulation(ParticleCheckpoints):
             rearranged |= self.rearrangement.apply(
                 self.particles, window, self.step_count, dt, self.watch, fill, contact
             )
-            # the density correction may push particles out through open sides
+            # The density correction may push particles out through open sides.
             if self.outlets is not None:
                 exchanged["departed"] += int(
                     self.grid.part.ranks.sum(self.outlets.remove_departed(self.particles))
                 )
             if early:
-                # as read with the solve, before particles have been displaced
+                # As read with the solve, before particles have been displaced.
                 stopped, pushed, stuck = self.met()
             if (
                 early
@@ -572,7 +602,9 @@ class ParticleSimulation(ParticleCheckpoints):
         )
 
     def monitor_density(self, window: Window, density: wp.array | None) -> None:
-        """Measure the density at the start of a step, before anything moves, if that has not been done.
+        """Measure the density at the start of a step, unless it has been measured.
+
+        Nothing has moved yet.
 
         Args:
             window: around the particles.
@@ -583,7 +615,10 @@ class ParticleSimulation(ParticleCheckpoints):
 
     @property
     def _monitored(self) -> bool:
-        """Whether a GPU knows what a density correction is decided by before particles move, and need not measure them in between."""
+        """Whether the density was measured on a GPU, and particle numbers stay the same.
+
+        The density correction then needs no readback between the move and the correction.
+        """
         kept = (
             self.grid.part.shared
             or self.band is not None
@@ -606,7 +641,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return self.checked_totals(when)
 
     def carry(self, dt: float) -> None:
-        """Move particles and solids by dt [s]; bodies in flight keep their momenta."""
+        """Move particles and solids by dt [s]; airborne bodies keep their momenta."""
         if self.bodies is not None:
             self.bodies.end_step(dt)
             if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
@@ -621,16 +656,19 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.boundary.thin.stop(self.particles.position, still=not self.boundary.moves)
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many of all particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
+        """Return how many particles met a wall, were pushed, and are stuck, on all ranks.
+
+        The counts are those of the last `carry`.
+        """
         met, pushed, stuck = self.grid.part.ranks.sum(np.array(self.boundary.met())).tolist()
         return met, pushed, stuck
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
-        """Return what the log says of a step's solve; nothing if there was none."""
+        """Return the log entries of a step's solve; empty if there was none."""
         return {} if result is None else {"solver": self.scene.solver.method} | solve_row(result)
 
     def logged(self, row: Row) -> Row:
-        """Return the entries of a row that the log has columns for, in their order."""
+        """Return the entries of a row that have log columns, in their order."""
         bodies = self.bodies.row() if self.bodies is not None else {}
         found = row | bodies
         if self._columns is None:
@@ -657,7 +695,7 @@ class ParticleSimulation(ParticleCheckpoints):
         )
 
     def notes(self) -> list[str]:
-        """Return warnings and facts worth a line at the start of a run."""
+        """Return warnings and notes for the start of a run."""
         cells, covered = (
             " x ".join(map(str, n[: self.grid.dimension]))
             for n in (self.grid.domain_counts, self.grid.counts)
@@ -704,7 +742,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals if self.band is None else self.band.with_interior(totals)
 
     def _exchange(self, dt: float) -> dict[str, int]:
-        """Remove the particles that have left in the step and add those that have come in; return how many all ranks have."""
+        """Remove particles at outlets and add those of sources; return the counts of all ranks."""
         span, drained, departed = (self.time, self.time + dt), 0, 0
         with self.watch.stage("sources and outlets", self.particles.position):
             for outlets in [] if self.outlets is None else [self.outlets]:
@@ -732,7 +770,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return row | {"interior_density": density, "spray": flying}
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points [m], shape (n, 3), a particle may be at."""
+        """Return at which points [m], shape (n, 3), a particle may be."""
         i, j, k = np.clip(self.particles.cells_of(points), -1, self.grid.counts).T + 1
         free = self.boundary.base.numpy()[k, j, i] != wl.SOLID
         if self.grid.barriers is not None:

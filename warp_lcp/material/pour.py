@@ -1,4 +1,4 @@
-"""Material that a program adds between two steps."""
+"""Add material between two steps."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 
 
 def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -> int:
-    """Fill what of a shape is empty, outside solids and cells of material, and return how many particles that took.
+    """Fill the empty part of a shape with particles, and return their number.
+
+    Cells of solids and of material stay as they are.
 
     Args:
         simulation: between two steps (updated).
-        shape: an entry of a scene's `[[liquid]]` or `[[sand]]`, with the velocity of what comes.
+        shape: an entry of a scene's `[[liquid]]` or `[[sand]]`, with the velocity of the new
+            material.
         name: of the shape, for messages.
 
     Raises:

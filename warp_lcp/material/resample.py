@@ -1,4 +1,4 @@
-"""Material brought from one grid to another: as many particles a cell as before, so more or fewer of them."""
+"""Resample material for another grid, with as many particles a cell as before."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from warp_lcp.grid.particles import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
-# x^(d+1) = x + 1: the steps of a sequence that fills a cube evenly
+# x^(d+1) = x + 1: the steps of a sequence that fills a cube evenly.
 PLASTIC = {2: 1.32471795724474602596, 3: 1.22074408460575947536}
 
 
@@ -88,7 +88,7 @@ def resampled(
 def resampling_notes(
     before: int, after: int, moved: int, spacing: float, grid: StaggeredGrid
 ) -> list[str]:
-    """Return what a user should know of a resampled material.
+    """Return notes for the user about a resampled material.
 
     Args:
         before: particles on the old grid.
@@ -114,7 +114,10 @@ def _placed(
     low: float,
     high: np.ndarray,
 ) -> np.ndarray:
-    """Return start + offset where a particle may be there, else start, else the nearest place of another particle."""
+    """Return start + offset where a particle may be there, else start.
+
+    If start is not admitted either, it is the nearest admitted place of another particle.
+    """
     dimension = len(high)
 
     def inside(points: np.ndarray) -> np.ndarray:

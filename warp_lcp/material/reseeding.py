@@ -1,4 +1,4 @@
-"""Reseeding: evens out the particles deep inside the material."""
+"""Reseeding: even out the number of particles of cells deep inside the material."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Reseeding:
             for f in (self._find, self._exchange)
         )
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
-        # of takers, and of particles moved
+        # Number of takers, and of particles moved.
         self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
         self._directions = sorted(
@@ -96,7 +96,7 @@ class Reseeding:
         )
 
     def _settings(self) -> typing.Any:
-        """Return what is the same for all cells and steps, as kernels take it."""
+        """Return the settings that are the same for all cells and steps, for kernels."""
         grid, s = self.grid, kernels.ReseedingSetting()
         s.planes, s.dx, s.inverse_dx = grid.planes, grid.spacing, 1.0 / grid.spacing
         s.origin, s.across = (
@@ -107,7 +107,7 @@ class Reseeding:
         return s
 
     def apply(self, particles: Particles, window: Window, step: int) -> int:
-        """Move particles; return their number.
+        """Move particles; return the number of moved particles.
 
         Args:
             particles: the material (sorted, moved).
@@ -118,7 +118,7 @@ class Reseeding:
         if not ranks.any(particles.count > 0):
             return 0
         particles.arrange(SORTED)
-        # beyond open sides lies air without particles, and nothing beyond that
+        # Beyond open sides is air without particles; beyond that are no cells.
         inside = window.common(self._asked)
         self._seed.value = step
         if inside is not None:
@@ -135,7 +135,10 @@ class Reseeding:
         return self._moved(before)
 
     def _find(self, particles: Particles, window: Window, nothing: bool) -> None:
-        """Launch the count of the particles of each cell, and the search for cells that want some, of which there may be none."""
+        """Launch the particle count of each cell, and the search for cells with too few.
+
+        With `nothing` there is nothing to search.
+        """
         b, offsets = self.boundary, particles.offsets
         if offsets is None:
             offsets, count = self._offsets, particles.listed_count
@@ -162,7 +165,7 @@ class Reseeding:
             self._inside.launch(kernels.find_kernel, inputs)
 
     def _exchange(self, particles: Particles) -> None:
-        """Launch what lets cells take from their neighbors, one direction after another."""
+        """Launch the moves of particles between neighboring cells, one direction at a time."""
         offsets = self._offsets if particles.offsets is None else particles.offsets
         count = int(self._list.count.value)
         inputs = [
@@ -187,12 +190,18 @@ class Reseeding:
             self.grid.part.fill(self._count)
 
     def _held(self) -> np.ndarray | None:
-        """Return how many particles the cells of a rank hold, before any has moved; None: one process counts what it moves."""
+        """Return the particle counts of a rank's cells before any have moved.
+
+        None on one process, which counts the moves.
+        """
         part = self.grid.part
         return np.array(part.box_of(self._count.numpy())) if part.shared else None
 
     def _moved(self, before: np.ndarray | None) -> int:
-        """Return how many particles have moved: a rank moves ghosts, too, so that ranks count what their cells have gained."""
+        """Return how many particles have moved.
+
+        A rank moves ghosts, too, so ranks count what their cells have gained.
+        """
         if before is None:
             return int(self._numbers.numpy()[1])
         part = self.grid.part

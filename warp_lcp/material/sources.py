@@ -101,7 +101,7 @@ class Sources:
         part = grid.part
         self._check_cells(part.ranks.sum(np.bincount(self._owner, minlength=len(self.sources))))
         low, high = np.array(part.owned.low) - 1, np.array(part.owned.high) - 1
-        # by slot: whether the cell is this process's
+        # By slot: whether this process owns the cell.
         self._emits = np.append(True, ((cells >= low) & (cells < high)).all(axis=1))
         self._boxes = [
             self._box(cells[self._owner == number]) for number in range(len(self.sources))
@@ -222,7 +222,7 @@ class Sources:
         return emitted
 
     def _check_cells(self, counts: np.ndarray) -> None:
-        """Refuse sources without an open cell, given how many each has."""
+        """Refuse sources without an open cell; `counts` are their open cells."""
         for source, count in zip(self.sources, counts, strict=True):
             if count == 0:
                 raise ValueError(
@@ -232,7 +232,10 @@ class Sources:
                 )
 
     def _occupants(self, particles: Particles) -> np.ndarray:
-        """Return how many particles each cell holds, of all processes: some have come into cells that are not their process's yet."""
+        """Return how many particles of all processes each cell holds.
+
+        Particles may have entered cells that another process owns.
+        """
         self._counting.run(particles)
         mine, part = np.asarray(self._counts.numpy()), self.grid.part
         if part.across is None:
@@ -302,7 +305,7 @@ class Sources:
         return slot[which], entries[which], filled[which] * starts, points[which]
 
     def _enter(self, number: int) -> None:
-        """Launch what follows the points of a source's lattice through its cells."""
+        """Launch the motion of a source's lattice points through its cells."""
         grid, seed = self.grid, (self.random_seed + number) * 0x9E3779B97F4A7C15 + 1
         size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
         numbers = {
@@ -335,7 +338,7 @@ class Sources:
         )
 
     def _reserve(self, count: int) -> None:
-        """Have room for so many points of a lattice."""
+        """Allocate memory for a number of lattice points."""
         if count > len(self._points["entries"]):
             size, memory = (
                 int(GROWTH * count),
@@ -357,7 +360,7 @@ class Sources:
 
     @staticmethod
     def _split(memory: np.ndarray) -> list[np.ndarray]:
-        """Return entries, slots, filled and points, shape (n, 3), as they lie in one memory."""
+        """Return entries, slots, filled and points, shape (n, 3), as views of one memory."""
         size = len(memory) // 6
         return [
             *memory[: 3 * size].reshape(3, size),
@@ -372,11 +375,13 @@ class Sources:
         filled: np.ndarray,
         points: np.ndarray,
     ) -> np.ndarray:
-        """Return where particles come in [m], of the points of `_entered`: if the source starts, those that fill cells are among them.
+        """Return the places of new particles [m], from the points of `_entered`.
+
+        If the source starts, points that fill its cells are included.
 
         Args:
-            held: by each cell, as a share of what it holds at rest.
-            slot: as returned there, like the others.
+            held: fill of each cell, relative to rest.
+            slot: as returned by `_entered`.
             entries: likewise.
             filled: likewise.
             points: likewise.
@@ -387,12 +392,12 @@ class Sources:
         return points[self.boundary.admits(points)] if len(points) else points
 
     def _way(self, number: int, time: float) -> list[float]:
-        """Return how far a source's lattice has moved at a time [m]."""
+        """Return the displacement of a source's lattice at a time [m]."""
         source = self.sources[number]
         return [float(v) * (time - source.start) for v in source.velocity]
 
     def _box(self, cells: np.ndarray) -> tuple[list[float], list[float]] | None:
-        """Return the low and the high corner [m] of cells (k, j, i); None: there are none."""
+        """Return the low and the high corner [m] of cells (k, j, i); None if there are none."""
         if not len(cells):
             return None
         low, high = (
@@ -402,7 +407,7 @@ class Sources:
         return (low * self.grid.spacing).tolist(), (high * self.grid.spacing).tolist()
 
     def _impose(self, velocity: Faces, known: Faces, cells: wp.array | None, supply: bool) -> None:
-        """Launch what `supply` does, or what `hold` does."""
+        """Launch the kernels of `supply` or of `hold`."""
         walls = self._moving_walls if supply else []
         if self._window is None:
             return
@@ -500,7 +505,10 @@ class Outlets:
         return self._remove(particles, ())[1]
 
     def _remove(self, particles: Particles, drains: tuple[Drain, ...]) -> tuple[int, int]:
-        """Remove particles beyond open sides and in some drains; return how many drains have swallowed, and how many have left."""
+        """Remove particles beyond open sides and in some drains.
+
+        Returns how many the drains have removed, and how many have left.
+        """
         count = particles.count
         if not count or not (self.open_sides or drains):
             return 0, 0
@@ -518,7 +526,7 @@ class Outlets:
     def _launch(
         self, particles: Particles, drains: tuple[Drain, ...], marks: wp.array, distance: wp.array
     ) -> None:
-        """Launch the marks of the particles that leave, and their removal."""
+        """Launch the marking of the particles that leave, and their removal."""
         position = particles.position
         mark_gone(self.grid, self.open_sides, position, marks)
         for drain in drains:
