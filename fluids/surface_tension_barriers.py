@@ -30,9 +30,9 @@ def curvature_kernel(
     limit: float,
     bend: F32,
 ):
-    """Find the curvature again, see `surface_tension.h`.
+    """Compute the curvature again near thin solids, see `surface_tension.h`.
 
-    Others stand for cells beyond thin solids.
+    Cells beyond a thin solid are replaced by cells on the near side.
     """
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         share = 2.0 * once[k, j, i] - twice[k, j, i]
@@ -72,7 +72,7 @@ def curvature_kernel(
 def jump_kernel(
     k, j, i, near: U8, apart: U8, planes: int, scale: float, kind: I8, bend: F32, jump: F32
 ):
-    """Set the jump again in cells beside the surface: that of the cell's own curvature."""
+    """Set the jump again in cells beside the surface, from the cell's own curvature."""
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         own = kind[k, j, i]
         value = float(0.0)

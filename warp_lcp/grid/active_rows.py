@@ -92,7 +92,7 @@ class ActiveRows:
         return replace(box, near=both)
 
     def _near(self, box: Window, particles: Particles, grow: int) -> np.ndarray:
-        """Return which segments of rows particles reach."""
+        """Return the marks of row segments that particles reach."""
         if self._marks is None:
             self._marks = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=self.grid.device)
         self._marks.zero_()

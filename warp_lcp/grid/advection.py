@@ -195,8 +195,8 @@ def advect(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that a closed face stopped.
-        endless: has bit n set if axis n has no end: velocities beyond its sides are those at the
-            other, as the ring's are. Particles may end up there.
+        endless: bit n is set if axis n is periodic: velocities beyond its sides are those at the
+            opposite side, as are the ring's. Particles may end up beyond a side.
     """
     launch(
         advect_pass(endless),
@@ -238,7 +238,7 @@ def advect_with_distance(
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
         open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
             beyond.
-        endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
+        endless: bit n is set if axis n is periodic, see `advect`; its sides count as open.
     """
     launch(
         distance_pass(endless),

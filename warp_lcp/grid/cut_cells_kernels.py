@@ -47,7 +47,7 @@ def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 @wp.func
 def corner(axis: int, planes: int, n: int):
-    """Return how far (k, j, i) the n-th of the four corners of a lower face is from the first."""
+    """Return the offset (k, j, i) of the n-th corner of a lower face from its first."""
     a = n & 1
     b = n >> 1
     dk = b * wp.where(axis == 2, 0, planes - 1)

@@ -91,9 +91,10 @@ class LevelSet:
             particles: the liquid. If it is indexed it must not have moved since it was sorted: each
                 cell then gathers from the particles around it, the same bits on every run of a GPU.
                 Otherwise they scatter.
-            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side:
-                what a pass reads from beyond the window then stays out of reach of the density.
-            capacity: share of each cell's kernel that is open, float32; None: 1 everywhere.
+            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side.
+                Values that a pass reads from beyond the window are then out of reach of the
+                density.
+            capacity: open share of each cell's kernel, float32; None for 1.
             base: int8, SOLID in cells that hold no liquid.
             fill: adds the density of liquid without particles in a window.
         """

@@ -206,10 +206,9 @@ class MarchingCubes:
     def contour(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the surface phi = 0, linear between cell centers.
 
-        Flat on the domain's sides where it is cut off there.
-
-        Where it meets a side at a right angle it ends there in an edge: what crosses it between
-        centers beside a side is put on the side. The same points in the same order on every run.
+        The surface is flat on the domain's sides where it is cut off there. Where it meets a side
+        at a right angle it ends there in an edge: crossings between centers beside a side are moved
+        onto the side. The points and their order are the same on every run.
 
         Args:
             phi: float32 at cell centers, in the stored shape; > 0 in the ring, so that the surface

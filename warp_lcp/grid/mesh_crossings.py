@@ -201,7 +201,7 @@ def look_beside(
 
 
 def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> Crossings:
-    """Return where a closed surface crosses itself or lies inside itself.
+    """Find where a closed surface crosses itself or lies inside itself.
 
     Args:
         mesh: the surface.

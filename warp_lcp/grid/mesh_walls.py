@@ -192,7 +192,7 @@ def _sharpened(
 
 
 def _nearest_ends(x: np.ndarray, simplices: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return which corners of each simplex are nearest to its target.
+    """Return a mask of the corners of each simplex nearest to its target.
 
     bool of the simplices' shape; several corners may be equally near.
     """

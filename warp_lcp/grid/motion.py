@@ -181,7 +181,7 @@ class Rotation:
     Args:
         rate: [degrees/s], counterclockwise seen from the axis's tip.
         center: a point of the axis [m], 2 or 3 numbers.
-        axis: its direction, 3 numbers of any length but 0; z unless given.
+        axis: its direction, 3 numbers of any length but 0. Default: z.
         start: [s].
         stop: [s], > start; infinity: never.
 
@@ -221,11 +221,11 @@ class Sinusoid:
 
     Args:
         period: [s], > 0.
-        amplitude: of the shift [m], 2 or 3 numbers; none unless given.
+        amplitude: of the shift [m], 2 or 3 numbers. Default: 0.
         phase: [degrees].
         angle: amplitude of the angle [degrees].
         center: a point of the axis of the swing [m], 2 or 3 numbers; it takes part in the shift.
-        axis: direction of that axis, 3 numbers of any length but 0; z unless given.
+        axis: direction of that axis, 3 numbers of any length but 0. Default: z.
 
     Raises:
         ValueError: a value is not finite, the period is not positive, or the axis is zero.
@@ -266,7 +266,7 @@ class Keyframes:
 
     Args:
         times: [s], increasing, shape (n,), n >= 2.
-        translate: shifts [m], shape (n, 2) or (n, 3); none unless given.
+        translate: shifts [m], shape (n, 2) or (n, 3). Default: 0.
         rotate: [degrees]: angles about z, shape (n,), as many turns as they say; or angles about
             the fixed axes x, y, z in that order, shape (n, 3), of less than half a turn from one
             keyframe to the next.
@@ -288,7 +288,7 @@ class Keyframes:
     _turns: _Turns | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the values and lay curves through them."""
+        """Check the values and build the curves."""
         times = np.array(self.times, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2:
             raise ValueError(f"times must be a list of at least two numbers, not {self.times}")
@@ -523,7 +523,7 @@ def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def _elapsed(time: float, start: float, stop: float) -> float:
-    """Return how long a motion from `start` to `stop` has gone on [s]."""
+    """Return the elapsed time [s] of a motion that begins at `start` and ends at `stop`."""
     return min(max(time, start), stop) - start
 
 

@@ -57,7 +57,7 @@ class NodeDistances:
         owner: int16 its number; 0: none is near.
         next_near: float32 distance to the second nearest [cells].
         next_owner: int16 its number.
-        struct: what kernels take.
+        struct: the same as a kernel argument.
     """
 
     def __init__(self, grid: StaggeredGrid, *, second: bool) -> None:

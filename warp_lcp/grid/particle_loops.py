@@ -185,7 +185,7 @@ class GridPlacement:
 
 
 def chunks(count: int, device: wp.Device) -> Rows:
-    """Return how a list's entries are divided into tasks."""
+    """Return the division of a list's entries into tasks."""
     return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN, weight=PARTICLE)
 
 

@@ -165,8 +165,8 @@ class Particles:
             capacity,), the first `count` in use.
         offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort;
             None unless `indexed`.
-        runs: begin and end of each run of particles that lie in the order in which sums take them,
-            int32, shape (2 runs,); None: all do.
+        runs: begin and end of each run of particles in the order of summation, int32, shape (2
+            runs,); None if all particles are in this order.
         exchange: knows the particles of other processes, see `warp_lcp.grid.part.ParticleExchange`.
 
     Raises:
@@ -278,8 +278,8 @@ class Particles:
         Args:
             position: [m], shape (n, 3).
             velocity: [m/s], shape (n, 3).
-            kept: the number that each takes along, or one for all; for particles that have one, 1
-                unless given.
+            kept: the number that each carries, or one for all. Default: 1, for particles that carry
+                one.
 
         Raises:
             ValueError: the shapes do not match.
@@ -543,7 +543,7 @@ class Particles:
             )
 
     def _keys_to_sort(self) -> int:
-        """Return how many keys a GPU sorts: at most a quarter more than particles.
+        """Return the number of keys that a GPU sorts: at most a quarter more than particles.
 
         So one graph serves many numbers of particles.
         """
@@ -700,7 +700,7 @@ class Particles:
 
 
 def _chunk_of_totals(count: int, device: wp.Device) -> int:
-    """Return how many particles a thread sums up."""
+    """Return the number of particles that a thread sums up."""
     return max(
         CUDA_CHUNK if device.is_cuda else CHUNK,
         -(-count // (CUDA_THREADS if device.is_cuda else THREADS)),
@@ -708,7 +708,7 @@ def _chunk_of_totals(count: int, device: wp.Device) -> int:
 
 
 def _piece_of_sort(count: int) -> int:
-    """Return how many keys form one piece of a sort."""
+    """Return the number of keys in one piece of a sort."""
     return max(CPU_GRAIN, -(-count // SORT_PIECES))
 
 

@@ -55,7 +55,7 @@ def open_sides_of(grid: StaggeredGrid, bits: int) -> int:
 
 
 def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
-    """Return which cells of the ring lie beyond open sides only.
+    """Return a mask of the cells of the ring that lie beyond open sides only.
 
     The result is bool in the stored shape. A corner cell that is beyond a wall as well is not open.
 

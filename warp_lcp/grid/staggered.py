@@ -527,7 +527,7 @@ class StaggeredGrid:
         dimension: 2 or 3.
         device: a Warp device or its name.
         origin: cells (x, y, z) of a larger grid before the first one of this.
-        whole: cells of the larger grid that this is a part of; None: it is no part.
+        whole: cells of the larger grid of which this is a part; None if it is no part.
         sparse: whether only a small part of its fields will be written, for which memory is taken
             in small pages.
         part: the part of the grid that this process has; all of it if None.
@@ -664,9 +664,8 @@ class StaggeredGrid:
     ) -> Window:
         """Return the window of cells from low to high, moved, grown and clipped.
 
-        (x, y, z), both included; moved by `shift` along each axis.
-
-        Of a box beyond what is stored a layer of what is nearest is left.
+        Cells (x, y, z), both included, are moved by `shift` along each axis. If the box lies
+        outside of the stored cells, the nearest layer of these is returned.
         """
         first, last = [], []
         for axis in (2, 1, 0):

@@ -102,7 +102,7 @@ class SurfaceMesh:
             finest useful resolution.
         smoothing: standard deviation of the kernel [particle distances], at least that of the
             narrow one, 1/2.
-        obstacles: solids; None: there are none but the domain's walls.
+        obstacles: solids; None if there are only the domain's walls.
 
     Raises:
         ValueError: an argument is out of range.

@@ -247,7 +247,7 @@ class ThinWalls:
         )
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Return which points [m], shape (n, 3), keep the distance from these solids.
+        """Return a mask of points [m], shape (n, 3), that keep the distance from these solids.
 
         A particle may start there.
         """

@@ -65,7 +65,7 @@ SHAPES, GROUPS = wp.array(dtype=ThinShape), wp.array(dtype=ThinGroup)
 
 @wp.func
 def hit_box(a: wp.vec3d, d: wp.vec3d, half: wp.vec3d):
-    """Return where a path a + t d enters a box, and the normal there."""
+    """Intersect a path a + t d with a box: return t of the entry, and the normal there."""
     enter = -_MISS
     leave = _MISS
     axis = int(0)
@@ -91,7 +91,7 @@ def hit_box(a: wp.vec3d, d: wp.vec3d, half: wp.vec3d):
 
 @wp.func
 def hit_ball(a: wp.vec3d, d: wp.vec3d, radius: wp.float64):
-    """Return where a path enters a ball about the origin."""
+    """Intersect a path with a ball about the origin."""
     t = _MISS
     dd = wp.dot(d, d)
     ad = wp.dot(a, d)
@@ -105,7 +105,10 @@ def hit_ball(a: wp.vec3d, d: wp.vec3d, radius: wp.float64):
 
 @wp.func
 def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
-    """Return where a path enters a capsule from the origin along an axis, and the normal there."""
+    """Intersect a path with a capsule from the origin along an axis.
+
+    Returns the place on the path, and the normal there.
+    """
     t = hit_ball(a, d, radius)
     t = wp.min(t, hit_ball(a - axis, d, radius))
     size = wp.dot(axis, axis)
@@ -124,7 +127,10 @@ def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
 
 @wp.func
 def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
-    """Return where a path meets a mesh from either side, and the normal there, against the path."""
+    """Intersect a path with a mesh, from either side.
+
+    Returns the place on the path, and the normal there, against the path.
+    """
     t = _MISS
     n = wp.vec3d()
     length = wp.length(d)
@@ -141,9 +147,10 @@ def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
 
 @wp.func
 def hit(shape: ThinShape, a: wp.vec3d, b: wp.vec3d):
-    """Return where the path from a to b enters a shape, and the normal there.
+    """Intersect the path from a to b with a shape.
 
-    The place is from 0 to 1, `MISS` if the path does not enter. Points are in the group's frame.
+    Returns the place of the entry on the path, and the normal there. The place is from 0 to 1,
+    `MISS` if the path does not enter. Points are in the group's frame.
     """
     t = _MISS
     n = wp.vec3d()
@@ -236,7 +243,7 @@ def in_plane(n: wp.vec3d, planes: int):
 
 @wp.func
 def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, but: int):
-    """Return where the path from a to b first enters one of some shapes.
+    """Find the first of some shapes that the path from a to b enters.
 
     Returns the place, the normal there and the shape. The shape `but` is left out.
     """

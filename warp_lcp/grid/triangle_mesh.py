@@ -110,10 +110,10 @@ class ClosedSurface:
     Build one with `read_mesh`, `builtin_mesh` or `close_surface`, which check that.
 
     Args:
-        name: what messages call it.
+        name: name of the mesh in messages.
         vertices: in the mesh's own units, float64 of shape (n, 3).
         triangles: vertex indices, int32 of shape (m, 3), counterclockwise seen from outside.
-        warnings: what had to be repaired, a line each.
+        warnings: repairs, a line each.
     """
 
     name: str
@@ -233,7 +233,7 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     Args:
         vertices: shape (n, 3), in any unit.
         triangles: vertex indices, shape (m, 3).
-        name: what messages call the mesh.
+        name: name of the mesh in messages.
 
     Raises:
         ValueError: not finite, without triangles, not closed, not orientable, or without volume.

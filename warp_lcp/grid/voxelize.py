@@ -34,9 +34,9 @@ class PlacedSolid:
     Args:
         geometry: the region it fills.
         separating: whether liquid may leave its wall (otherwise it slides along it only).
-        name: what messages call it, for example `solid[2] (sphere)`.
-        motion: takes the geometry from where it is placed to where it is; None: it stands still.
-        among: what messages call the material around it.
+        name: name of the solid in messages, for example `solid[2] (sphere)`.
+        motion: motion from the initial place of the geometry; None if it stands still.
+        among: name of the surrounding material in messages.
     """
 
     geometry: Geometry
@@ -132,7 +132,7 @@ def voxelize(
 def inside(
     geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str
 ) -> np.ndarray:
-    """Return which points lie inside any of the geometries.
+    """Return a mask of the points that lie inside any of the geometries.
 
     Args:
         geometries: the regions; none contain nothing.
@@ -218,7 +218,7 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
 
     Args:
         geometry: a solid, or the liquid's start.
-        name: what messages call it.
+        name: name of the region in messages.
         grid: the grid, or a part of one.
 
     Raises:

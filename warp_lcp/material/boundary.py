@@ -100,7 +100,7 @@ class Boundary(Protocol):
         """Advect particles, then move the solids to `time`."""
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many particles met a wall, were pushed, and are stuck.
+        """Return numbers of particles that met a wall, were pushed, and are stuck.
 
         During the last advection; stuck inside a solid.
         """
@@ -131,7 +131,7 @@ class WholeCells:
         grid: the grid.
         solids: which cells are solid, and whose walls separate.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
-            constant; the cells stay where they are. None: all stand still.
+            constant; the cells stay fixed. None if all are at rest.
         open_sides: the open sides for which `solids` was made, except periodic ones.
         sides: the periodic sides, which are open in `solids`; None if there are none.
         shapes: of the solids, if they fill whole cells exactly.
@@ -445,7 +445,7 @@ class CutBoundary:
             push_out(self.grid, distance, position, counts[1:2], counts[2:3], open_sides=sides)
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many particles met a wall, were pushed, and are stuck."""
+        """Return numbers of particles that met a wall, were pushed, and are stuck."""
         met, pushed, stuck = (int(n) for n in self._counts.numpy())
         return met, pushed, stuck
 
@@ -482,7 +482,7 @@ class CutBoundary:
         ]
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Return which points [m], shape (n, 3), keep the distance from walls."""
+        """Return a mask of points [m], shape (n, 3), that keep the distance from walls."""
         coordinates = self.grid.to_grid(points)
         if self.grid.dimension == 2:
             coordinates[:, 2] = 1.0

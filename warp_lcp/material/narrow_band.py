@@ -270,7 +270,7 @@ class NarrowBand:
             particles: the liquid (updated); `key` holds its cells.
             window: cells that material can touch.
             kind: int8 of AIR, FLUID, SOLID.
-            phi: float32 distance to the surface [cells]; None: it lies on the cells' faces.
+            phi: float32 distance to the surface [cells]; None if it lies on the cells' faces.
             contact: uint8, RELEASED where liquid leaves a wall.
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
@@ -343,9 +343,9 @@ class NarrowBand:
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
         """Return sums over the particles and the interior.
 
-        They are counted as H, and weighted as at rest: what H differs by is spread over all the
-        liquid. Its center would otherwise move with every particle that the band has more or less
-        than its share.
+        The interior counts as H particles, and is weighted as at rest: the difference of H from
+        rest is spread over all the liquid. Otherwise the center would move with every particle that
+        the band has more or less than its share.
         """
         inside, count = self.interior, totals.count + self.held
         if inside.count == 0 or count <= 0:

@@ -150,7 +150,7 @@ def make_boundary(
         grid: its grid.
         folder: folder of the files that it names.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
-            constant; None: all stand still, or have their own motion.
+            constant; None if all are at rest, or have their own motion.
         solids: of `placed_solids`; made here if None.
 
     Raises:
@@ -501,7 +501,7 @@ def start_band(
 
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
-    """Return which stored cells are near a source or a drain; None if there is none."""
+    """Return a mask of stored cells near a source or a drain; None without both."""
     regions = [*scene.source, *scene.drain]
     if not regions:
         return None

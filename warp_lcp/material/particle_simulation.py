@@ -43,68 +43,67 @@ CONTACTS_MISSED = 1e-2
 class ParticleSimulation(ParticleCheckpoints):
     """Simulation of particles on a staggered grid, without the material's own solve.
 
-    A subclass calls the parts of a step in its own `step`.
+    A subclass calls the parts of a step in its own `step`. Particles have the velocities of the
+    middle of the last step; the grid has, in a step, those of its middle. Forces act for `kick_dt`,
+    half of the last step and half of this one; then particles move for the whole step (the leapfrog
+    of Verlet). One solve a step gives a scheme that is its own inverse in time, whatever the steps'
+    lengths: airborne material moves along its parabola.
 
-    Particles have the velocities of the middle of the last step, the grid in a step those of its
-    middle: forces act for `kick_dt`, half of the last step and half of this one, and then particles
-    move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme that is its own
-    inverse in time, whatever the steps' lengths: what flies goes along its parabola.
-
-    The grid's part says what of it this process works on. On several ranks making a simulation,
-    `stable_dt`, `step`, `mark`, `frame` and `restore_pieces` are collective and give every rank the
-    same numbers, or raise the same error on all: rows of the log are of the whole material; a frame
-    shows this rank's particles and cells. What another rank knows comes in where the chain of
-    dependence needs it: particles a cell from the cut before they are brought to the faces;
-    velocities and weights of the faces; what a material finds of its cells; the solve, which is one
-    of all ranks; the velocity that it leaves, and again while that is continued into air and walls.
-    All of it is computed by the same kernels from the same numbers in the same order as by one
-    process, so that runs on any number of ranks differ by the rounding in the solver and in sums
-    over all particles alone.
+    The grid's part defines the cells that this process works on. On several ranks, making a
+    simulation, `stable_dt`, `step`, `mark`, `frame` and `restore_pieces` are collective. They give
+    every rank the same numbers, or raise the same error on all. Rows of the log are of the whole
+    material; a frame has this rank's particles and cells. Data of other ranks are exchanged where
+    they are needed: particles within a cell of the cut before the transfer to the faces; velocities
+    and weights of the faces; the material's fields of cells; the solve, which is one solve of all
+    ranks; the velocity after the solve, and again while it is extrapolated into air and walls. The
+    same kernels compute with the same numbers in the same order as one process does. Runs on
+    different numbers of ranks therefore differ only by rounding in the solver and in sums over all
+    particles.
 
     A step calls `begin_step`, `window` and `particles_to_grid`; changes `velocity` by the laws of
     its material; then calls `extrapolate_velocity`, `grid_to_particles` and `move`, and returns the
     log columns of `logged`. Until `move` the state is unchanged except for the order of the
-    particles, so that a solve may fail: all of it is in the context `attempt`.
+    particles, so that a solve may fail. The whole step is in the context `attempt`.
 
-    Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In
-    between the subclass gives them the impulses of its solve and calls `solve_contacts`.
+    For rigid bodies, `begin_step` starts their step and `move` ends it. In between, the subclass
+    gives them the impulses of its solve and calls `solve_contacts`.
 
-    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's
-    clock, time step, checkpoints, resampling, notes and columns; `step` and `frame` are the
-    subclass's.
+    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` the class has the
+    clock, time step, checkpoints, resampling, notes and columns of a Simulation; the subclass
+    defines `step` and `frame`.
 
     Args:
-        scene: what to simulate.
-        grid: the one that it starts on.
-        parts: what of it belongs to that grid: walls and solids, sources, a narrow band.
-        particles: the material at the start, this process's.
-        make_parts: makes the parts of another grid; None: this one is kept.
-        outlets: where it leaves.
+        scene: the scene.
+        grid: the initial grid.
+        parts: the parts that belong to that grid: walls and solids, sources, a narrow band.
+        particles: this process's material at the start.
+        make_parts: makes the parts of another grid; None if the grid never changes.
+        outlets: drains and open sides.
         bodies: solids of the boundary that the material moves.
-        coverage: says when the material needs another grid; None: this one is kept.
-        spray: carries particles that need no grid; None: none does.
-        notes: facts for the start of a run.
+        coverage: chooses the grid window; None if the grid never changes.
+        spray: carries particles that need no grid; None if there is none.
+        notes: notes for the start of a run.
 
     Attributes:
-        particles: the material, but for its spray.
+        particles: the material, without its spray.
         velocity: of the last step on the faces, one field a component [m/s].
         weights: of the particles on each component's faces, in the last step.
-        flights: gives bodies in flight their momenta back; None: the material has none, or none
-            that can be told.
+        flights: conserves the momenta of airborne bodies; None if it is off.
         gravity: [m/s^2], shape (3,).
         particle_mass: [kg]; 2-D: [kg/m].
-        layers: how far the velocity is continued into air and walls, in faces.
-        reach: how far from particles a step touches cells; more than `layers` where a subclass
-            needs it.
+        layers: number of layers of faces to which the velocity is extrapolated into air and walls.
+        reach: distance from particles, in cells, within which a step writes to cells; more than
+            `layers` where a subclass needs it.
         time: [s].
         step_count: steps done.
         last_dt: length of the last step [s], 0 before the first.
-        kick_dt: how long forces act in the step that has begun [s].
-        watch: what the stages of a step are measured with.
-        sides: joins the ends of axes without an end; None: there are none.
-        diagnostics: are called before the totals of particles that have moved, to launch what is
-            read with them.
-        vicinity: finds the cells that a step must visit; None: all around the particles.
+        kick_dt: time for which forces act in the current step [s].
+        watch: stopwatch of the stages of a step.
+        sides: periodic sides; None if there are none.
+        diagnostics: functions that are called before the totals of moved particles, to launch work
+            that is read with them.
+        vicinity: active row segments, the cells that a step must visit; None for all cells around
+            the particles.
     """
 
     vicinity: ActiveRows | None = None
@@ -656,9 +655,9 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.boundary.thin.stop(self.particles.position, still=not self.boundary.moves)
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many particles met a wall, were pushed, and are stuck, on all ranks.
+        """Return numbers of particles that met a wall, were pushed, and are stuck.
 
-        The counts are those of the last `carry`.
+        They are those of all ranks. The counts are those of the last `carry`.
         """
         met, pushed, stuck = self.grid.part.ranks.sum(np.array(self.boundary.met())).tolist()
         return met, pushed, stuck

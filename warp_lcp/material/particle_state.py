@@ -35,8 +35,8 @@ def check_state(
     """Refuse a state that does not belong to the same scene.
 
     Args:
-        state: what to continue from.
-        expected: what the simulation that shall continue has now; `cells` are among it.
+        state: the state to continue from.
+        expected: the current state of the simulation that will continue; it includes `cells`.
         changing: the particles' arrays, if their number changes.
         solids_move: whether solids may be where they have not been.
 

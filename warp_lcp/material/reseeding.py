@@ -25,23 +25,23 @@ class Reseeding:
     """Reseeding: sparse cells deep inside take particles from dense neighbors.
 
     A flow draws particles together along some streamlines and apart along others. A density
-    correction cures the first, but voids between particles remain: they count as material as long
-    as the surface does not see them, and the volume grows. A cell that no wall touches, whose
-    surroundings of 3^dimension cells are full, takes particles from neighbors that hold more than
-    at rest, if it holds fewer than `least`; and from those with more than `most`, until it holds as
-    many as at rest. So nothing comes or goes:
+    correction repairs the first, but voids between particles remain: they count as material as long
+    as the surface does not see them, and the volume grows. A cell takes particles if no wall
+    touches it, and if its surroundings of 3^dimension cells are full. If it holds fewer than
+    `least`, it takes from neighbors that hold more than at rest. It takes from neighbors with more
+    than `most` until it holds as many as at rest. Nothing is created or removed:
 
-    - mass: particles only move, to the emptiest part of the cell, by less than two cells along each
-      axis;
-    - momentum and kinetic energy: each keeps its velocity and its gradient, which over this way
-      differ from the flow's by as much as the interpolation errs. Angular momentum and the center
-      of mass change with the particles' places;
-    - the surface and bubbles of more than a cell: what is not full around is left alone. A whole
-      region that is thin stays thin.
+    - Mass: particles only move, to the emptiest part of the cell, by less than two cells along each
+      axis.
+    - Momentum and kinetic energy: each particle keeps its velocity and its gradient. Over this
+      distance they differ from the flow's by as much as the interpolation errs. Angular momentum
+      and the center of mass change with the particles' places.
+    - The surface and bubbles of more than a cell: cells with surroundings that are not full stay
+      unchanged. A whole region that is thin stays thin.
 
-    The result is the same on every run. `apply` is collective: a rank does what its cells and those
-    beside them do, whose particles it knows as ghosts; after each direction all agree about how
-    many particles cells hold.
+    The result is the same on every run. `apply` is collective: a rank treats its own cells and
+    those beside them, whose particles it has as ghosts. After each direction all ranks agree on the
+    number of particles in cells.
 
     Args:
         grid: the grid.
@@ -198,7 +198,7 @@ class Reseeding:
         return np.array(part.box_of(self._count.numpy())) if part.shared else None
 
     def _moved(self, before: np.ndarray | None) -> int:
-        """Return how many particles have moved.
+        """Return the number of particles that have moved.
 
         A rank moves ghosts, too, so ranks count what their cells have gained.
         """

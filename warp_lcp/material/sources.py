@@ -33,12 +33,12 @@ class Source:
     """Inflow region.
 
     Args:
-        name: what messages call it.
+        name: name of the source in messages.
         contains: returns which points [m], shape (n, 3), lie in it, shape (n,).
         velocity: of its material [m/s], shape (3,), not 0.
         start: when it starts to run [s].
         stop: when it no longer does [s].
-        kept: number carried by its particles; None: none.
+        kept: number carried by its particles; None if they carry none.
     """
 
     name: str
@@ -56,18 +56,17 @@ class Source:
 class Sources:
     """Inflow through the cells whose centers lie in a source.
 
-    The area of the inflow is that of the cells' faces.
+    The area of the inflow is that of the cells' faces. While a source runs, the faces of its cells
+    have its velocity, and the pressure treats the cells as a solid that moves at it: the outflow is
+    area times velocity, whatever is in the way. Material behind a source is not drawn in.
 
-    While a source runs, the faces of its cells have its velocity, and the pressure sees the cells
-    as a solid that moves at it: what leaves them is area times velocity, whatever is in the way.
-    Material behind a source is not drawn in. Particles lie on a jittered lattice that moves with
-    the source; those that the lattice brings into the cells in a step are new. It is a function of
-    time alone, so that an resumed run is bitwise identical. A source that starts fills its cells,
-    unless they are full already.
+    Particles lie on a jittered lattice that moves with the source; those that the lattice moves
+    into the cells in a step are new. The lattice is a function of time alone, so that a resumed run
+    is bitwise identical. A source that starts fills its cells, unless they are full already.
 
-    A step need not end where a source starts or stops. What comes in is what the lattice brings in
-    from start to stop, to the particle, however the time is cut into steps; the flow has the
-    source's velocity in the steps in whose middle it runs.
+    A step need not end where a source starts or stops. The particles that enter are exactly those
+    that the lattice brings in from start to stop, however the time is divided into steps. The flow
+    has the source's velocity in the steps in whose middle the source runs.
 
     Args:
         grid: the grid.
@@ -187,7 +186,7 @@ class Sources:
 
         Args:
             particles: the material (updated).
-            before: at the start of the step [s]; None: there has been no step.
+            before: at the start of the step [s]; None if there has been no step.
             now: at its end [s].
         """
         since = now if before is None else before
@@ -232,7 +231,7 @@ class Sources:
                 )
 
     def _occupants(self, particles: Particles) -> np.ndarray:
-        """Return how many particles of all processes each cell holds.
+        """Return the number of particles in each cell, of all processes.
 
         Particles may have entered cells that another process owns.
         """

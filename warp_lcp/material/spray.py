@@ -151,7 +151,7 @@ class Spray:
         return totals.joined(self.particles.totals()) if self.particles.count else totals
 
     def _leaves(self, particles: Particles, time: float, dt: float, dx: float) -> np.ndarray:
-        """Return which particles are lone, far from all others, and near no obstacle."""
+        """Return a mask of lone particles, far from all others and near no obstacle."""
         x = particles.position.numpy()
         alone = self._alone(x, dx)
         if alone.any() and not alone.all():
@@ -164,7 +164,7 @@ class Spray:
         return alone
 
     def _within(self, particles: Particles, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return which particles lie in a box."""
+        """Return a mask of the particles in a box."""
         x, axes = particles.position.numpy(), slice(self._dimension)
         return np.asarray(((x >= low) & (x <= high))[:, axes].all(axis=1))
 
@@ -176,7 +176,7 @@ class Spray:
         dx: float,
         which: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return which particles may come near a solid or a closed side in a step."""
+        """Return a mask of particles that may come near a solid or closed side in a step."""
         x, v = (
             array.numpy() if which is None else array.numpy()[which]
             for array in (particles.position, particles.velocity)
@@ -200,7 +200,7 @@ class Spray:
         return near
 
     def _alone(self, position: np.ndarray, dx: float) -> np.ndarray:
-        """Return which particles [m] belong to clusters of few."""
+        """Return a mask of particles, given by position [m], in clusters of few."""
         tile, low = (
             np.floor(position / (TILE * dx)).astype(np.int64),
             np.floor(position.min(axis=0) / (TILE * dx)).astype(np.int64),

@@ -97,10 +97,10 @@ if (last == nx && nx > 1) fill_one(nx - 1);
 //   box        float32 field, source
 SIMD for (int i = first; i < last; ++i) field[i] = source[i];
 
-// kernel warp_lcp.grid.window_reduction.add_rows: Add up what a pass has found in the rows of a window, a
-// column each; of the last columns the largest. The order is that of NumPy's pairwise summation:
-// 8 accumulators over up to 128 values, their sums added in pairs; of a box without whole planes,
-// rows that fit 8192 values one after another.
+// kernel warp_lcp.grid.window_reduction.add_rows: Reduce the results of a window's rows
+// One column a quantity: sums, and the maximum of each of the last columns. The order is that of
+// NumPy's pairwise summation: 8 accumulators over up to 128 values, their sums added in pairs. In a
+// box without whole planes, rows that fit 8192 values are added one after another.
 //   compute    float64
 //   whole      float64 partials, host, results; vec2i pieces?
 //   numbers    int first_k, first_j, planes, rows_, box_k, box_j, box_planes, box_rows, hulls,

@@ -24,8 +24,8 @@ auto unite = [&](int i, int j) {
     }
 };
 
-// kernel warp_lcp.material.ballistic_fragments.unite: Cells with a face between them that particles gave weight
-// belong together
+// kernel warp_lcp.material.ballistic_fragments.unite: Join the trees of two cells
+// They have a face with particle weight between them.
 //   compute    float32
 //   whole      int32 parent
 //   box        float32 u, v, w?
@@ -60,8 +60,8 @@ for (int i = first; i < last; ++i) {
     several[c] = 0;
 }
 
-// kernel warp_lcp.material.ballistic_fragments.number: Number the trees of several cells that nothing holds;
-// other cells get -1
+// kernel warp_lcp.material.ballistic_fragments.number: Number the trees of several cells
+// that no wall holds; other cells get -1.
 //   compute    float32
 //   whole      int32 parent; uint8 held, several; int32 number, count
 //   box        int8 kind
@@ -71,8 +71,8 @@ for (int i = first; i < last; ++i) {
     number[c] = parent[c] == c && !held[c] && several[c] ? wp::atomic_add(count, 1) : -1;
 }
 
-// kernel warp_lcp.material.ballistic_fragments.hold: Tell which trees reach a wall, and which have several
-// cells: those without weight stay alone
+// kernel warp_lcp.material.ballistic_fragments.hold: Mark trees that reach a wall
+// and trees of several cells; cells without weight stay alone.
 //   compute    float32
 //   whole      int32 parent; uint8 held, several
 //   box        int8 kind; uint8 touch
