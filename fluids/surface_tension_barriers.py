@@ -10,7 +10,7 @@ from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 MODULE = "fluids.surface_tension_barriers"
-STEEP = wp.constant(1.0e-4)  # the least square of a slope that tells a direction
+STEEP = wp.constant(1.0e-4)  # least square of a slope that defines a direction
 BAND = wp.constant(SHARE)
 _AIR, _FLUID, _SOLID = (wp.constant(wp.int8(kind)) for kind in (AIR, FLUID, SOLID))
 

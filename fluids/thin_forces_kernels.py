@@ -9,9 +9,9 @@ import warp as wp
 from warp_lcp.fluids.wall_kernels import WallKernelFields, cell_center, crossing_on, fields_on, put
 from warp_lcp.grid.cell_kernel import F64, INTS, U8, cell_kernel, next_to
 
-OPEN = -1.0  # the distance to a wall along an edge that none crosses
-MIDWAY = 0.5  # cells: the distance to other walls, which close a face between two cells
-PASSES = 4  # over the corners of a cube, to find which are connected
+OPEN = -1.0  # distance along an edge that no wall crosses
+MIDWAY = 0.5  # cells: distance to other walls, which close a face between two cells
+PASSES = 4  # passes over the corners of a cube, to find which are connected
 
 _OPEN, _MIDWAY = wp.constant(OPEN), wp.constant(MIDWAY)
 Distances = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
@@ -26,8 +26,8 @@ class Cube:
     """
 
     distance: Distances  # from a corner to the wall on the edge along an axis [cells], OPEN without
-    number: Numbers  # of the thin solid there, 0: another wall
-    sides: wp.vec3i  # in which direction the far corners lie, 1 or -1
+    number: Numbers  # number of the thin solid there, 0 for another wall
+    sides: wp.vec3i  # direction of the far corners, 1 or -1
     planes: int
 
 

@@ -8,7 +8,7 @@ from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID
 
 MODULE = "fluids.viscosity_barriers"
-HALF = wp.constant(0.5)  # cells from a face to a thin solid that it is apart from its neighbor by
+HALF = wp.constant(0.5)  # cells from a face to a thin solid that separates it from its neighbor
 _FLUID, _RELEASED = wp.constant(wp.int8(FLUID)), wp.constant(wp.uint8(RELEASED))
 FLOATS = wp.array(dtype=wp.float32)
 TURNS, SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)

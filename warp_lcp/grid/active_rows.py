@@ -18,8 +18,8 @@ from warp_lcp.kernels import KernelFile
 # Least cells of a box that is visited in part. Finding the part costs as much as a pass over the
 # particles and one over the segments.
 LEAST_CELLS = 1 << 17
-MOST = 0.4  # of a box's segments that a part may have
-REST = 6  # steps after which one looks again whether a part has become smaller
+MOST = 0.4  # largest active share of a box's segments
+REST = 6  # steps between tests of a box that was not worth visiting in part
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
 MARK = KERNELS["warp_lcp.grid.active_rows.mark_segments"]
@@ -42,9 +42,10 @@ class ActiveRows:
         nz, ny, nx = grid.shape
         self._marks: wp.array[wp.uint8] | None = None
         self._shape = nz, ny, -(-nx // SEGMENT)
-        self._step = -1  # that has been looked at
-        self._now: np.ndarray | None = None  # what it reaches
-        self._before: np.ndarray | None = None  # and what the one before it did; None: not known
+        self._step = -1  # number of the last step
+        self._now: np.ndarray | None = None  # segments that the last step reaches
+        # Segments that the step before it reached; None if not known.
+        self._before: np.ndarray | None = None
         self._rest = -1  # the step until which all is visited
         self.active = not grid.device.is_cuda and grid.size >= LEAST_CELLS
         if before is not None and self.active:

@@ -48,21 +48,21 @@ CENTERS = 3  # the `axis` of a field at cell centers
 # Distance from walls [cells] at which particles are put. Float32 positions in 10^3 cells round by
 # less than its excess over MARGIN.
 AIM = 1.1 * MARGIN
-SLACK = 0.25  # cells by which the interpolated distance may exceed the way that is free
+SLACK = 0.25  # largest excess of the interpolated distance over the free distance [cells]
 # Stride [cells] of a particle near a wall before it evaluates the distance again; shorter where the
 # stride would end on another side of the wall.
 STRIDE = 0.5
-SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
-STRIDES = 64  # of a move: 32 cells along a wall
+SHORTEST = 0.02  # shortest stride [cells], where a wall is thinner than that
+STRIDES = 64  # most strides of a move: 32 cells along a wall
 # Cosine between the normals of two walls. Walls whose normals are further apart stop a particle
 # between them; along nearer ones it slides.
 CORNER = 0.5
-BEND = 0.9  # normals that are nearer than this are one wall
-LEG = 0.25  # cells of such a search in one direction
+BEND = 0.9  # cosine between normals above which two walls count as one
+LEG = 0.25  # step [cells] of the search for a way out along one direction
 # Cells by which a step may put a particle back: more than its stride and the diagonal of the walls'
 # rounding.
 REACH = 1.0
-PUSH = 3.0  # cells that a wall may push a particle in a step
+PUSH = 3.0  # cells by which a wall may push a particle in a step
 
 _WALLS = {
     "MARGIN": MARGIN,

@@ -49,7 +49,7 @@ def stand_in(apart: U8, k: int, j: int, i: int, way: wp.vec3i):
     """
     result = way
     free = free_path(apart, k, j, i, way[0], way[1], way[2])
-    for without in range(1, 7):  # of the axes, one a bit: 1, 2, 4, and then 3, 5, 6
+    for without in range(1, 7):  # axes to leave out, one a bit: 1, 2, 4, and then 3, 5, 6
         if not free:
             bits = int(without)
             if without == 3:

@@ -10,7 +10,7 @@ MODULE = "warp_lcp.grid.barriers.transfer"
 # Least weight of a face of a particle's own cell, as in `warp_lcp.grid.transfer`.
 EDGE = 1.0e-5
 TINY_WEIGHT = 1.0e-9
-FREE = 2.5  # cells from solids that cut cells, beyond which a particle's way is not theirs
+FREE = 2.5  # cells from other solids beyond which these do not affect a particle's path
 
 VEC8 = wp.types.vector(length=8, dtype=wp.float32)
 

@@ -34,9 +34,10 @@ from warp_lcp.operators.grid_poisson import FLUID
 # Cells. The level set and velocities are extrapolated two layers into thicker solids, which cut
 # cells; in thinner solids these layers would overlap those of the other side.
 BARRIER = 3.0
-PARTS = {2: 6, 3: 3}  # points of a cell an axis, for the share of its kernel that its center sees
-PARTS_MOVING = {2: 4, 3: 2}  # the same, at each step
-COST = 256  # of a particle, in cells of a usual pass
+# Sample points per cell and axis, for the share of its kernel that its center sees.
+PARTS = {2: 6, 3: 3}
+PARTS_MOVING = {2: 4, 3: 2}  # sample points per cell and axis if solids move, in each step
+COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
 
@@ -105,7 +106,8 @@ class Barriers:
         """Find the cells, faces and neighbors that the solids separate."""
         grid, barrier = self.grid, self._barrier
         now = self._around()
-        before, self._window = self._window or now, now  # what is no longer near is marked so
+        # Cells that are no longer near are unmarked.
+        before, self._window = self._window or now, now
         low, high = [*map(min, now.low, before.low)], [*map(max, now.high, before.high)]
         self._all = Window.of(low, high, grid.device)
         self._all.launch(faces_kernels.near_kernel, [barrier, self.near])
@@ -297,7 +299,7 @@ class Barriers:
             dt: time step [s].
             start: places of the particles [m], shape (n,).
         """
-        if len(start) == 0:  # of a rank without material
+        if len(start) == 0:  # a rank without material
             return
         if len(self._aim) < len(start):
             self._aim = wp.empty(

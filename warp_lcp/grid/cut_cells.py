@@ -35,10 +35,10 @@ from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.operators.grid_poisson import SOLID
 
-CLOSE = 1.0  # cells from a solid within which the sides of a periodic axis must be alike
+CLOSE = 1.0  # cells from a solid within which the two sides of a periodic axis must agree
 NOWHERE: NodeBox = (0, 0, 0), (0, 0, 0)  # a box without nodes
 
-DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
+DEEP = 1e-2  # cells from a solid's surface within which a node lies on it
 
 
 class CutCells:
@@ -152,7 +152,8 @@ class CutCells:
         wp.copy(self.base, self._marks)
         # Nodes near the moving solids at the last update of the velocity.
         self._moved_from: NodeBox | None = None
-        self._moved_to: NodeBox | None = None  # and where they are
+        # Nodes near the moving solids at their current places.
+        self._moved_to: NodeBox | None = None
         moving = [
             (number, solid)
             for number, solid in enumerate(solids, start=1)

@@ -231,7 +231,7 @@ def velocity_kernel(
 
 
 options = {"module": "warp_lcp.grid.capacity"}
-COLORS = 3  # along an axis: as many cells as a kernel reaches over
+COLORS = 3  # colors along an axis: the width of a kernel in cells
 
 OPEN_CELLS = KERNELS["warp_lcp.grid.capacity.open_cells"]
 

@@ -11,8 +11,8 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.kernels import KernelFile
 
-BLOCKED = -1  # not to be filled
-UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
+BLOCKED = -1  # mark of faces that are not filled
+UNKNOWN = 0  # mark of faces to fill; positive: layer in which a face became known, 1 at the start
 # Layers around faces with weight: the range in which particles beyond its neighbors affect the
 # density of a cell.
 REACH = 2

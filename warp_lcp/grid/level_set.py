@@ -15,10 +15,10 @@ from warp_lcp.grid.staggered import COPY, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.window_reduction import WindowTally
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 
-REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
-QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL
+REACH = 1.5  # half the width of a cell's kernel [cells]
+QUANTILE = 3.7191  # quantile of the normal distribution at 1 - level_set_kernels.TAIL
 Fill = Callable[[Window, wp.array], None]
-PARTS = {2: 4, 3: 2}  # points an axis that a cell on the surface is sampled at
+PARTS = {2: 4, 3: 2}  # sample points per axis of a cell on the surface
 
 
 class LevelSet:

@@ -19,8 +19,8 @@ from warp_lcp.operators.grid_poisson import SOLID
 # a cell), and an empty wedge deep in the liquid would count as air, into which the liquid falls.
 # Such a cell gets its neighbors' distance.
 MIN_CAPACITY = 0.25
-TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
-EXTENDED = 2  # layers of cells without a distance of their own that are given one
+TAIL = 1e-4  # least filled share with a quantile, after smoothing
+EXTENDED = 2  # layers of cells to which the distance is extrapolated
 
 _CONSTANTS = {"MIN_CAPACITY": MIN_CAPACITY, "TAIL": TAIL, "SOLID": SOLID}
 KERNELS = KernelFile(Path(__file__).parent / "headers/level_set.h", _CONSTANTS)

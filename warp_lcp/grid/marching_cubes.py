@@ -25,7 +25,7 @@ import warp as wp
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 
-MOST = 5  # triangles of a cell
+MOST = 5  # most triangles of a cell
 EDGES = tuple(
     (corner, corner | 1 << axis)
     for axis in range(3)

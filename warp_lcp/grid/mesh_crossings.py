@@ -143,7 +143,7 @@ def find_crossings(
         d, e, f = triangle(points, corners, other)
         m = wp.normalize(wp.cross(e - d, f - d))
         line = wp.cross(n, m)
-        if wp.length(line) < wp.float64(1.0e-6):  # in parallel planes
+        if wp.length(line) < wp.float64(1.0e-6):  # the planes are parallel
             continue
         along = wp.normalize(line)
         h = wp.vec3d(

@@ -17,8 +17,8 @@ import numpy as np
 from warp_lcp.files.size_limits import check_claim
 
 FORMATS = (".obj", ".ply", ".stl")
-MARK = b"\xef\xbb\xbf"  # that some editors write before UTF-8 text
-WIDE = (b"\xff\xfe", b"\xfe\xff")  # and before UTF-16
+MARK = b"\xef\xbb\xbf"  # byte order mark that some editors write before UTF-8 text
+WIDE = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 # Words of a text STL after the first.
 STL_WORDS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", flags=re.MULTILINE | re.IGNORECASE)
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count
@@ -44,7 +44,7 @@ PLY_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": "
 PLY_CORNERS = ("vertex_indices", "vertex_index")
 LARGEST_INDEX = 2**31 - 1
 
-Corners = list[np.ndarray]  # of polygons, each of shape (count, corners)
+Corners = list[np.ndarray]  # blocks of polygons, each of shape (count, corners)
 
 
 def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from warp_lcp.kernels.compiler import forward_kernel
 # Lattice cells from the domain's side. Points that close the surface there are 0.01 off its other
 # sides.
 TOUCHING = 0.015
-ON_SIDE, ON_SOLID = 1, 2  # bits of a mark
+ON_SIDE, ON_SOLID = 1, 2  # bits of a point's mark
 # Lattice cells. Tolerance of a point on a solid: the accuracy of a distance that is linear between
 # nodes.
 NEAR = 0.25

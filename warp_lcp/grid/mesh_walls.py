@@ -26,12 +26,13 @@ OVERLAP = 0.03
 # Cells. Step of the differences that give grad d, and the least of a coordinate, which float32
 # rounds.
 STEP, ROUNDING = 0.01, 1.2e-5
-FARTHEST = 1.25  # cells that a point may move
-SHARP = 0.9  # cosine of the angle between normals: less is an edge of the solid
+FARTHEST = 1.25  # cells by which a point may move
+SHARP = 0.9  # cosine between normals below which there is an edge of the solid
 # Cells from the wall. A common point of planes farther from it belongs to no edge but to a round
 # surface.
 MISSED = 0.06
-SINGULAR = 0.05  # of the largest eigenvalue: directions in which planes do not tell where they meet
+# Fraction of the largest eigenvalue: along smaller ones the planes do not determine a point.
+SINGULAR = 0.05
 TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 TRIANGLE = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi / 3.0 * np.arange(3)])
 

@@ -24,16 +24,17 @@ from warp_lcp.kernels.host_kernel import HostKernel
 
 Vector = Sequence[float] | np.ndarray
 
-ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
+# Largest error of R R' - 1 of a pose; products of a few rotations stay near 1e-15.
+ROTATION_ERROR = 1e-9
 # [m/s] or [degrees/s], between keyframes of a smooth motion, whose cubics use squares and higher
 # powers.
 FASTEST = 1e18
-SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
+SPEED_SAMPLES = 4  # parts of a time span in which the top speed is evaluated
 TOP_SPEED = HostKernel(
     KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.motion.top_speed"]
 )
 PARTS = np.arange(SPEED_SAMPLES + 1.0)
-UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
+UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of an unbounded solid
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
@@ -409,7 +410,7 @@ class Motions:
             return 0.0
         n, m = len(self), SPEED_SAMPLES
         boxes = bounds if isinstance(bounds, np.ndarray) else boxes_of(bounds)
-        times = PARTS * ((time + span - time) / m) + time  # as np.linspace, which takes longer
+        times = PARTS * ((time + span - time) / m) + time  # as np.linspace, which is slower
         times[-1] = time + span
         R, t = self.poses(times)
         _, (fastest,) = TOP_SPEED.run((R, t, boxes, size), (), tasks=n, count=n, parts=m, span=span)

@@ -21,9 +21,9 @@ from warp_lcp.grid.solids_kernels import (
 )
 from warp_lcp.kernels.compiler import forward_kernel
 
-FAR = 4.0  # cells: distances below it are exact, others at least this large
-COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
-ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
+FAR = 4.0  # cells: smaller distances are exact, others at least this large
+COARSE = 3  # nodes along an axis of a group that is bounded by one distance
+ROUNDING = 1.0e-3  # cells: distances below this have no reliable sign
 # Mark of cells with distance 0 at all corners whose center is open: gaps of one cell.
 HOLLOW = 1
 
@@ -58,7 +58,7 @@ class ShapeGroup:
     """The shapes of a solid, and the box of nodes around it."""
 
     number: int
-    first: int  # of its shapes
+    first: int  # first of its shapes
     end: int  # one past the last
     low: wp.vec3i  # first node (x, y, z)
     high: wp.vec3i  # one past the last

@@ -30,9 +30,9 @@ CPU_GRAIN = 4096
 # Tasks per thread where particles add to planes of a field. Chunks that touch two tasks' planes are
 # read twice.
 SHARES = 2
-LEAST_PLANES = 4  # of a share
-PARTICLE = 16  # cells of a usual pass that a particle of one costs
-LIST_ROOM = 1.25  # of the threads of a captured launch over a list's entries
+LEAST_PLANES = 4  # least planes of a task
+PARTICLE = 16  # work of a particle in a pass, in cells of a usual pass
+LIST_ROOM = 1.25  # factor on the threads of a captured launch over a list's entries
 # Distance that particles keep from walls, in cells: well above the rounding of float32 positions in
 # 10^3 cells.
 MARGIN = 1e-3

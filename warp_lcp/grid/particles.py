@@ -21,17 +21,17 @@ from warp_lcp.kernels.memory import RowsMemory, Scalar, Slot, rows_memory
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.vectors import Tally
 
-CHUNK = 256  # the fewest particles that one thread adds up
-THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
-CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
+CHUNK = 256  # fewest particles that one thread sums up
+THREADS = 1024  # most threads of a sum; the host adds their partial results
+CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # likewise on a GPU
 # Growth of the storage when it is full: n appended particles are copied at most 2 n times, and at
 # most a third of the storage is unused.
 GROWTH = 1.5
 # Pieces of the keys in a sort. With more, the sums between two passes take longer.
 SORT_PIECES = 32
 # Places of particles in the order of all ranks' particles, see `warp_lcp.distributed.particles`.
-MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
-NEW = 1 << 62  # places from which on particles have come since the last sort
+MOST_A_CELL = 1 << 20  # particles; all places of a cell are numbers below those of the next cell
+NEW = 1 << 62  # first place of particles that were added since the last sort
 SORTED, UNSORTED = 0, 1  # steps in which `arrange` sorts, and in which it need not
 # Steps between sorts if nothing needs the order. At CFL 2 the transfers get no slower within 16
 # steps; a sort costs 25 ns a particle.
@@ -175,7 +175,7 @@ class Particles:
 
     runs: wp.array | None = None
     _order: wp.array  # scratch memory, as large as `key`
-    _spare: Column  # where the next reordered column goes
+    _spare: Column  # memory of the next reordered column
 
     def __init__(
         self,
@@ -218,8 +218,8 @@ class Particles:
             self._sort_rows, self._sort_pieces = RowsMemory(), Scalar()
             self._counts = wp.zeros(0, dtype=wp.int32, device=device)
         self._last: ParticleTotals | None = None
-        self._totals_launched = False  # of the particles as they are, on a GPU
-        self._known: ParticleTotals | None = None  # that are right
+        self._totals_launched = False  # whether a GPU has the sums of the current particles
+        self._known: ParticleTotals | None = None  # current sums
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
         self.exchange = grid.part.exchange_of(self)
@@ -469,7 +469,7 @@ class Particles:
         self._spare = Column(self._capacity, self.count, device)
         self.key = zeros(2 * self._capacity, wp.int32, device)
         self._order = zeros(2 * self._capacity, wp.int32, device)
-        self._sorting.forget()  # which knows the halves of both
+        self._sorting.forget()  # its recorded launches use both halves
 
     def arrange(self, step: int) -> None:
         """Number the particles by cell, with ghosts on ranks; collective.

@@ -160,7 +160,7 @@ class _Shape(ABC):
     invert: bool = False
 
     kernel: ClassVar[Any]
-    cost: ClassVar[int] = 8  # of a point, in cells of a usual pass
+    cost: ClassVar[int] = 8  # work of a point, in cells of a usual pass
 
     def signed_distance(
         self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)

@@ -23,7 +23,7 @@ class ShapeFrame:
 
     inverse_rotation: wp.mat33
     translation: wp.vec3
-    scale: float  # that distances come back times
+    scale: float  # factor on distances
     sign: float  # -1: the shape is inverted
 
 
@@ -180,12 +180,12 @@ class Block:
 
     low: wp.vec3i
     high: wp.vec3i  # one past the last
-    counts: wp.vec3i  # of items
+    counts: wp.vec3i  # numbers of items
     origin: wp.vec3i  # cells of a larger grid before the first
     stride: int
     flat: bool  # 2-D: z does not count
     spacing: float  # [m]
-    offset: float  # of an item's point from its low node, in cells
+    offset: float  # offset of an item's point from its low node, in cells
 
 
 @wp.func

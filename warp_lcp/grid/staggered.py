@@ -40,7 +40,7 @@ CLEAR: dict[typing.Any, StencilKernel] = {
     for dtype in (wp.int8, wp.float32, wp.float64)
 }
 COPY = KERNELS["warp_lcp.grid.copy_box.copy"]
-SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
+SEGMENT = 8  # cells of a row that are visited together in an active window
 
 
 @wp.struct
@@ -51,7 +51,7 @@ class CellRange:
     begin: int
     finish: int
     rows: int
-    chunks: int  # of a row
+    chunks: int  # chunks of a row
     k: int
     j: int
     i: int
@@ -287,7 +287,7 @@ class _RangeMemory:
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
         self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA now
-        self.room: tuple[int, ...] = (1, 1, 1)  # at most so far
+        self.room: tuple[int, ...] = (1, 1, 1)  # largest dimensions so far
 
     def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
         """Set the CellRange on CUDA, with its threads."""
@@ -325,9 +325,9 @@ class ActiveWindow(Window):
     sizes: tuple[Scalar, Scalar]
     pieces: Scalar
     hulls: Slot
-    _rows: tuple[RowsMemory, RowsMemory]  # of passes, of passes that sum
-    _sums: dict[int, DeviceRows]  # of passes that sum over columns of so many planes, on CUDA
-    _ranges: tuple[_RangeMemory, _RangeMemory]  # of kernels for cells, for rows
+    _rows: tuple[RowsMemory, RowsMemory]  # rows of passes, and of passes that sum
+    _sums: dict[int, DeviceRows]  # rows of passes that sum over columns of so many planes, on CUDA
+    _ranges: tuple[_RangeMemory, _RangeMemory]  # ranges of kernels for cells, and for rows
     _now: Window
 
     def __init__(self, window: Window) -> None:

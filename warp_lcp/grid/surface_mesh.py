@@ -27,16 +27,17 @@ from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 # Particle distances. Standard deviation of the narrowest kernel without gaps, the quadratic
 # B-spline.
 SHARPEST = 0.5
-EXTENDED = 2  # layers that the distance is continued into solids, and the velocity into air
+EXTENDED = 2  # layers to which the distance is extrapolated into solids, and the velocity into air
 # Largest smoothed share that a lone particle is assumed to have. Kernels as narrow as particles
 # cannot distinguish it from others.
 CROWD = 0.1
 # Rounds of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume.
 ROUNDS = 3
-SEEN = 2 * ROUNDS + 1  # lattice cells around one that its points depend on by the smoothing
-OUTSIDE = 1.0  # of the surface, in the ring at cuts
-MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9  # a lattice cell, and more where there are solids
-MESH_POINT_BYTES = 80  # a point, its triangles and its velocity included
+SEEN = 2 * ROUNDS + 1  # lattice cells around a cell that its smoothed points depend on
+OUTSIDE = 1.0  # value outside of the surface, in the ring at cuts
+# Bytes of a lattice cell; and more where there are solids.
+MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9
+MESH_POINT_BYTES = 80  # bytes of a point, with its triangles and its velocity
 
 
 def surface_layers(parts: int) -> int:
@@ -128,7 +129,7 @@ class SurfaceMesh:
             )
         self.grid, self.obstacles, self._parts = grid, obstacles, parts
         self.lattice = grid.refined(parts)
-        distance = parts / per_axis  # of particles at rest, in lattice cells
+        distance = parts / per_axis  # distance of particles at rest, in lattice cells
         self._each = distance**grid.dimension
         self._thin_passes, self._passes = (
             max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing)

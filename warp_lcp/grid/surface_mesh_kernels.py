@@ -10,7 +10,7 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import SOLID
 
-FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
+FAR = 2.0  # lattice cells: beyond this distance a solid does not reduce the liquid
 # Share of a kernel. Where less is open, the distance is extrapolated from outside the solid.
 LEAST_OPEN = 0.25
 # A particle is amplified by gain ((THIN / share)^POWER - 1) where the smoothed share is below THIN:

@@ -25,13 +25,13 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import copy
 
-THIN = 3.0  # cells: what is thinner is met as its exact shape
-SHEET = 1.0  # cells: rigid bodies of at least that cut cells
-STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
+THIN = 3.0  # cells: particles meet thinner solids as exact shapes
+SHEET = 1.0  # cells: rigid bodies of at least this thickness cut cells
+STRIDE_ROOM = 0.5  # cells by which a moving solid must be thicker than its largest step
 # Cells by which shapes are enlarged, so that there is no crack between shapes that touch.
 SKIN = 1e-4
-THIN_SHARE = 1e-3  # of a mesh's surface that must be thin for that
-COST = 32  # of a particle, in cells of a usual pass
+THIN_SHARE = 1e-3  # least share of a mesh's surface that is thin, for the mesh to be thin
+COST = 32  # work of a particle, in cells of a usual pass
 Simple = Box | Sphere | Capsule | TriangleMesh
 
 
@@ -207,7 +207,7 @@ class ThinWalls:
     def remember(self, position: wp.array) -> None:
         """Store the positions of particles [m], shape (n,), before they move."""
         count = len(position)
-        if count == 0:  # of a rank without material
+        if count == 0:  # a rank without material
             return
         if len(self._start) < count:
             room = count + count // 4

@@ -11,13 +11,13 @@ from warp_lcp.grid.cell_kernel import POINTS, list_kernel
 
 MODULE = "warp_lcp.grid.thin_walls"
 BOX, SPHERE, CAPSULE, MESH = 0, 1, 2, 3
-PUSHES = 4  # times that a particle is put off the solids that it starts in, each of them in turn
-SLIDES = 12  # walls that a particle slides along in a step, one after another
-ROUNDS = 8  # how often a path is looked at again among solids of different motions
-ROOM = 0.25  # of the distance that particles keep, that they have in corners at least
-HALVINGS = 6  # of a way into a corner, until there is that room
-MISS = 2.0  # a parameter of a path beyond its end
-ENDLESS = 1.0e30  # half extent [m] of a box without ends
+PUSHES = 4  # most times that a particle is moved off the solids that it starts in, each in turn
+SLIDES = 12  # most walls along which a particle slides in a step
+ROUNDS = 8  # most traces of a path among solids of different motions
+ROOM = 0.25  # least distance in corners, as a fraction of the distance that particles keep
+HALVINGS = 6  # most halvings of a path into a corner, until there is that room
+MISS = 2.0  # parameter of a path beyond its end
+ENDLESS = 1.0e30  # half extent [m] of an unbounded box
 
 _ONE, _ZERO, _MISS = (
     wp.constant(wp.float64(1.0)),
@@ -39,7 +39,7 @@ class ThinShape:
     turn: wp.mat33d
     shift: wp.vec3d
     half: wp.vec3d  # half extents of a box, axis of a capsule from its start [m]
-    radius: wp.float64  # of a sphere or capsule; of a mesh: its unit of length [m]
+    radius: wp.float64  # radius of a sphere or capsule; unit of length of a mesh [m]
     mesh: wp.uint64
     low: wp.vec3d  # corners of a box around it, in the group's frame [m]
     high: wp.vec3d
@@ -52,7 +52,7 @@ class ThinGroup:
     A point p of the group is at x = turn p + shift, before and after a step.
     """
 
-    first: int  # of its shapes
+    first: int  # first of its shapes
     end: int
     turn_before: wp.mat33d
     shift_before: wp.vec3d

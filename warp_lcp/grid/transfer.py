@@ -31,7 +31,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.memory import Scalar, value_of
 
-TINY_WEIGHT = 1e-9  # below it a face counts as untouched
+TINY_WEIGHT = 1e-9  # least weight of a face that particles touch
 # A particle exactly on the boundary between cells would leave one face of its own cell without
 # weight, hence without gravity.
 EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}

@@ -92,10 +92,11 @@ BUILTIN: dict[str, Callable[[], Triangles]] = {"torus": torus, "knot": knot}
 
 
 BUILTIN_PREFIX = "builtin:"
-WELD = 1e-6  # of the mesh's diagonal: coarser than float32 coordinates, far finer than a cell
-FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has none
-NO_VOLUME = 1e-9  # of the mesh's diagonal cubed
-LARGEST = 1e18  # of a coordinate, as of a scene's numbers
+# Fraction of the mesh's diagonal: coarser than float32 coordinates, far finer than a cell.
+WELD = 1e-6
+FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has no area
+NO_VOLUME = 1e-9  # least volume, as a fraction of the mesh's diagonal cubed
+LARGEST = 1e18  # largest coordinate, as for numbers of a scene
 # Vertices to merge with each, at most on average. With more, the mesh has shrunk to a point beside
 # a stray vertex.
 CLOSE_VERTICES = 64

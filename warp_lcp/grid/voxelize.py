@@ -20,8 +20,8 @@ from warp_lcp.grid.staggered import StaggeredGrid
 
 OPEN = -1
 DOMAIN_WALL = 0
-STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
-THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
+STRAY = 0.5  # cells by which a mesh may reach out of the domain without a warning
+THIN_SHARE = 0.01  # share of a mesh's surface above which thin parts cause a warning
 # Share of a mesh's surface. More area that is inside out is no blemish: its inside would be
 # missing.
 INVERTED_SHARE = 0.01

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Columns of cells, one a thread, into which a GPU cuts a grid: some waves of the largest GPUs.
 CUDA_SUMS = 1 << 20
-CUDA_PLANES = 16  # of one of them, at least
+CUDA_PLANES = 16  # least planes of a column
 
 ADD_ROWS = KERNELS["warp_lcp.grid.window_reduction.add_rows"]
 

@@ -25,9 +25,9 @@ from warp_lcp.material.boundary import Boundary
 # [cells^2] Least second moment about an axis, per particle, of a body whose rotation the grid
 # resolves.
 NARROW = 1.0
-ROOM, LEAST = 2, 64  # of bodies that memory is for, over those there are; at least
-VECTORS = 5  # of a body that kernels need
-Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
+ROOM, LEAST = 2, 64  # allocated bodies: a factor on their number, and a minimum
+VECTORS = 5  # vectors of a body that kernels read
+Sums = np.ndarray  # results of `kernels.add_up`, float64, shape (bodies, COLUMNS)
 NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 
 
@@ -88,7 +88,7 @@ class BallisticFragments:
         self._numbers = BodyNumbers(0)
         self._growing = LaunchGraph(grid.device, self._launch_growth)
         self._rate, self._quanta = Scalar(), Scalar()  # see `flight_kernels.add_up`
-        self._list = ListMemory(grid.device)  # of the bodies' particles
+        self._list = ListMemory(grid.device)  # list of the bodies' particles
         self._vectors, self._start = (
             np.zeros((0, VECTORS, 3), dtype=np.float32),
             wp.zeros(0, dtype=wp.vec3, device=grid.device),
@@ -277,7 +277,7 @@ class BallisticFragments:
         if self._settles:
             share[:] = 1.0
         push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
-        share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
+        share[after[:, kernels.LEAVES] > 0.0] = -1.0  # the body meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift
         self._tell(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
         self._landing.run(particles)

@@ -538,7 +538,7 @@ class CutBoundary:
             self._find_walls()
 
     def _find_walls(self) -> None:
-        walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third
+        walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # 2-D does not use the third
         self.grid.domain.launch(
             kernels.touch_cut_kernel, [self.grid.planes, *walls, self.cut.separating, self.touch]
         )

@@ -10,8 +10,8 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 TOUCHES_NOTHING = 0  # no solid face
-HELD = 1  # a wall cell whose material stays on its walls
-RELEASED = 2  # a wall cell whose material is leaving
+HELD = 1  # a wall cell whose material stays at its walls
+RELEASED = 2  # a wall cell whose material separates
 
 TOUCHES = 1  # bits of `touch`: a face of the cell is not open,
 LETS_GO = 2  # and one of those belongs to a wall that separates

@@ -32,8 +32,8 @@ CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} |
     # Least density by which displacements are divided: thin spray need not take up the excess of a
     # full cell.
     "LEAST_DENSITY": 0.5,
-    "LEAST_CAPACITY": 0.1,  # that densities are divided by there
-    "HALF": 0.5,  # of what a cell holds: with less it is at the surface
+    "LEAST_CAPACITY": 0.1,  # least capacity by which densities are divided there
+    "HALF": 0.5,  # share of what a cell can hold; a cell with less is at the surface
 }
 
 
@@ -58,8 +58,9 @@ def add_kernel(
     sum[0] = a[0] + b[0]
 
 
-LONGEST = 0.5  # cells that a correction moves a particle at most
-EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
+LONGEST = 0.5  # cells by which a correction moves a particle at most
+# Root mean square excess of overfull cells that is not worth a solve, relative to a cell.
+EXCESS = 1e-3
 # Fraction of the diagonal. It gives closed pockets a solution, and leaves 0.5 % of the excess 45
 # cells deep.
 SHIFT = 1e-5
@@ -88,7 +89,8 @@ class DensityMonitor:
         )
         self._crowd = WindowTally(CROWD, grid, grid.part.owned)
         self._density: wp.array | None = None
-        self._known: tuple[float, float] | None = None  # what was found since the last `measure`
+        # Result of the last `measure`, once it has been read.
+        self._known: tuple[float, float] | None = None
         self._trail, self._cells = DirtyRegion(grid.part.owned), ActiveWindow(grid.domain)
         self._measuring = LaunchGraph(grid.device, self._launch)
 
@@ -282,7 +284,7 @@ class DensityCorrection:
         self._copied: list[tuple[wp.array, wp.array]] = []
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
-        self._way = Scalar()  # by which the displacement is multiplied [m]
+        self._way = Scalar()  # factor on the displacement [m]
         launches = (
             self._launch_preparation,
             self._launch_displacement,

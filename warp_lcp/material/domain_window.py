@@ -24,12 +24,14 @@ LEAST_CELLS = 1 << 18
 # Cells, at most, of a new grid beyond the required ones on each side; or an eighth of the required
 # cells, if that is more.
 SPARE = 8
-AHEAD = 16  # steps that it is laid for, as the material moves now
-START = 10  # cells around a material at the start that its first steps reach
-MOST = 0.5  # of the domain's cells that a part may have; else the grid covers all of it
-LARGE_CELLS, MOST_OF_LARGE = 1 << 26, 0.9  # of a domain whose cells, all of them, are much memory
-SPARSE = 32.0  # times as many cells as a material fills: a grid that has more is hardly written to
-LOOSE = 3.0  # times the cells of a grid that would be laid now: one that has more is laid anew
+AHEAD = 16  # steps for which a new grid suffices at the material's current speed
+START = 10  # cells around the initial material that its first steps reach
+MOST = 0.5  # largest share of the domain's cells in a part; else the grid covers the whole domain
+# Cells from which a domain needs much memory, and that share for it.
+LARGE_CELLS, MOST_OF_LARGE = 1 << 26, 0.9
+# Multiple of the cells that a material fills: most memory of a larger grid stays unwritten.
+SPARSE = 32.0
+LOOSE = 3.0  # multiple of the cells of a new grid: a larger grid is rebuilt
 
 FAR = 1 << 30  # cells: beyond any domain
 

@@ -15,9 +15,10 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
 
-COLUMNS = 18  # of a body's sums, see `add_up`
-LEAVES = 17  # of them, the particles that come near a wall or an open side
-MOST_STRIDES = 1024  # of a way, a cell each, as far as particles go in a step
+COLUMNS = 18  # columns of a body's sums, see `add_up`
+LEAVES = 17  # column: number of particles that come near a wall or an open side
+# Most strides of a path, one cell each: the longest move of a particle in a step.
+MOST_STRIDES = 1024
 
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -38,7 +39,7 @@ class Flight:
     inverse_dx: float  # [1/m]
     origin: wp.vec3i  # cells of a larger grid before the first one of this
     who: Integers  # the particles of all bodies
-    body: Integers  # of each of them
+    body: Integers  # body of each particle
     sums: wp.array2d(dtype=wp.int64)
 
 

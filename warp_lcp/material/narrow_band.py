@@ -57,10 +57,10 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 # Cells below the band in which depths are resolved: a depth that is advected into the band must
 # have a slope.
 BEYOND = 3.0
-DEEP = 2.0  # cells below the surface from which on a cell counts as full whatever particles say
-REACH = 1.5  # of a cell's kernel, in cells
-FALLS = 2  # passes over rows, back and forth, after which most depths are found
-UNEVEN = 0.1  # how far the interior's density may differ from that at rest
+DEEP = 2.0  # depth in cells from which a cell counts as full, whatever its particles
+REACH = 1.5  # half the width of a cell's kernel [cells]
+FALLS = 2  # passes over rows, forth and back, after which most depths are final
+UNEVEN = 0.1  # largest difference of the interior's density from that at rest
 
 
 class NarrowBand:
@@ -138,7 +138,7 @@ class NarrowBand:
         )
         self._last = Scalar(), Scalar()  # plane and row of the window
         self._each, self._at_rest, self._way, self._behind = (Scalar() for _ in range(4))
-        self._shift = Scalar(), Scalar(), Scalar()  # of fresh particles' lattice
+        self._shift = Scalar(), Scalar(), Scalar()  # shift of fresh particles' lattice
         launches = (
             self._launch_depth,
             self._fall,

@@ -11,8 +11,8 @@ from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
-INSET = 1e-3  # of a cell: particles are put no nearer to its faces
-COLUMNS = 15  # of a row's sums, see `sum_kernel`
+INSET = 1e-3  # least distance of new particles from a cell's faces [cells]
+COLUMNS = 15  # columns of a row's sums, see `sum_kernel`
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -109,7 +109,7 @@ def blend_kernel(
         a = i - wp.where(axis == 0, 1, 0)
         here = base[k, j, i] != _SOLID
         below = base[c, b, a] != _SOLID
-        mean = float(-1.0)  # of the open cells beside the face
+        mean = float(-1.0)  # mean over the open cells beside the face
         if here and below:
             mean = 0.5 * (depth[k, j, i] + depth[c, b, a])
         elif here:

@@ -194,7 +194,8 @@ def make_boundary(
         grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered
     )
     if wall_velocity is None and scene.source:
-        wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
+        # Memory for the velocities of sources' faces.
+        wall_velocity = np.zeros((1 + len(placed), 3))
     return WholeCells(
         grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes
     ), voxels.notes
@@ -222,7 +223,8 @@ def make_thin_walls(
         crossing: only those that are too thin to cut cells; of rigid bodies only sheets, since
             other bodies are pushed by the pressure through the cells that they cut.
     """
-    walls = {False: THIN, True: max(THIN, scene.time.cfl + STRIDE_ROOM)}  # by whether they move
+    # Thickness limit by whether solids move.
+    walls = {False: THIN, True: max(THIN, scene.time.cfl + STRIDE_ROOM)}
 
     def suits(solid: PlacedSolid) -> bool:
         shape, dx, is_body = solid.geometry, grid.spacing, isinstance(solid.motion, BodyMotion)
@@ -387,7 +389,7 @@ def make_particles(
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    indexed = True if grid.barriers is not None else None  # what is near those gathers
+    indexed = True if grid.barriers is not None else None  # transfers near barriers gather
     affine, kept = scene.particles.transfer == "apic", kept_by(scene, owner)
     return Particles(grid, position, velocity, affine=affine, kept=kept, indexed=indexed), notes
 

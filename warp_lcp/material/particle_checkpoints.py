@@ -187,7 +187,7 @@ class ParticleCheckpoints(ParticleFrames):
         if found is not None and found is not part:
             self._work_on(found)
         self._take_pieces(pieces, expected)
-        if found is None:  # in boxes that were laid for the start
+        if found is None:  # the boxes are those of the start
             self.particles.totals()
             self.rebalance()
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.grid.particles import ParticleTotals
 
-Row = dict[str, float | int | str | None]  # of the log
+Row = dict[str, float | int | str | None]  # a row of the log
 
 COLUMNS = (
     "particles",

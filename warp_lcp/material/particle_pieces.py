@@ -11,8 +11,8 @@ from warp_lcp.material.particle_redistribution import STATE
 # One rank's piece of a simulation's state. The last axes of fields of cells are z, y, x.
 Piece = Mapping[str, np.ndarray]
 
-ALIKE = ("bodies", "body_contacts")  # tables of what all ranks have
-LATER = {STATE: np.float64}  # there once particles have been moved apart
+ALIKE = ("bodies", "body_contacts")  # tables that are the same on all ranks
+LATER = {STATE: np.float64}  # arrays that exist after the first density correction
 
 
 def fields_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -23,7 +23,7 @@ from warp_lcp.simulation import Stopwatch
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 STATE = "density_correction"
-PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes out what crowds
+PACE = 2.0  # factor on sqrt(dx / g): time in which an automatic correction removes the excess
 
 
 class ParticleRedistribution:

@@ -22,25 +22,25 @@ from warp_lcp.scene.table import Complaint, Table
 from warp_lcp.settings import Count, CountOrZero, Part, Share
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
-GRID_BYTES = 36  # fields of the grid, a cell
+GRID_BYTES = 36  # fields of the grid, per cell
 CUT_BYTES = 45
 MOVING_BYTES = 30
 SOURCE_BYTES = 8
 # Bytes a cell of the density correction's fields and method; and more where cells are cut.
 CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22
-EVEN_BYTES = 9  # and more where it closes voids
+EVEN_BYTES = 9  # and more where the correction closes voids
 RESEED_BYTES = 13
 BAND_BYTES = 24
-FLIGHT_BYTES = 10  # what says which cells belong to bodies in flight
+FLIGHT_BYTES = 10  # marks of the cells of airborne bodies
 # Largest growth of a narrow band with its surface: 1.3 times in a double dam break, 1.7 in a dam
 # break in 3-D.
 SPREAD = 2.0
-PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
+PLANES = 2.5  # planes for which a 2-D cell counts: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
-SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
+SEEDING_BYTES = 136  # a particle on the host, before the solver is made
 # Fraction of the distance of particles: the error of their float32 coordinates on 4096 cells.
 SITE_SLACK = 1e-3
-LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
+LATTICE_BYTES = 50  # a point of one plane of cells, while particles are selected
 
 
 class Reseed(Table):
@@ -112,7 +112,7 @@ class ParticleScene(Scene):
 
     # Bytes a cell of the solve's fields that exist before the particles are made.
     solve_bytes: ClassVar[int] = 0
-    correction_gain: ClassVar[float] = 1.0  # of the density correction
+    correction_gain: ClassVar[float] = 1.0  # gain of the density correction
     # Fraction of the material in excess, times particles.per_axis. A pool at rest has 1e-3 / 3e-5
     # at 1 / 2, a splash 1e-2.
     crowded: ClassVar[float] = 2e-3

@@ -158,7 +158,7 @@ class ParticleSimulation(ParticleCheckpoints):
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
-        self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
+        self._columns: tuple[str, ...] | None = None  # columns of the log, after their first use
         # [m]. A tent at the very end would reach beyond the stored cells.
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]

@@ -10,7 +10,7 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.simulation import Volume
 
-VOLUME_BYTES = 13  # a cell: the level set's fields
+VOLUME_BYTES = 13  # fields of the level set, per cell
 
 
 class ParticleVolume:

@@ -36,7 +36,7 @@ def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -
     cells = grid.interior(simulation.own_state()["cells"])
     free = (cells == wl.AIR) & (grid.interior(boundary.base.numpy()) != wl.SOLID)
     i, j, k = simulation.particles.cells_of(simulation.particles.position.numpy()).T
-    free[k, j, i] = False  # where material has gone since the last solve
+    free[k, j, i] = False  # cells that material has entered since the last solve
     region = region_of(shape.to_geometry(Path.cwd(), grid.dimension), boundary, grid.device)
     points, _ = seed(
         grid,

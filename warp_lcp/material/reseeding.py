@@ -18,7 +18,7 @@ from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material import reseeding_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
-COST = 8 * PARTICLE  # of a cell that wants particles, in cells of a usual pass
+COST = 8 * PARTICLE  # work of a cell that wants particles, in cells of a usual pass
 
 
 class Reseeding:

@@ -22,10 +22,10 @@ from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
 
-NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
-GRAZED = 1e-9  # of a way: less than that in a cell is rounding
-FILLED = 0.5  # of a full cell's particles: a source that starts fills cells that hold fewer
-JAMMED = 2.0  # cells that hold more than this share get no more
+NOW = 1e-9  # s: rounding error of a time at which a step ends
+GRAZED = 1e-9  # fraction of a path: a shorter piece in a cell is rounding
+FILLED = 0.5  # fraction of a full cell: a source that starts fills cells with less
+JAMMED = 2.0  # fraction of a full cell: a cell with more gets no more particles
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Sources:
                 (cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1
             )
         self._moving_walls = boundary.velocity if not boundary.open else []
-        self._running: list[bool] | None = None  # what the device knows of it
+        self._running: list[bool] | None = None  # values on the device; None if not set
         self._imposing, self._counting = (
             LaunchGraph(device, record) for record in (self._impose, self._count)
         )
@@ -343,7 +343,8 @@ class Sources:
                 int(GROWTH * count),
                 zeros(6 * int(GROWTH * count), wp.int32, self.grid.device),
             )
-            for place, name in enumerate(self._points):  # in one memory, which is read by one copy
+            # One memory for all arrays, so that one copy reads them.
+            for place, name in enumerate(self._points):
                 kind = wp.vec3 if name == "point" else wp.int32
                 self._points[name] = wp.array(
                     ptr=memory.ptr + 4 * place * size,
@@ -481,7 +482,7 @@ class Outlets:
     def __init__(self, grid: StaggeredGrid, drains: Sequence[Drain], open_sides: int) -> None:
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
         self._store, self._slot = zeros(0, wp.float32, grid.device), Slot()
-        self._distance = self._store  # of as many as there are particles
+        self._distance = self._store  # view of as many entries as there are particles
         self._leaving = LaunchGraph(grid.device, self._launch)
 
     def apply(self, particles: Particles, before: float, now: float) -> tuple[int, int]:

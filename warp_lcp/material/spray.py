@@ -16,14 +16,15 @@ from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.memory import Scalar
 
-EVERY = 8  # steps between looks for particles that have left the others
-TILE = 8  # cells: clusters of particles are told apart by empty tiles between them
-FEW = 8  # particles: no more make a cluster that flies off the grid
+EVERY = 8  # steps between searches for particles that have left the others
+TILE = 8  # cells of a tile; empty tiles separate clusters of particles
+FEW = 8  # most particles of a cluster that leaves the grid
 # Cells from the box around all other particles at which a cluster leaves the grid; it returns at
 # half of that.
 AWAY = 2 * TILE
-MOST_TILES = 1 << 22  # else they are larger
-CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
+MOST_TILES = 1 << 22  # most tiles; they are larger if there would be more
+# Cells from a solid or wall, in addition to a step's path, within which particles stay on the grid.
+CLEAR = 3
 
 
 @list_kernel("warp_lcp.material.spray")
