@@ -3,27 +3,27 @@
 Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962].
 Three ways:
 
-Particles among whole cells (`advect`) never enter a SOLID one. Every stage walks from cell to cell:
-a particle that meets a closed face stops before it and slides along it. Whole-cell solids need no
-distance, and a distance would not work: pushing particles out along it strands them in SOLID cells.
-The number of cells to the nearest solid shows which particles cannot be stopped; only the others
-walk.
+Particles among whole cells (`advect`) never enter a SOLID cell. Every stage walks from cell to
+cell: a particle that meets a closed face stops before it and slides along it. A distance would not
+work here: pushing particles out along it strands them in SOLID cells. The number of cells to the
+nearest solid shows which particles cannot be stopped; only the others walk.
 
-Particles among walls that are given by their distance (`advect_with_distance`). One whose distance
-to walls exceeds its way needs no care. The others go in strides that the distance allows, but of
-half a cell at least, so that one that rests on a wall gets on; whoever ends a stride too near a
-wall or inside it is put back along the normal. On a plane that takes just the normal part from the
-way. The rest of the way loses its part into the wall, and between two walls all but the part along
-their edge. A stride that would end on another side of a wall is halved, so that plates of more than
-a cell are not tunnelled at any speed. Positions are measured by the distance that is interpolated
-between nodes, which defines where solids are, and by that to the domain's walls.
+Particles among walls that are given by their distance (`advect_with_distance`) move freely if their
+distance to walls exceeds their path. The others move in strides that the distance allows, but of
+half a cell at least, so that a particle at rest on a wall can move. A particle that ends a stride
+too near a wall or inside it is put back along the normal; on a plane this removes just the normal
+part of the path. The rest of the path loses its part into the wall, and between two walls all but
+the part along their edge. A stride that would end on another side of a wall is halved, so that
+particles do not tunnel through plates of more than a cell at any speed. The distance is
+interpolated between nodes, which defines where solids are, and combined with that to the domain's
+walls.
 
 Fields (`carry_field`): f(x, t + dt) = f(y, t), where y is found by such a step back along the
-velocity, so that they go the same way as particles. A velocity is interpolated by cubics through
-four nodes along each axis (Catmull and Rom's), kept within the range of the 2^dimension nodes
-around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80 steps,
-with linear interpolation 23 %. A distance is interpolated linearly, which is exact where it is one
-to a plane.
+velocity, so that fields and particles follow the same path. A velocity is interpolated by cubics
+through four nodes along each axis (Catmull and Rom's), limited to the range of the 2^dimension
+nodes around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80
+steps, with linear interpolation 23 %. A distance is interpolated linearly, which is exact for the
+distance to a plane.
 """
 
 import functools
@@ -225,8 +225,8 @@ def advect_with_distance(
 
     No particle ends within MARGIN cells of a wall unless it started there.
 
-    Where no way back out of a wall is found within a cell, a particle stays where its last stride
-    was open. A move goes at most 1024 cells, and 32 along walls.
+    Where no place outside of a wall is found within a cell, a particle stays where its last open
+    stride ended. A move goes at most 1024 cells, and 32 along walls.
 
     Args:
         grid: the grid.

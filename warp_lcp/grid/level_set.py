@@ -25,16 +25,16 @@ class LevelSet:
     """Level set: signed distance of cell centers to the liquid's surface.
 
     The density is the sum of the particles' quadratic B-splines at the cell's center, in units of
-    the density at rest. Divided by the capacity, what the cell's kernel can hold beside solids, it
-    is the filled share of the kernel, and phi is the distance at which a half space fills that
-    share: unbiased for a plane along an axis, at a wall that the plane is perpendicular to as well,
-    without a radius to tune. A plane across the axes is off by up to 0.01 cells. A film on a wall
+    the density at rest. Divided by the capacity, the open share of the cell's kernel beside solids,
+    it is the filled share of the kernel, and phi is the distance at which a half space fills that
+    share. For a plane along an axis this is unbiased, without a radius to tune, also at a wall
+    perpendicular to the plane. A plane across the axes is off by up to 0.01 cells. A film on a wall
     within the kernel's reach looks too thin: phi is 0 with the liquid still 0.11 cells above the
     center of a cell that the wall bounds, 0.36 above a center that lies on the wall.
 
     Binomial passes (1, 2, 1)/4 over density and capacity make the kernel wider and closer to the
-    normal distribution of variance 1/4 + passes/2, whose quantile phi then is. They quiet a surface
-    at rest and erase thin fronts.
+    normal distribution of variance 1/4 + passes/2; phi is then its quantile. They remove noise from
+    a surface at rest, and erase thin fronts.
 
     Args:
         grid: the grid.

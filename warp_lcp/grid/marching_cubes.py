@@ -2,16 +2,16 @@
 
 Closed, without duplicate points; segments in 2-D.
 
-One thread takes a row of cells, and knows from a scan where its points and triangles go. A point
+One thread takes a row of cells; a prefix sum gives the places of its points and triangles. A point
 belongs to the node at the low end of its edge; a node's points are numbered x, y, z from the number
-that the node keeps.
+that the node stores.
 
-The triangles of a case are worked out from the cube instead of typed in. Corner c of a cell lies at
-(c & 1, c >> 1 & 1, c >> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a +
-b runs along axis a from the b-th of the four corners that are low along it. On a face each run of
-inside corners is cut off by a segment, so that two cells see the same segments on the face between
-them: the surface is closed. No triangle has an edge within a face that is no segment, so that each
-of its edges belongs to two triangles.
+The triangles of a case are computed from the cube. Corner c of a cell lies at (c & 1, c >> 1 & 1, c
+>> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a + b runs along axis a
+from the b-th of the four corners that are low along it. On a face each run of inside corners is cut
+off by a segment, so that two cells have the same segments on the face between them: the surface is
+closed. A triangle has no edge within a face except segments, so that each of its edges belongs to
+two triangles.
 """
 
 import functools

@@ -2,9 +2,9 @@
 
 A motion is a pose over time, relative to the placement in the scene.
 
-All motions are functions of time alone, in float64: a solid that turns for a million steps has not
-drifted, and a run that is resumed sees the same poses. Points and directions are those of the
-domain [m]; two coordinates mean z = 0, and a 2-D scene turns about z.
+All motions are functions of time alone, in float64: a solid that turns for a million steps does not
+drift, and a resumed run has the same poses. Points and directions are those of the domain [m]; two
+coordinates mean z = 0, and a 2-D scene turns about z.
 """
 
 from __future__ import annotations

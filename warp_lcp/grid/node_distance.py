@@ -1,8 +1,8 @@
 """Signed distances of solids at the nodes of a grid, in cells, positive in the open.
 
-Node (k, j, i) is the low corner of stored cell (k, j, i). Each node keeps the two nearest solids,
-so that a face can tell which of them is nearest to its center. Distances below `FAR` cells are
-exact, others are at least that large: only nodes near solids are measured.
+Node (k, j, i) is the low corner of stored cell (k, j, i). Each node stores the two nearest solids,
+so that a face can choose the one nearest to its center. Distances below `FAR` cells are exact,
+others are at least that large: only nodes near solids are measured.
 """
 
 from __future__ import annotations

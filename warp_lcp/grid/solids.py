@@ -3,9 +3,9 @@
 Box, sphere, capsule, plane, triangle mesh and unions, for solids and regions of material.
 
 A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with
-two coordinates extend without limit in z, spheres and capsules lie at z = 0 (discs and stadiums
-there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the distance is the one
-to the surface in space, never more than the one to the cut.
+two coordinates are infinite in z, spheres and capsules lie at z = 0 (discs and stadiums there), and
+a mesh is cut by the plane z = 0. For a mesh the sign is that of the cut, and the distance is that
+to the surface in space, never more than that to the cut.
 """
 
 from __future__ import annotations

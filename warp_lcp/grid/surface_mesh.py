@@ -87,14 +87,14 @@ class Interior:
 class SurfaceMesh:
     """Surface mesh around particles.
 
-    On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle
-    distances and divided by what solids and walls leave of the kernel: the filled share. Where it
-    is 1/2 there is the surface: unbiased for a plane and flat at walls that the plane meets at a
-    right angle; a ball of radius R shrinks by up to smoothing^2 / R [particle distances]. Where
-    particles have few others around them, in drops, filaments and sheets too thin for the kernel, a
-    narrow kernel is added to the share with a weight that grows as the smoothed share falls, so
-    that a drop of one particle is still there. The surface is cut along walls, solids and the
-    domain's sides, those that are open or periodic too.
+    The density of the particles is computed on a lattice finer than the grid, smoothed over
+    `smoothing` particle distances, and divided by the open part of the kernel beside solids and
+    walls: the filled share. The surface is where this share is 1/2. It is unbiased for a plane, and
+    flat at walls that the plane meets at a right angle; a ball of radius R shrinks by up to
+    smoothing^2 / R [particle distances]. Where particles have few others around them, in drops,
+    filaments and sheets too thin for the kernel, a narrow kernel is added to the share. Its weight
+    grows as the smoothed share falls, so that a drop of one particle remains. The surface is cut
+    along walls, solids and the domain's sides, open and periodic ones included.
 
     Args:
         grid: the grid.

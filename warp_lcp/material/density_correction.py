@@ -198,17 +198,17 @@ class DensityCorrection:
         0 <= x_i complementary to y_i = sum over faces of a_f (x_i - x_neighbor) + rho_max
         capacity_i - rho_i >= 0,
 
-    a_f the open fraction of a face. Every open cell that a particle's kernel reaches is an unknown,
-    those at the surface too, x = 0 in the others: nothing pulls, the surface needs no condition.
-    Particles go d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell, along walls
-    where they meet one. Their velocities stay as they are, so momentum is conserved.
+    with a_f the open fraction of a face. Every open cell that a particle's kernel reaches is an
+    unknown, also at the surface; x = 0 in the others. There is no suction, so the surface needs no
+    condition. Particles move by d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell,
+    and along walls that they meet. Their velocities stay unchanged, so momentum is conserved.
 
-    With `even` a cell is an equation where it and all cells around it are more than half full:
-    inside a liquid that keeps its volume. y_i = 0 then moves what is beyond rho_max, or below 2 -
-    rho_max, to or from the surface, and leaves the density of other cells as it is; x may have
-    either sign. Without it nothing closes the voids that a flow draws, every cell is truncated at
-    rho_max from above alone, and the liquid grows: a thin pool by 5 %. Where a wall lets go there
-    is a surface too, and nothing is drawn to it.
+    With `even` a cell has the equation y_i = 0 instead, if it and all cells around it are more than
+    half full: inside a liquid that keeps its volume. The equation moves the excess over rho_max, or
+    the deficit below 2 - rho_max, to or from the surface, and leaves the density of other cells
+    unchanged; x may have either sign. Without `even` the voids that a flow creates are not closed,
+    every cell is truncated at rho_max from above alone, and the liquid grows: a thin pool by 5 %. A
+    wall that separates has a surface as well, and nothing is drawn to it.
 
     The operator, the method and its hierarchy are the pressure's. Where solids cut cells, pockets
     between them may be closed and count particles beyond a thin wall; SHIFT keeps their problem

@@ -4,31 +4,31 @@ After narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. Deep in
 particles carry no information: their density is that at rest, and their velocity is that of the
 grid. Let d(x) be the depth, the distance to the surface [cells], and W the band's width.
 
-1. Where. A step starts with the depth d* that the last one has carried along, so {d* > W} is where
-   no particle is: it is liquid that was deeper than W and moved with the flow. Cells with d* >= D =
-   min(2, W / 2) count as full, all others as full as their particles say, which reach beyond any
-   kernel around these. So the surface is the particles' alone, and no error of d* builds up: after
-   the solve d is measured again as a chamfer distance from air cells, with the fraction of a cell
-   from their level set; solids do not count.
-2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a
-   semi-Lagrangian step of third order (`warp_lcp.grid.advection`); on those above W - 2 it is the
-   particles' mean, in between it goes over linearly. Gravity and pressure act on both alike.
-3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W
-   - 1} and is now shallower (a wall has let go of it, say), gets fresh particles in each step: a
-   reservoir of even density, out of which the flow takes exactly what it carries away. Their
-   lattice moves on through the cell by irrational steps, so that in the mean over steps every place
-   is as likely: on a lattice that stays no particle ever is where a slow flow could take it along,
-   and cells filled up to a count lose 10 % to the same bias. They take their velocity and its
-   gradient from the grid, as all others do at that time.
-4. Mass. H counts the particles that the interior stands for: those that went in less those that
-   came out. What the fresh layer holds and what the density correction sees there is H by the
-   particles that {d* > W} would hold at rest, within a tenth of 1: particles and H are as many as
-   without a band, so that liquid lost to one side is pushed back by the correction as it would be
-   without.
+1. Where. A step starts with the depth d* that the last step has advected, so {d* > W} is the region
+   without particles: liquid that was deeper than W and moved with the flow. Cells with d* >= D =
+   min(2, W / 2) count as full; the density of all others is that of their particles, which extend
+   beyond any kernel around these cells. So the surface depends on the particles alone, and errors
+   of d* do not accumulate: after the solve d is measured again as a chamfer distance from air
+   cells, with the fraction of a cell from their level set; solids do not count.
+2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, advected by a
+   semi-Lagrangian step of third order (`warp_lcp.grid.advection`). On faces above W - 2 it is the
+   particles' mean; in between it is interpolated linearly. Gravity and pressure act on both alike.
+3. Exchange. Particles deeper than W are removed. The band's last layer, W - 1 < d <= W, and cells
+   of {d* > W - 1} that are now shallower (because a wall has separated, say) get fresh particles in
+   each step. They are a reservoir of even density, from which the flow takes exactly the amount
+   that it carries away. Their lattice moves on through the cell by irrational steps, so that in the
+   mean over steps every place is equally likely. (With a fixed lattice no particle is ever where a
+   slow flow could carry it away, and cells filled up to a count lose 10 % to the same bias.) Fresh
+   particles take their velocity and its gradient from the grid, as all others do at that time.
+4. Mass. H is the number of particles that the interior represents: those that entered it less those
+   that left it. The density of the fresh layer, and of the interior in the density correction, is H
+   divided by the particles that {d* > W} would hold at rest, limited to within a tenth of 1. The
+   numbers of particles and H together are those without a band, so that the correction pushes back
+   liquid lost to one side as it would without one.
 
 In sums the interior counts by whole cells, so that a log's center of mass may be off by a part of a
-cell, and its potential energy by as much. Particles also stay within W of where liquid leaves a
-wall, where solids cut cells or move, and of sources, drains and open sides.
+cell, and its potential energy accordingly. Particles also stay within W of places where liquid
+leaves a wall, where solids cut cells or move, and of sources, drains and open sides.
 """
 
 from __future__ import annotations

@@ -25,9 +25,9 @@ def resampled(
 ) -> tuple[dict[str, np.ndarray], int]:
     """Return the particles of a state, made finer or coarser for another grid.
 
-    With k > 1 times as many particles as there were, every one is followed by k on average, spread
-    over the square or cube that was its share of a cell at rest; its velocity is continued there by
-    its gradient. With k < 1 one of every 1/k stays, chosen by chance among neighbors. A uniform
+    With k > 1 times as many particles as before, each is replaced by k on average, spread over the
+    square or cube that was its share of a cell at rest. Its velocity is extrapolated there by its
+    gradient. With k < 1 one of every 1/k stays, chosen at random among neighbors. A uniform
     velocity is added, so that momentum is conserved but for the rounding of the particles' number.
 
     Args:
