@@ -53,9 +53,9 @@ class CutCells:
         solids: in the order of their numbers, 1 + s; the domain is number 0.
         wall_separating: whether liquid may leave the domain's wall.
         capacity: whether to keep the capacity.
-        remarks: make notes of faces and refuse a grid without open cells; False: the grid is a part
-            of a larger one.
-        left_out: numbers of solids that cut no cells; their velocities are kept.
+        remarks: write notes about faces, and refuse a grid without open cells; False for a part of
+            a larger grid.
+        left_out: numbers of solids that cut no cells; their velocities are still computed.
         open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid
             closes them, and the ring is air.
 
@@ -70,17 +70,16 @@ class CutCells:
         wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open
             faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
-        capacity: float32 integral of the cell's quadratic B-spline kernel over what is open, 1 away
-            from walls; None if not asked for.
-        velocity: float32 mean velocity of what is not open of each face [m/s], the component along
-            the face's normal: that of the solid that moves, times its part; None when no solid
-            moves.
+        capacity: float32 integral of the cell's quadratic B-spline kernel over the open space, 1
+            away from walls; None if not requested.
+        velocity: float32 mean velocity of the closed part of each face [m/s], the component along
+            the face's normal: that of the moving solid, times its part; None when no solid moves.
         turn: mat33 of shape (1 + solids,): the velocity of a solid's point x is turn x + shift
             [1/s].
         shift: vec3 [m/s].
         separating: uint8 of shape (1 + solids,).
         names: of those numbers, the first "domain".
-        notes: warnings worth a line at the start of a run.
+        notes: warnings for the start of a run.
         whole_cells: whether every face is open or closed, no solid reaches into a cell with an open
             face and nothing moves.
         moves: whether a solid moves.

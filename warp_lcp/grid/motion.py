@@ -225,7 +225,7 @@ class Sinusoid:
         amplitude: of the shift [m], 2 or 3 numbers. Default: 0.
         phase: [degrees].
         angle: amplitude of the angle [degrees].
-        center: a point of the axis of the swing [m], 2 or 3 numbers; it takes part in the shift.
+        center: a point of the axis of the swing [m], 2 or 3 numbers; it moves with the shift.
         axis: direction of that axis, 3 numbers of any length but 0. Default: z.
 
     Raises:
@@ -271,8 +271,7 @@ class Keyframes:
         rotate: [degrees]: angles about z, shape (n,), as many turns as they say; or angles about
             the fixed axes x, y, z in that order, shape (n, 3), of less than half a turn from one
             keyframe to the next.
-        center: the point [m] that the turns leave where it is, 2 or 3 numbers; it takes part in the
-            shifts.
+        center: the fixed point [m] of the rotations, 2 or 3 numbers; it moves with the shifts.
         smooth: whether velocities are continuous.
 
     Raises:

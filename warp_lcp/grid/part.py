@@ -167,7 +167,7 @@ class BodyNumbers:
     """Airborne bodies of material, numbered from the trees of cells on each process.
 
     Attributes:
-        count: number of bodies that this process knows.
+        count: number of bodies in this process's numbering.
         several: number of bodies with trees on several processes; they come first.
         of_tree: the body of each tree of this process, int32, shape (trees,), -1 if it has none;
             None if each tree is a body.
@@ -259,7 +259,7 @@ class GridPart:
         """Join trees of cells across processes to bodies; collective.
 
         Args:
-            trees: number of trees that this process has found.
+            trees: number of trees on this process.
             seen: the cells that it has searched; None if there are none.
             parent: of each cell in its tree, int32, flat.
             number: number of the tree of each root, -1 for other cells, int32, flat.

@@ -156,8 +156,8 @@ class Particles:
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
         kept: a number that each particle carries, shape (n,); None if they carry none.
-        indexed: sort every step and know where each cell's particles begin, for transfers that
-            gather; those that need it on CUDA are the default there.
+        indexed: sort in every step and store the first particle of each cell, for transfers that
+            gather. Default on CUDA, if the transfers need it there.
 
     Attributes:
         count: particles.
@@ -167,7 +167,7 @@ class Particles:
             None unless `indexed`.
         runs: begin and end of each run of particles in the order of summation, int32, shape (2
             runs,); None if all particles are in this order.
-        exchange: knows the particles of other processes, see `warp_lcp.grid.part.ParticleExchange`.
+        exchange: exchange with other processes, see `warp_lcp.grid.part.ParticleExchange`.
 
     Raises:
         ValueError: the shapes do not match.

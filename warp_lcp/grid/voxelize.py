@@ -56,9 +56,9 @@ class VoxelSolids:
         separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets
             liquid leave.
         names: of those indices, the first "domain".
-        covered: number of cells whose center lies in each solid (whichever claimed it), without the
-            domain; shape (solids,).
-        notes: warnings worth a line at the start of a run.
+        covered: number of cells whose center lies in each solid, including cells assigned to
+            another; shape (solids,), without the domain.
+        notes: warnings for the start of a run.
     """
 
     index: wp.array3d(dtype=wp.int32)
@@ -84,7 +84,7 @@ def voxelize(
         solids: in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
         open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
-        remarks: make notes and refuse errors at the start of a run; False: solids have moved since.
+        remarks: write notes and refuse errors at the start of a run; False once solids have moved.
         counts: fill `covered`, which waits for the device; needed for remarks.
 
     Raises:

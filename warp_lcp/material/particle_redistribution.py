@@ -131,7 +131,7 @@ class ParticleRedistribution:
                 known.
 
         Returns:
-            What the log says of it.
+            The log entries.
         """
         row: dict[str, float | int | str] = {}
         self.moved = self._evens(step)

@@ -549,7 +549,7 @@ class ParticleSimulation(ParticleCheckpoints):
                 None if it is not known.
 
         Returns:
-            What the log says of it and of the particles.
+            The log entries of the step and of the particles.
 
         Raises:
             SimulationFailed: something is not finite, or a particle has left the domain.

@@ -34,7 +34,7 @@ def resampled(
         state: `position` [m], `velocity` [m/s], for APIC `affine_0` ... [1/s] and what particles
             take along, `kept`; float32, shape (n, 3), about in the order of the cells.
         grid: the new grid.
-        admits: tells which points [m], shape (n, 3), a particle may be at.
+        admits: returns a mask of the points [m], shape (n, 3), at which a particle may be.
         spacing: of the old grid [m].
         per_axis: particles along the edge of a cell at rest, on both grids.
         random_seed: of the places.

@@ -46,10 +46,10 @@ class Reseeding:
     Args:
         grid: the grid.
         boundary: solids and walls.
-        least: particles of a cell below which it is filled up, at most those at rest.
-        most: particles of a cell above which it hands on, at least those at rest.
+        least: number of particles below which a cell is filled up, at most that at rest.
+        most: number of particles above which a cell gives some away, at least that at rest.
         particles_a_cell: of material at rest.
-        every: steps from one time to the next.
+        every: steps between reseedings.
 
     Raises:
         ValueError: `least` <= `particles_a_cell` <= `most` does not hold.
