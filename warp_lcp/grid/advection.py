@@ -191,7 +191,7 @@ def advect(
     Args:
         grid: the grid.
         fields: velocity of each component on the faces [m/s].
-        room: of `clearance`. Every particle lies in a cell that is not SOLID.
+        room: result of `clearance`. Every particle lies in a cell that is not SOLID.
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that a closed face stopped.
@@ -236,7 +236,7 @@ def advect_with_distance(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
             beyond.
         endless: bit n is set if axis n is periodic, see `advect`; its sides count as open.
     """
@@ -273,7 +273,7 @@ def push_out(
         moved: int32, shape (1,): raised by the number of particles that were put outside.
         left: int32, shape (1,): raised by the number of those for which no way out was found; they
             stay where they were.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
     """
     launch(
         PUSH_OUT,
@@ -305,7 +305,7 @@ def carry_field(
     Args:
         grid: the grid.
         window: cells to consider, in the domain and the ring's upper layer.
-        velocity: of each component on the faces [m/s].
+        velocity: velocity of each component on the faces [m/s].
         way: dt / dx [s/m].
         field: float32, of faces or cells; not `out`.
         out: float32 (written). Where the level is no more than `least`: the velocity as it was, 0

@@ -295,7 +295,7 @@ class Barriers:
         The solids have not moved yet. `bring` moves the particles later.
 
         Args:
-            velocity: of each component on the faces [m/s].
+            velocity: velocity of each component on the faces [m/s].
             dt: time step [s].
             start: places of the particles [m], shape (n,).
         """
@@ -343,7 +343,7 @@ class Barriers:
 
         Args:
             window: faces to consider.
-            velocity: of each component [m/s] (updated).
+            velocity: velocity of each component [m/s] (updated).
             known: int8, positive where it is known (updated: 0 on crossed faces).
             kind: int8 of AIR, FLUID, SOLID.
             contact: uint8, `released` where material leaves its wall.

@@ -56,8 +56,8 @@ class CutCells:
         remarks: write notes about faces, and refuse a grid without open cells; False for a part of
             a larger grid.
         left_out: numbers of solids that cut no cells; their velocities are still computed.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid
-            closes them, and the ring is air.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no
+            solid closes them, and the ring is air.
 
     Attributes:
         distance: float32 signed distance to the nearest solid at nodes [cells], positive in the
@@ -78,7 +78,7 @@ class CutCells:
             [1/s].
         shift: vec3 [m/s].
         separating: uint8 of shape (1 + solids,).
-        names: of those numbers, the first "domain".
+        names: names of the solids by number, the first "domain".
         notes: warnings for the start of a run.
         whole_cells: whether every face is open or closed, no solid reaches into a cell with an open
             face and nothing moves.
@@ -245,7 +245,7 @@ class CutCells:
         the material changes, and a rotation of such a field changes no volume.
 
         Args:
-            time: at which the solids were placed [s].
+            time: time at which the solids were placed [s].
             dt: how long from there on [s]; negative: the step that ended at `time`.
 
         Raises:

@@ -76,10 +76,10 @@ def complete(
 
     Args:
         window: faces to consider.
-        velocity: of each component [m/s] (updated).
-        weights: of the particles on each component's faces.
+        velocity: velocity of each component [m/s] (updated).
+        weights: weights of the particles on each component's faces.
         known: scratch memory, int8, one field a component.
-        join: as of `extrapolate`.
+        join: see `extrapolate`.
         barriers: solids thinner than cells; None if there are none.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):

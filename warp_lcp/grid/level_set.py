@@ -45,8 +45,8 @@ class LevelSet:
         phi: [cells], float32, < 0 in the liquid, within +-`limit`; SOLID cells within two of an
             open one have the mean of their neighbors, others and all cells outside the window are
             air.
-        density: in units of the density at rest, float32, in open cells and in SOLID ones next to
-            them.
+        density: density in units of the density at rest, float32, in open cells and in SOLID ones
+            next to them.
         limit: the largest |phi| [cells].
 
     Raises:
@@ -166,7 +166,7 @@ class LevelSet:
         Args:
             distance: signed distance to the solids at the cells' low corners [cells], > 0 in the
                 open, float32; None: solids are the cells that were SOLID in the last update.
-            window: that of the last update.
+            window: window of the last update.
         """
         self.measure(distance, window)
         return self.measured

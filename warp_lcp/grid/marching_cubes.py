@@ -246,8 +246,8 @@ class MarchingCubes:
         """Return the corners of the last surface that lie in given cells.
 
         Args:
-            phi: as passed to `contour`.
-            number: as `contour` has left it.
+            phi: the field passed to `contour`.
+            number: the numbers that `contour` has written.
             cells: between the centers of these and of their upper neighbors.
         """
         return self._corners(cells, phi, number, self._counted(cells, phi)[1])

@@ -205,9 +205,9 @@ def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarr
 
     Args:
         mesh: the surface.
-        vertices: of it, in half diagonals of its bounding box from its center, float64 of shape (n,
-            3).
-        triangles: of it, int32 of shape (m, 3).
+        vertices: vertices of the surface, in half diagonals of its bounding box from its center,
+            float64 of shape (n, 3).
+        triangles: triangles of the surface, int32 of shape (m, 3).
     """
     device = mesh.points.device
     inputs = [

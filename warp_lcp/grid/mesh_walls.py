@@ -42,7 +42,7 @@ class MeshWalls:
 
     Args:
         solids: the solids.
-        spacing: of the grid [m].
+        spacing: spacing of the grid [m].
         dimension: 2 or 3.
         device: device of the solids.
     """
@@ -100,8 +100,8 @@ def fit_to_walls(
     """Return the points of a surface with those on solids moved onto the solids' shapes.
 
     Args:
-        points: of the surface [cells], shape (n, 3).
-        corners: of its triangles, shape (m, 3), or segments, shape (m, 2).
+        points: points of the surface [cells], shape (n, 3).
+        corners: corners of its triangles, shape (m, 3), or segments, shape (m, 2).
         on_solid: whether a point lies on a solid, shape (n,).
         fixed: which coordinates of a point may not change, as it lies on a side of the domain,
             bool, shape (n, 3).
@@ -155,7 +155,7 @@ def _sharpened(
         x: points on solids [cells], shape (n, 3).
         normal: unit normals there, shape (n, 3); 0: unknown.
         free: which coordinates may change, shape (n, 3).
-        corners: of triangles or segments, numbers of these points; below 0: of others.
+        corners: corners of triangles or segments, numbers of these points; below 0: of others.
         walls: the solids.
     """
     edges = _sharp_edges(corners, normal)

@@ -43,7 +43,7 @@ def keep_checked(frozen: Any, error: float) -> None:
 
     Args:
         frozen: the dataclass.
-        error: that R R' - 1 may have.
+        error: largest error of R R' - 1.
 
     Raises:
         ValueError: a value is not finite, or the matrix is not a rotation.
@@ -222,7 +222,7 @@ class Sinusoid:
 
     Args:
         period: [s], > 0.
-        amplitude: of the shift [m], 2 or 3 numbers. Default: 0.
+        amplitude: amplitude of the shift [m], 2 or 3 numbers. Default: 0.
         phase: [degrees].
         angle: amplitude of the angle [degrees].
         center: a point of the axis of the swing [m], 2 or 3 numbers; it moves with the shift.
@@ -325,7 +325,7 @@ class Motions:
     """Motions of several solids, evaluated together.
 
     Args:
-        motions: of n solids.
+        motions: motions of n solids.
     """
 
     def __init__(self, motions: Sequence[Motion]) -> None:
@@ -401,7 +401,7 @@ class Motions:
         Args:
             bounds: low and high corner [m] of a box around each solid as it is placed, shape (2,
                 3); None: it has no limits. Or these in one array, see `boxes_of`.
-            size: of the domain [m], shape (3,), z = 0 in 2-D.
+            size: sides of the domain [m], shape (3,), z = 0 in 2-D.
             time: [s].
             span: time to look ahead [s], > 0.
         """

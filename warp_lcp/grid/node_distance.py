@@ -419,7 +419,7 @@ class NodeSampler:
             low: first node (x, y, z).
             high: one past the last.
             stride: nodes along each axis for which one distance stands.
-            offset: of the measured point from the low node of its group, in cells.
+            offset: offset of the measured point from the low node of its group, in cells.
             before: cells (x, y, z) of the whole grid before the first node's; None for those before
                 the sampler's grid.
         """

@@ -186,7 +186,7 @@ class GridPart:
             cells, around them.
 
     Attributes:
-        grid: as given.
+        grid: the grid.
         ranks: the communicator of the processes that work on the grid.
         decomposition: boxes of cells of the processes; None if there is one process.
         layers: layers of ghost cells around the part, its ring included.
@@ -261,7 +261,7 @@ class GridPart:
         Args:
             trees: number of trees on this process.
             seen: the cells that it has searched; None if there are none.
-            parent: of each cell in its tree, int32, flat.
+            parent: parent of each cell in its tree, int32, flat.
             number: number of the tree of each root, -1 for other cells, int32, flat.
             held: not 0 at roots of trees that a wall touches, flat.
         """
@@ -356,7 +356,7 @@ class GridPart:
                 x.
             width: layers next to the owned cells; None for all.
             parts: the fields are those of `grid.refined(parts)`.
-            forest: of `forest`, for such fields; None for all cells.
+            forest: result of `forest`, for such fields; None for all cells.
         """
 
     def faces(self, window: Window) -> Window:

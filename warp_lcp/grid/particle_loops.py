@@ -133,10 +133,10 @@ def scatter(
 
     Args:
         passed: a kernel with `each_share` of `particles.h`.
-        grid: of the particles.
+        grid: grid of the particles.
         position: positions of the particles.
         touched: result of `touched_planes` for them.
-        runs: of `Particles`.
+        runs: `runs` of `Particles`.
         structs: further arguments of the pass, see `StencilKernel.bind`.
         given: likewise.
     """

@@ -136,7 +136,7 @@ class Column:
         """Set the vectors in use from an index on.
 
         Args:
-            first: that index.
+            first: the index.
             values: shape (count - first, 3), or one number for all.
         """
         if self._host is not None:
@@ -744,9 +744,9 @@ def sort_keys(
         keys: int32, not negative, and scratch memory of the same size.
         order: int32, which receives where each key was, and scratch memory.
         counts: int32, scratch memory for `pieces` of a round's digits and `APART` more.
-        rows: of the keys, a piece a task.
+        rows: rows of the keys, a piece a task.
         pieces: how many there are.
-        bits: that keys have at most.
+        bits: largest number of bits of a key.
     """
     device = counts.device
     rounds, each = digits_of(bits)
@@ -789,8 +789,8 @@ def lattice(
             it.
         per_axis: points along an edge of a cell.
         jitter: width of the uniform random displacement, as a fraction of the points' spacing.
-        random_seed: of the displacements, which are one sequence over all of the grid.
-        plane: which cells along z, counted from 0; 0 in 2-D.
+        random_seed: seed of the displacements, which are one sequence over all of the grid.
+        plane: index of the cells along z, from 0; 0 in 2-D.
 
     Returns:
         Points [m], shape (n, 3), z = 0 in 2-D.
@@ -841,7 +841,7 @@ def seed(
         per_axis: points along an edge of a cell, >= 1.
         jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter
             <= 1.
-        random_seed: of the displacements; they do not depend on the regions.
+        random_seed: seed of the displacements; they do not depend on the regions.
 
     Returns:
         Positions [m], float32, shape (n, 3), and the region of each, shape (n,).

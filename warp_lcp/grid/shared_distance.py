@@ -29,7 +29,7 @@ def measure_together(
     The layers of a solid have equally many nodes.
 
     Args:
-        sampler: of this process's part of the grid.
+        sampler: sampler of this process's part of the grid.
         geometries: the solids where they are, the same on all processes.
 
     Returns:
@@ -96,9 +96,9 @@ def enter_layers(nodes: NodeDistances, number: int, layers: list[Layer]) -> None
     """Enter a solid's measured distances at the nodes of this process's part.
 
     Args:
-        nodes: where to (updated).
+        nodes: the node distances (updated).
         number: the solid's, > 0.
-        layers: of `measure_together`.
+        layers: layers of `measure_together`.
     """
     grid = nodes.grid
     stored = CellBox((0, 0, 0), grid.shape[::-1]).moved(grid.origin)

@@ -61,7 +61,7 @@ def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
 
     Args:
         shape: (nz + 2, ny + 2, nx + 2).
-        bits: of `side_bits`.
+        bits: bits of `side_bits`.
     """
     outside, closed = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for number in range(len(SIDES)):
@@ -130,7 +130,7 @@ def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.arra
 
     Args:
         grid: the grid.
-        bits: of `side_bits`.
+        bits: bits of `side_bits`.
         position: [m], shape (n,).
         marks: int32, shape (n,) (written): 1 for those that have left, else 0.
     """
@@ -216,8 +216,8 @@ class PeriodicSides:
         """Merge means over particles on faces that are the same.
 
         Args:
-            velocity: of each component [m/s] (updated).
-            weights: of the particles (updated: none in the ring).
+            velocity: velocity of each component [m/s] (updated).
+            weights: weights of the particles (updated: none in the ring).
             saved: more velocities that the weights belong to [m/s] (updated), or empty.
         """
         for number, (field, weight) in enumerate(zip(velocity, weights, strict=True)):

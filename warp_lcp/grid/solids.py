@@ -245,7 +245,7 @@ class Box(_Shape):
     Args:
         lower: low corner [m], 2 or 3 numbers.
         upper: high corner [m], as many.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the box.
 
     Raises:
@@ -310,7 +310,7 @@ class Sphere(_Shape):
     Args:
         center: [m], 2 or 3 numbers.
         radius: [m], > 0.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the sphere.
 
     Raises:
@@ -348,7 +348,7 @@ class Capsule(_Shape):
         start: one end of the segment [m], 2 or 3 numbers.
         end: the other end [m], as many.
         radius: [m], > 0.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the capsule.
 
     Raises:
@@ -399,7 +399,7 @@ class Plane(_Shape):
     Args:
         point: a point of the plane [m], 2 or 3 numbers.
         normal: direction out of the material, as many numbers, of any length but 0.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: put the material on the normal's side.
 
     Raises:
@@ -443,7 +443,7 @@ class TriangleMesh(_Shape):
 
     Args:
         surface: the checked surface, in the mesh's own coordinates.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the inside.
     """
 
@@ -468,7 +468,7 @@ class TriangleMesh(_Shape):
         Args:
             file: path, relative to `folder`, or `builtin:` and a name.
             folder: where relative paths start; the working directory without it.
-            placement: where it stands.
+            placement: placement of the shape.
             invert: make it everything but the inside.
 
         Raises:

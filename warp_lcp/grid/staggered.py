@@ -94,7 +94,7 @@ class Window:
     Args:
         low: first (k, j, i), ring included.
         high: one past the last (k, j, i).
-        device: where kernels run.
+        device: device on which kernels run.
         near: active segments of rows, see `warp_lcp.grid.active_rows`; kernels may skip the rest of
             the box. None for all. Sums over rows visit the range from the first to the last active
             segment of a row.

@@ -100,14 +100,14 @@ class ThinWalls:
 
     Args:
         grid: the grid; any part of the domain's.
-        solids: of the scene; numbers of walls are 1 + s.
+        solids: solids of the scene; numbers of walls are 1 + s.
         thin: numbers of the thin ones.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there, for
-            good or to the other end of an axis.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there,
+            for good or to the other end of an axis.
         endless: periodic axes; solids near one side have images beyond the other.
 
     Attributes:
-        numbers: of these solids.
+        numbers: numbers of these solids.
         moves: whether one of them moves.
         least: smallest coordinates of particles [m], -inf where they may leave.
         most: largest coordinates, likewise.

@@ -93,7 +93,7 @@ def particles_to_faces(
         offsets: first particle of each stored cell, int32, shape (cells + 1,), of particles that
             are sorted by cell: faces gather. None: particles scatter, in any order; on CUDA the
             last bits then differ from run to run.
-        runs: of `Particles`.
+        runs: `runs` of `Particles`.
     """
     passes = transfer_passes(fields[0].dtype)
     window = window or grid.everywhere
@@ -199,9 +199,9 @@ def accelerate(
     Args:
         window: faces that particles can reach.
         velocity: each component [m/s] (updated).
-        weights: of the particles on each component's faces.
-        change: of each component [m/s], shape (3,); a recorded launch has one for those that are
-            not 0 then.
+        weights: weights of the particles on each component's faces.
+        change: change of each component [m/s], shape (3,); a recorded launch has one for those that
+            are not 0 then.
     """
     for axis, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
         if value_of(change[axis]) != 0.0:

@@ -29,8 +29,8 @@ def tube(
         curve: points along the curve, shape (n, 3); the last is joined to the first.
         normals: unit vectors across the curve, shape (n, 3).
         binormals: tangent x normal, shape (n, 3).
-        radius: of the tube, less than the curve's radius of curvature and half the distance of its
-            strands.
+        radius: radius of the tube, less than the curve's radius of curvature and half the distance
+            of its strands.
         sides: number of vertices around the tube.
 
     Returns:

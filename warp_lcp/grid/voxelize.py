@@ -55,7 +55,7 @@ class VoxelSolids:
             (the ring, but for what lies beyond open sides), 1 + s in cells of solid s.
         separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets
             liquid leave.
-        names: of those indices, the first "domain".
+        names: names by index, the first "domain".
         covered: number of cells whose center lies in each solid, including cells assigned to
             another; shape (solids,), without the domain.
         notes: warnings for the start of a run.
@@ -81,9 +81,9 @@ def voxelize(
 
     Args:
         grid: the grid.
-        solids: in the order of their claims.
+        solids: the solids, in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
         remarks: write notes and refuse errors at the start of a run; False once solids have moved.
         counts: fill `covered`, which waits for the device; needed for remarks.
 
@@ -137,7 +137,7 @@ def inside(
     Args:
         geometries: the regions; none contain nothing.
         points: [m], shape (m, 3); z = 0 in 2-D.
-        device: where distances are evaluated.
+        device: device on which distances are evaluated.
 
     Returns:
         bool of shape (m,).

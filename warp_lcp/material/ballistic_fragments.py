@@ -158,10 +158,10 @@ class BallisticFragments:
         Args:
             particles: the material; `key` holds its cells.
             window: cells that it can touch.
-            weights: of the particles on each component's faces.
+            weights: weights of the particles on each component's faces.
             kind: int8 of AIR, FLUID, SOLID, of the step's solve.
             dt: time step [s].
-            change: of the velocity by gravity in this step [m/s], shape (3,).
+            change: change of the velocity by gravity in this step [m/s], shape (3,).
         """
         if not self._found:
             self.find(window, weights, kind)
@@ -252,7 +252,7 @@ class BallisticFragments:
         Args:
             particles: those of `begin`, in their order, with new velocities (updated: position,
                 velocity, gradients).
-            velocity: of each component on the faces [m/s].
+            velocity: velocity of each component on the faces [m/s].
         """
         if len(self._before) == 0:
             return

@@ -36,8 +36,8 @@ class Boundary(Protocol):
 
     Attributes:
         sides: the periodic sides; None if there are none.
-        open_sides: of the domain, see `warp_lcp.grid.sides`; they include the sides of periodic
-            axes.
+        open_sides: open sides of the domain, see `warp_lcp.grid.sides`; they include the sides of
+            periodic axes.
         base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open
             sides.
         touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face
@@ -129,12 +129,12 @@ class WholeCells:
 
     Args:
         grid: the grid.
-        solids: which cells are solid, and whose walls separate.
+        solids: the solid cells, and the walls that separate.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
             constant; the cells stay fixed. None if all are at rest.
         open_sides: the open sides for which `solids` was made, except periodic ones.
         sides: the periodic sides, which are open in `solids`; None if there are none.
-        shapes: of the solids, if they fill whole cells exactly.
+        shapes: shapes of the solids, if they fill whole cells exactly.
 
     Raises:
         ValueError: `wall_velocity` has another shape.

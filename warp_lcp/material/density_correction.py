@@ -74,8 +74,8 @@ class DensityMonitor:
     Args:
         grid: the grid.
         boundary: solids and walls.
-        particles_a_cell: of material at rest.
-        max_density: of a cell, in units of the density at rest.
+        particles_a_cell: number of particles in a cell of material at rest.
+        max_density: largest density of a cell, in units of the density at rest.
     """
 
     def __init__(
@@ -98,7 +98,8 @@ class DensityMonitor:
         """Measure the density; `found` then returns the result.
 
         Args:
-            density: of the particles, in units of that at rest, float32; computed here if None.
+            density: density of the particles, in units of that at rest, float32; computed here if
+                None.
             particles: the material; where the density is computed here they must not have moved
                 since they were sorted.
             window: cells that hold all particles, with two to spare on each side.
@@ -155,7 +156,7 @@ class DensityFields:
         kind: int8 cell types of the problem (written).
         b: right-hand side (written).
         x: solution of the last problem, the start of this one.
-        density: of the material, in units of that at rest, float32.
+        density: density of the material, in units of that at rest, float32.
         capacity: open fraction of each cell's kernel, float32; None for 1.
         inside: cells deep inside, which may lack material; None if there are none.
     """
@@ -173,7 +174,7 @@ class Correction:
     """Result of a density correction.
 
     Attributes:
-        result: of the solve; None if no cell was overfull and nothing has moved.
+        result: result of the solve; None if no cell was overfull and nothing has moved.
         over_full: cells above the largest density, and cells deep inside below the least.
         max_density: before the correction, in units of the density at rest: 1 and the most by which
             a cell exceeds what fits beside walls.
@@ -218,7 +219,7 @@ class DensityCorrection:
         grid: the grid.
         boundary: solids and walls.
         solver: settings of the method.
-        particles_a_cell: of material at rest.
+        particles_a_cell: number of particles in a cell of material at rest.
         max_density: rho_max, > 0. A material at rest whose particles lie at random would grow with
             1.
         gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives
@@ -226,12 +227,12 @@ class DensityCorrection:
         even: whether cells inside the material are to hold neither too much nor too little.
         every: steps from one correction to the next.
         tolerance: relative residual at which a solve is done.
-        max_iterations: of the method; the best iterate is taken then.
+        max_iterations: limit of iterations of the method; the best iterate is taken then.
 
     Attributes:
         x: the last solution [cells^2], float64, the guess of the next.
-        density: of the particles before the last correction, float32.
-        displacement: of the last correction on the faces of each axis [m], float32.
+        density: density of the particles before the last correction, float32.
+        displacement: displacement of the last correction on the faces of each axis [m], float32.
     """
 
     def __init__(

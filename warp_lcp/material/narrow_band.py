@@ -73,16 +73,16 @@ class NarrowBand:
     Args:
         grid: the grid.
         boundary: solids and walls.
-        width: of the band [cells], >= 3.
+        width: width of the band [cells], >= 3.
         per_axis: particles along the edge of a cell.
         jitter: width of fresh particles' random displacement, a fraction of their distance.
-        random_seed: of the displacements.
+        random_seed: seed of the displacements.
         keep: cells that hold particles whatever their depth, bool of the stored shape; None if
             there are none.
 
     Attributes:
         depth: d* [cells], float32; 0 in air. More than `width` where there are no particles.
-        velocity: of each component's faces, carried along with it [m/s].
+        velocity: velocity on each component's faces, advected with the depth [m/s].
         held: H, particles that the interior stands for; negative if the band has got more than
             there was.
         interior: sums over the cells without particles, at their centers; its count is theirs.
@@ -177,7 +177,7 @@ class NarrowBand:
 
         Args:
             owner: number of the liquid in each cell, -1: none, shape (nz, ny, nx).
-            velocities: of the liquids [m/s], shape (n, 3).
+            velocities: velocities of the liquids [m/s], shape (n, 3).
 
         Returns:
             bool, shape (nz, ny, nx).
@@ -214,8 +214,8 @@ class NarrowBand:
 
         Args:
             window: faces that material can reach.
-            velocity: of each component [m/s] (updated).
-            weights: of the particles on each component's faces (updated).
+            velocity: velocity of each component [m/s] (updated).
+            weights: weights of the particles on each component's faces (updated).
         """
         start, full = self.width - 2.0, float(self.particles_a_cell)
         for axis, (carried, field, weight) in enumerate(
@@ -231,7 +231,7 @@ class NarrowBand:
 
         Args:
             window: cells that material can reach.
-            density: of the particles, in units of that at rest (updated).
+            density: density of the particles, in units of that at rest (updated).
         """
         window.launch(
             kernels.fill_kernel, [self.full, 1.0, self.depth, self.boundary.capacity, density]
@@ -242,7 +242,7 @@ class NarrowBand:
 
         Args:
             window: cells that material can reach.
-            density: of the particles, in units of that at rest (updated).
+            density: density of the particles, in units of that at rest (updated).
         """
         least = max(self.width - REACH, self.full)
         if not is_recording():
@@ -301,7 +301,7 @@ class NarrowBand:
         In the window of the last exchange.
 
         Args:
-            velocity: of each component on the faces [m/s].
+            velocity: velocity of each component on the faces [m/s].
             dt: time step [s].
         """
         self._way.value = dt / self.grid.spacing
@@ -579,8 +579,8 @@ def without_band(
 
     Args:
         state: arrays of the particles and, if there was a band, of `NarrowBand.state`.
-        spacing: of its grid [m].
-        random_seed: of the places.
+        spacing: spacing of its grid [m].
+        random_seed: seed of the places.
     """
     if "interior" not in state or state["interior"][0] <= 0:
         return state

@@ -151,7 +151,7 @@ def make_boundary(
         folder: folder of the files that it names.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
             constant; None if all are at rest, or have their own motion.
-        solids: of `placed_solids`; made here if None.
+        solids: solids of `placed_solids`; made here if None.
 
     Raises:
         ValueError: solids cut cells and there is a `wall_velocity`.
@@ -219,7 +219,7 @@ def make_thin_walls(
         scene: the scene.
         grid: its grid.
         placed: its solids.
-        open_sides: of `warp_lcp.grid.sides.side_bits`; those of periodic axes are added.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`; those of periodic axes are added.
         crossing: only those that are too thin to cut cells; of rigid bodies only sheets, since
             other bodies are pushed by the pressure through the cells that they cut.
     """
@@ -249,7 +249,7 @@ class Parts:
 
     Attributes:
         boundary: solids and the domain's walls.
-        sources: where material enters.
+        sources: inflow of material.
         band: the narrow band of particles; None if they are everywhere.
         solids: the solids as the material's own solver uses them, if it uses another form.
     """

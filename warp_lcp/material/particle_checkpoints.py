@@ -170,8 +170,8 @@ class ParticleCheckpoints(ParticleFrames):
         The run may have had any number of ranks. Each rank takes the data in its box.
 
         Args:
-            pieces: of `state`, of all ranks, in any order. Of a piece that has nothing in this
-                rank's box grown by some cells the arrays of particles and cells are not read.
+            pieces: pieces of `state`, of all ranks, in any order. Of a piece that has nothing in
+                this rank's box grown by some cells the arrays of particles and cells are not read.
 
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
@@ -215,7 +215,7 @@ class ParticleCheckpoints(ParticleFrames):
         """Continue from the data of pieces in this rank's box; collective.
 
         Args:
-            pieces: of all ranks, or that of this box.
+            pieces: pieces of all ranks, or that of this box.
             expected: number of particles of all pieces if none enter or leave.
         """
         part: Any = self.grid.part

@@ -48,7 +48,7 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
     """Merge the pieces of all ranks to the state of a one-process simulation.
 
     Args:
-        pieces: of all ranks.
+        pieces: pieces of all ranks.
         like: a state of the same scene in one process, which gives names, types and what lies
             around the domain.
 

@@ -75,8 +75,8 @@ class ParticleRedistribution:
 
         Args:
             step: its number.
-            density: of the particles, in units of that at rest, float32; None if it is not known
-                yet.
+            density: density of the particles, in units of that at rest, float32; None if it is not
+                known yet.
             particles: the material.
             window: cells that hold all of it, with two to spare on each side.
         """

@@ -86,8 +86,8 @@ class ParticleSimulation(ParticleCheckpoints):
 
     Attributes:
         particles: the material, without its spray.
-        velocity: of the last step on the faces, one field a component [m/s].
-        weights: of the particles on each component's faces, in the last step.
+        velocity: velocity of the last step on the faces, one field a component [m/s].
+        weights: weights of the particles on each component's faces, in the last step.
         flights: conserves the momenta of airborne bodies; None if it is off.
         gravity: [m/s^2], shape (3,).
         particle_mass: [kg]; 2-D: [kg/m].
@@ -508,7 +508,7 @@ class ParticleSimulation(ParticleCheckpoints):
         """Find airborne bodies, and transfer the faces' velocity to the particles.
 
         Args:
-            window: of the step.
+            window: window of the step.
             kind: int8 of AIR, FLUID, SOLID, of the step's solve.
             dt: time step [s].
         """
@@ -542,9 +542,9 @@ class ParticleSimulation(ParticleCheckpoints):
 
         Args:
             dt: time step [s].
-            window: of the step.
-            density: of the particles before they move, in units of that at rest; None if it is not
-                known.
+            window: window of the step.
+            density: density of the particles before they move, in units of that at rest; None if it
+                is not known.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED: the contact with walls in the step;
                 None if it is not known.
 
@@ -607,7 +607,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
         Args:
             window: around the particles.
-            density: of the particles, in units of that at rest, where it is known.
+            density: density of the particles, in units of that at rest, where it is known.
         """
         with self.watch.stage("density monitor", self.particles.position):
             self.rearrangement.look(self.step_count, density, self.particles, window)

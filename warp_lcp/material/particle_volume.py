@@ -19,7 +19,7 @@ class ParticleVolume:
     Args:
         grid: a 3-D grid.
         boundary: solids and walls.
-        particles_a_cell: of the material at rest.
+        particles_a_cell: number of particles in a cell of the material at rest.
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
@@ -33,8 +33,8 @@ class ParticleVolume:
         rest.
 
         Args:
-            particles: of the material; on CUDA they are sorted, as the next step would do, where
-                the order is needed.
+            particles: particles of the material; on CUDA they are sorted, as the next step would
+                do, where the order is needed.
             fill: adds the density of material without particles, in a window.
         """
         if particles.offsets is not None:

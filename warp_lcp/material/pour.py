@@ -22,7 +22,7 @@ def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -
         simulation: between two steps (updated).
         shape: an entry of a scene's `[[liquid]]` or `[[sand]]`, with the velocity of the new
             material.
-        name: of the shape, for messages.
+        name: name of the shape, for messages.
 
     Raises:
         ValueError: the shape holds no empty cell, or the grid covers but a part of the domain.

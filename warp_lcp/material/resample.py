@@ -35,9 +35,9 @@ def resampled(
             take along, `kept`; float32, shape (n, 3), about in the order of the cells.
         grid: the new grid.
         admits: returns a mask of the points [m], shape (n, 3), at which a particle may be.
-        spacing: of the old grid [m].
+        spacing: spacing of the old grid [m].
         per_axis: particles along the edge of a cell at rest, on both grids.
-        random_seed: of the places.
+        random_seed: seed of the places.
 
     Returns:
         The arrays by name, and how many particles had to be moved out of solids.
@@ -94,7 +94,7 @@ def resampling_notes(
         before: particles on the old grid.
         after: particles on the new one.
         moved: particles that were moved out of solids.
-        spacing: of the old grid [m].
+        spacing: spacing of the old grid [m].
         grid: the new one.
     """
     change = after * grid.cell_volume / (before * spacing**grid.dimension) - 1.0 if before else 0.0

@@ -48,7 +48,7 @@ class Reseeding:
         boundary: solids and walls.
         least: number of particles below which a cell is filled up, at most that at rest.
         most: number of particles above which a cell gives some away, at least that at rest.
-        particles_a_cell: of material at rest.
+        particles_a_cell: number of particles in a cell of material at rest.
         every: steps between reseedings.
 
     Raises:

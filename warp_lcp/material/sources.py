@@ -35,7 +35,7 @@ class Source:
     Args:
         name: name of the source in messages.
         contains: returns which points [m], shape (n, 3), lie in it, shape (n,).
-        velocity: of its material [m/s], shape (3,), not 0.
+        velocity: velocity of its material [m/s], shape (3,), not 0.
         start: when it starts to run [s].
         stop: when it no longer does [s].
         kept: number carried by its particles; None if they carry none.
@@ -74,7 +74,7 @@ class Sources:
         sources: a cell belongs to the first that contains its center.
         per_axis: particles along the edge of a cell.
         jitter: width of their random displacement, a fraction of their distance.
-        random_seed: of the displacements.
+        random_seed: seed of the displacements.
 
     Raises:
         ValueError: a source has no open cell.
@@ -156,7 +156,7 @@ class Sources:
         Before the pressure solve.
 
         Args:
-            time: in the middle of the step [s].
+            time: time in the middle of the step [s].
             velocity: u* of each component [m/s] (updated).
             kind: int8 of AIR, FLUID, SOLID (updated).
         """
@@ -172,7 +172,7 @@ class Sources:
         Of those that `supply` found.
 
         Args:
-            velocity: of each component [m/s] (updated).
+            velocity: velocity of each component [m/s] (updated).
             known: int8 of each component (updated): 1 on those faces; or empty.
             shown: int8 (updated): the sources' cells become FLUID.
         """
@@ -187,7 +187,7 @@ class Sources:
         Args:
             particles: the material (updated).
             before: at the start of the step [s]; None if there has been no step.
-            now: at its end [s].
+            now: time at the end of the step [s].
         """
         since = now if before is None else before
         running = [
@@ -381,7 +381,7 @@ class Sources:
 
         Args:
             held: fill of each cell, relative to rest.
-            slot: as returned by `_entered`.
+            slot: slots returned by `_entered`.
             entries: likewise.
             filled: likewise.
             points: likewise.
@@ -476,7 +476,7 @@ class Outlets:
     Args:
         grid: the grid.
         drains: regions that swallow material.
-        open_sides: of the domain, see `warp_lcp.grid.sides.side_bits`.
+        open_sides: open sides of the domain, see `warp_lcp.grid.sides.side_bits`.
     """
 
     def __init__(self, grid: StaggeredGrid, drains: Sequence[Drain], open_sides: int) -> None:
@@ -490,8 +490,8 @@ class Outlets:
 
         Args:
             particles: the material (updated).
-            before: at the start of the step [s].
-            now: at its end [s].
+            before: time at the start of the step [s].
+            now: time at the end of the step [s].
 
         Returns:
             How many drains have swallowed, and how many have left through open sides.

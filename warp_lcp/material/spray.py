@@ -56,7 +56,7 @@ class Spray:
     Args:
         grid: any of the simulation's.
         solids: solids that it may meet.
-        open_sides: of the domain, see `warp_lcp.grid.sides.side_bits`.
+        open_sides: open sides of the domain, see `warp_lcp.grid.sides.side_bits`.
         active: whether any particle may fly.
         keeps: whether particles carry a number.
 
@@ -103,7 +103,7 @@ class Spray:
             particles: on the grid (updated).
             totals: sums over them.
             step: number of the step.
-            time: at its start [s].
+            time: time at the start of the step [s].
             dt: its length [s].
         """
         own, dx, before = self.particles, particles.grid.spacing, particles.count

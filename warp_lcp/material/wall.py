@@ -146,14 +146,15 @@ def extend_velocity(
         window: faces to consider.
         velocity: each component [m/s] (updated): projected where `known`, the particles' average
             where there is weight.
-        weights: of the particles on each component's faces.
+        weights: weights of the particles on each component's faces.
         known: int8 of each component (updated): 1 on projected faces, 0 on others, -1 inside
             solids.
         kind: int8 of AIR, FLUID, SOLID.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         index: int32: -1 in open cells, the wall's number elsewhere.
         separating: uint8 a wall.
-        solid_velocity: of the solids on each component's faces [m/s], or empty if all stand still.
+        solid_velocity: velocity of the solids on each component's faces [m/s], or empty if all
+            stand still.
         layers: number of layers of faces to fill in the air.
         join: called with the marks and the velocity of a component after each layer, see
             `warp_lcp.grid.extrapolate`.
