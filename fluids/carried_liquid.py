@@ -1,4 +1,4 @@
-"""Liquid that moves with thin rigid bodies, up to the centers of cells beside them."""
+"""Liquid that moves with thin rigid bodies, up to the nearest cell centers."""
 
 from __future__ import annotations
 

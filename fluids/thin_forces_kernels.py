@@ -115,7 +115,9 @@ def arc_area(count: int, a: float, b: float, alike: bool):
 
 @wp.func
 def lean(S: WallKernelFields, cube: Cube, at: wp.vec3i, corner: int, axis: int, other: int):
-    """Return the slope of a wall, from its distance at the next center outside the square.
+    """Return the slope of a wall, from its distance at the next cell center.
+
+    That center lies outside of the square.
 
     It is the increase of the wall's distance along `axis` from the corner to that center; `at` is
     the cell of corner 0. The slope is 0 for a wall along the other axis of the square, and -1 if

@@ -137,7 +137,7 @@ def pull_kernel(
 
 @cell_kernel(MODULE)
 def part_kernel(k, j, i, a: int, b: int, apart_a: U8, apart_b: U8, edge: F32):
-    """Cut the links across an edge of axes a and b at faces that a thin solid separates."""
+    """Cut the links across an edge of axes a and b at a thin solid."""
     if apart_below(apart_a, b, k, j, i) or apart_below(apart_b, a, k, j, i):
         edge[k, j, i] = 0.0
 

@@ -111,7 +111,7 @@ def carry_pass(axis: int) -> StencilKernel:
 def clearance_kernel(
     cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)
 ):
-    """Mark cells with their distance to the nearest SOLID cell, one distance per launch.
+    """Mark cells at one distance from the nearest SOLID cell per launch.
 
     The launch with `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE. The launch with
     distance d marks the cells around those of d - 1 with d.

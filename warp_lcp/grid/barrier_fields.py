@@ -41,7 +41,7 @@ def free_path(apart: U8, k: int, j: int, i: int, dk: int, dj: int, di: int):
 
 @wp.func
 def stand_in(apart: U8, k: int, j: int, i: int, way: wp.vec3i):
-    """Return the step to the cell that replaces the one a step `way` (z, y, x) from a cell.
+    """Return the step to the cell that replaces one at a step `way` (z, y, x).
 
     It is that cell if it is on the same side of thin solids. Otherwise the step is shortened by one
     of its axes, or by two, which mirrors the values beside the cell. If none of these is free,
@@ -80,7 +80,10 @@ def has_neighbors(field: U8, planes: int, k: int, j: int, i: int):
 
 @cell_kernel(MODULE)
 def binomial_kernel(k, j, i, near: U8, apart: U8, planes: int, source: F32, out: F32):
-    """Repeat a binomial pass (1, 2, 1)/4 near thin solids, without values from beyond them."""
+    """Repeat a binomial pass (1, 2, 1)/4 near thin solids.
+
+    Values from beyond the solids are left out.
+    """
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         total = float(0.0)
         for n in range(wp.where(planes == 2, 27, 9)):
@@ -112,7 +115,9 @@ def shift_kernel(
     known: I8,
     out: F32,
 ):
-    """Shift phi back to a cell's center, near thin solids, from values on its own side.
+    """Shift phi back to a cell's center near thin solids.
+
+    Only values on the cell's own side are used.
 
     See `warp_lcp.grid.level_set_kernels.wall_shift_kernel`.
     """

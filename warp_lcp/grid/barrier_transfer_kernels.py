@@ -182,7 +182,9 @@ def interpolate_kernel(
     velocity: POINTS,
     gradient: POINTS,
 ):
-    """Interpolate the velocity at particles near thin solids from the faces that they see.
+    """Interpolate the velocity at particles from the faces that they see.
+
+    Only particles near thin solids are considered.
 
     See `warp_lcp.grid.transfer`.
     """

@@ -1,4 +1,4 @@
-"""Barriers: solids thinner than cells, which separate the material on their two sides.
+"""Barriers: solids thinner than cells, which separate material on their sides.
 
 A face between two cells is closed where a solid stands between the cells' centers, although neither
 center lies in it. The face has the velocity of the solid there.

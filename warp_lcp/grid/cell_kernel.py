@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernel factories: a function of one cell, or of a piece of a row, becomes a kernel.
+"""Kernel factories: make kernels of functions of one cell or row piece.
 
 Only this module defines how threads share the cells of a `CellRange`.
 """
@@ -142,7 +142,7 @@ def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], w
 
 
 def list_kernel(module: str) -> Callable:
-    """Return a decorator that makes a kernel(tasks, ...) of a function of one list entry.
+    """Return a decorator for kernels(tasks, ...) of functions of a list entry.
 
     The kernel is launched by `launch_list`; `module` is its Warp module. The function's parameter
     without a type is the entry `i`. It cannot return early, and writes nothing that other entries

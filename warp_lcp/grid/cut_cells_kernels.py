@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Open fractions of faces and cells, and velocities of solids, from node distances.
+"""Open fractions of faces and cells, and solid velocities, from node distances.
 
 See `warp_lcp.grid.node_distance`.
 """
@@ -108,7 +108,7 @@ _TURNS, _SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
 
 @wp.struct
 class Moving:
-    """Node distances and marks of the moving solids, to find the one that covers a face."""
+    """Node distances and marks of moving solids, to find the one on a face."""
 
     nodes: Nearest
     standing: F32  # distance to the nearest solid that stands still, at nodes [cells]

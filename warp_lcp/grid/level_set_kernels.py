@@ -33,7 +33,7 @@ GATHER = KERNELS["warp_lcp.grid.density.gather_density"]
 
 @wp.func
 def slope_beside(here: float, below: float, above: float, has_below: bool, has_above: bool):
-    """Return the central difference, or the one-sided one where only one neighbor has a value."""
+    """Return the central difference, or the one-sided one with one neighbor only."""
     if has_below and has_above:
         return 0.5 * (above - below)
     if has_above:
@@ -110,7 +110,7 @@ def clear_kernel(k, j, i, limit: float, phi: F32, known: I8):
 
 @cell_kernel("warp_lcp.grid.level_set")
 def whole_cell_capacity_kernel(k, j, i, planes: int, base: I8, capacity: F32):
-    """Add up the shares 1/6, 2/3, 1/6 of a cell's kernel that lie in the open cells around it."""
+    """Sum up the shares 1/6, 2/3, 1/6 of a cell's kernel over open cells."""
     total = float(0.0)
     for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, base.shape[0])):
         for b in range(wp.max(j - 1, 0), wp.min(j + 2, base.shape[1])):

@@ -101,7 +101,9 @@ def _midpoint(edge: Edge) -> np.ndarray:
 
 @functools.cache
 def _cut(loop: Loop) -> Cut | None:
-    """Return the triangulation of a loop with the shortest diagonals, and their length.
+    """Return the triangulation of a loop with the shortest diagonals.
+
+    Also returns their length.
 
     Returns None if every triangulation has a diagonal within a face.
     """

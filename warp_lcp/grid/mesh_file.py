@@ -119,7 +119,7 @@ def _triangulate(path: Path, points: np.ndarray, blocks: Corners) -> tuple[np.nd
 
 
 def _blocks(polygons: Sequence[Sequence[int] | np.ndarray]) -> Corners:
-    """Return polygons as arrays, one for each run of polygons with equally many corners."""
+    """Return polygons as arrays, one per run of equal numbers of corners."""
     return [np.array(list(run), dtype=np.int64) for _, run in itertools.groupby(polygons, key=len)]
 
 
@@ -274,7 +274,7 @@ class _Records:
         self.order, self.at = order, 0
 
     def claim(self, element: _Element) -> dict[str, int]:
-        """Return the least size of an element's records and the size of the remaining data.
+        """Return the least size of an element's records, and that of the data left.
 
         `stored` and `held` are in bytes, two per word of a text.
         """

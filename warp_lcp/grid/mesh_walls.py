@@ -97,7 +97,7 @@ def fit_to_walls(
     fixed: np.ndarray,
     walls: MeshWalls,
 ) -> np.ndarray:
-    """Return the points of a surface with those on solids moved onto the solids' shapes.
+    """Return a surface's points, with those on solids moved onto the shapes.
 
     Args:
         points: points of the surface [cells], shape (n, 3).
@@ -227,7 +227,10 @@ class Planes:
 
     @classmethod
     def through(cls, x: np.ndarray, normal: np.ndarray) -> Planes:
-        """Return a plane through each point, shape (n, 3), with this normal; none where it is 0."""
+        """Return a plane through each point, shape (n, 3), with this normal.
+
+        There is no plane where the normal is 0.
+        """
         return cls(
             normal[:, :, None] * normal[:, None, :],
             normal * np.einsum("ij,ij->i", normal, x)[:, None],

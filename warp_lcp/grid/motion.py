@@ -523,7 +523,7 @@ def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def _elapsed(time: float, start: float, stop: float) -> float:
-    """Return the elapsed time [s] of a motion that begins at `start` and ends at `stop`."""
+    """Return the elapsed time [s] of a motion from `start` to `stop`."""
     return min(max(time, start), stop) - start
 
 

@@ -1,4 +1,4 @@
-"""Signed distances of solids at the nodes of a grid, in cells, positive in the open.
+"""Signed distances of solids at grid nodes, in cells, positive in the open.
 
 Node (k, j, i) is the low corner of stored cell (k, j, i). Each node stores the two nearest solids,
 so that a face can choose the one nearest to its center. Distances below `FAR` cells are exact,
@@ -84,7 +84,7 @@ class NodeDistances:
 
 
 def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) -> Window:
-    """Return the window of nodes low <= (x, y, z) < high, without cells where there are none."""
+    """Return the window of nodes low <= (x, y, z) < high, which may be empty."""
     if any(map(ge, low, high)):
         return Window((1, 1, 1), (1, 1, 2), grid.device)
     return Window(_kji(low), _kji(high), grid.device)
@@ -93,7 +93,7 @@ def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) ->
 def nodes_near(
     grid: StaggeredGrid, geometry: Geometry, reach: float = FAR
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the range of stored nodes (x, y, z) within `reach` cells of a solid's bounds.
+    """Return the range of nodes (x, y, z) within `reach` cells of a solid's box.
 
     The first node and the one past the last; None if there are none.
     """
@@ -130,7 +130,7 @@ def nodes_within(
 
 
 class ShapeTable:
-    """Table of boxes, spheres, capsules and planes on the device, entered by one launch.
+    """Device table of boxes, spheres, capsules and planes, entered by one launch.
 
     Args:
         grid: the grid.

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of solids' distances at nodes, and of cells that are flat at all corners.
+"""Kernels of solids' distances at nodes, and of flat cells.
 
 A flat cell has distance 0 at all corners; only its center shows whether it is open.
 """
@@ -35,7 +35,10 @@ options = {"module": "warp_lcp.grid.node_distance"}
 
 @wp.struct
 class Nearest:
-    """The two nearest solids of each node, see `warp_lcp.grid.node_distance.NodeDistances`."""
+    """The two nearest solids of each node.
+
+    See `warp_lcp.grid.node_distance.NodeDistances`.
+    """
 
     near: F32
     owner: I16
@@ -100,7 +103,10 @@ def enter(node: wp.vec3i, d: float, solid: int, nodes: Nearest):
 
 @wp.func
 def snapped(meters: float, spacing: float, snap: float):
-    """Return a distance in cells; 0 within `snap` of 0, so that walls on faces stay there."""
+    """Return a distance in cells, 0 within `snap` of 0.
+
+    Walls on faces so stay there.
+    """
     d = meters / spacing
     if wp.abs(d) < snap:
         d = 0.0
@@ -178,7 +184,7 @@ def claim_groups(
 
 @forward_kernel(**options)
 def listed_points(block: Block, list: Listed, out: Points):
-    """Fill the places [m] of listed nodes or, with the block's offset, of cell centers."""
+    """Fill the places [m] of listed nodes, or cell centers by the block's offset."""
     c = wp.tid()
     out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), block.offset)
 

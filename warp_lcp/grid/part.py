@@ -158,7 +158,10 @@ class ParticleExchange:
         return nullcontext()
 
     def joined_totals(self, own: ParticleTotals) -> ParticleTotals:
-        """Return the sums over all processes' particles from those of this one; collective."""
+        """Return the sums over the particles of all processes; collective.
+
+        `own` are the sums of this process.
+        """
         return own
 
 
@@ -243,14 +246,17 @@ class GridPart:
         return ParticleExchange(particles)
 
     def nearest(self, cells: np.ndarray) -> np.ndarray:
-        """Return cells (x, y, z) of the part, shape (n, 3), as their nearest periodic images.
+        """Return the nearest periodic images of cells (x, y, z), shape (n, 3).
 
         Along periodic axes the image that is nearest to the part is chosen.
         """
         return cells
 
     def near(self, window: Window, layers: int) -> Window | None:
-        """Return the cells of a window within some layers of the owned cells; None if none."""
+        """Return the cells of a window within some layers of the owned cells.
+
+        Returns None if there are none.
+        """
         return window
 
     def join_trees(
@@ -311,7 +317,7 @@ class GridPart:
         return None
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
-        """Return the cells that the fastest particles move in a step, if too many; collective.
+        """Return the cells that particles move in a step, if too many; collective.
 
         Returns 0 if all stay within the ghost cells.
         """
@@ -385,7 +391,7 @@ class GridPart:
 
     @property
     def row_ranks(self) -> Any:
-        """Processes that have cells of the same rows along x, in order; None if rows are whole."""
+        """Processes that share rows along x, in order; None if rows are whole."""
         return None
 
     def known_of(self, field: np.ndarray) -> np.ndarray:

@@ -165,7 +165,7 @@ def scatter(
 
 @dataclass(frozen=True, slots=True)
 class GridPlacement:
-    """Spacing of a grid and its place in a larger one, as kernels over particles take them.
+    """Spacing of a grid and its place in a larger one, for particle kernels.
 
     Attributes:
         planes: nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D.

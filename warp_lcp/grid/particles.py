@@ -543,7 +543,9 @@ class Particles:
             )
 
     def _keys_to_sort(self) -> int:
-        """Return the number of keys that a GPU sorts: at most a quarter more than particles.
+        """Return the number of keys that a GPU sorts.
+
+        It is at most a quarter more than the number of particles.
 
         So one graph serves many numbers of particles.
         """

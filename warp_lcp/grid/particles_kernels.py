@@ -35,7 +35,10 @@ def count_up_kernel(
 
 @forward_kernel(module="warp_lcp.grid.particles")
 def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(dtype=wp.int32)):
-    """Find the first particle of each cell, or of the next nonempty one, in sorted keys."""
+    """Find the first particle of each cell, or of the next nonempty one.
+
+    The keys are sorted.
+    """
     cell = wp.tid()
     if cell > key[count - 1]:  # lower_bound would return the last particle
         offsets[cell] = count

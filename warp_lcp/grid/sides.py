@@ -291,7 +291,10 @@ def add_kernel(count: int, lines: F32):
 @forward_kernel(module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def average_kernel(count: int, weight: F32, field: F32, saved: F32):
-    """Merge the two ends of a line into the faces that they repeat, weighted by particles."""
+    """Merge the two ends of a line into the faces that they repeat.
+
+    The result is the mean weighted by particles.
+    """
     a, b = wp.tid()
     for end in range(2):
         ring = wp.where(end == 0, 0, count + 1)

@@ -165,7 +165,7 @@ class _Shape(ABC):
     def signed_distance(
         self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
     ) -> None:
-        """Write the Euclidean distance to the surface, negative inside (outside when inverted).
+        """Write the distance to the surface, negative inside (outside if inverted).
 
         Args:
             points: [m], shape (m,), on any device; a 2-D caller passes z = 0.

@@ -83,7 +83,7 @@ def cell_index(coordinate: float, count: int):
 def _corners(
     choose: typing.Callable[[int, int], int], one: tuple[int, int, int], other: tuple[int, int, int]
 ) -> tuple[int, int, int]:
-    """Return the smaller or the larger coordinates of two corners; `choose` is min or max."""
+    """Return the smaller or larger coordinates of corners; `choose`: min or max."""
     return choose(one[0], other[0]), choose(one[1], other[1]), choose(one[2], other[2])
 
 

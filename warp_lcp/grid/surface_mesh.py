@@ -235,7 +235,7 @@ class SurfaceMesh:
         return Window.of(low.tolist(), high.tolist(), lattice.device)
 
     def _mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
-        """Return the smoothed surface phi = 0; on ranks the triangles of this rank's cells.
+        """Return the smoothed surface phi = 0, on ranks that of this rank's cells.
 
         `number` is scratch memory.
         """

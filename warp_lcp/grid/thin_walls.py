@@ -247,7 +247,7 @@ class ThinWalls:
         )
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Return a mask of points [m], shape (n, 3), that keep the distance from these solids.
+        """Return a mask of points [m], shape (n, 3), that keep their distance.
 
         A particle may start there.
         """

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Exact geometry of thin solids: path intersections, and kernels that stop particles.
+"""Exact geometry of thin solids: intersect paths, and stop particles.
 
 All of it is float64: a particle keeps a distance of a thousandth of a cell from a wall, and that
 must survive the transformation from the domain's coordinates into those of a shape and back.
@@ -65,7 +65,7 @@ SHAPES, GROUPS = wp.array(dtype=ThinShape), wp.array(dtype=ThinGroup)
 
 @wp.func
 def hit_box(a: wp.vec3d, d: wp.vec3d, half: wp.vec3d):
-    """Intersect a path a + t d with a box: return t of the entry, and the normal there."""
+    """Intersect a path a + t d with a box; return t and the normal of the entry."""
     enter = -_MISS
     leave = _MISS
     axis = int(0)
@@ -234,7 +234,7 @@ def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
 
 @wp.func
 def in_plane(n: wp.vec3d, planes: int):
-    """Project a normal onto the plane of a 2-D scene, at unit length; 0 if it has no part."""
+    """Project a normal onto the plane of a 2-D scene, at unit length or 0."""
     result = n
     if planes == 1:
         result = wp.normalize(wp.vec3d(n[0], n[1], _ZERO))

@@ -32,7 +32,7 @@ NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 
 
 class BallisticFragments:
-    """Find the bodies of material that no wall touches in a step, and keep their momenta.
+    """Find bodies of material that no wall touches, and keep their momenta.
 
     The pressure's impulses on an airborne body add up to zero, but not the impulses that its
     particles get from them. They are not spread as evenly as the volume for which the pressure is
@@ -153,7 +153,7 @@ class BallisticFragments:
         dt: float,
         change: np.ndarray,
     ) -> int:
-        """Find the bodies, before particles take their new velocities; return their number.
+        """Find bodies, before particles get new velocities; return their number.
 
         Args:
             particles: the material; `key` holds its cells.
@@ -226,7 +226,7 @@ class BallisticFragments:
         self._add(kernels.lift_kernel, particles, [particles.position, self._start])
 
     def _launch_flight(self, particles: Particles, velocity: list[wp.array]) -> None:
-        """Launch the advection of the bodies' particles, and the sums over their new places."""
+        """Launch the advection of the bodies' particles, and sums at the new places."""
         clear(self._flight.sums)
         wall, arrived = self.boundary, [self._x, self._near]
         inputs = [
@@ -247,7 +247,7 @@ class BallisticFragments:
         self._carry(kernels.land_kernel, [*moved, self._motion, self._end, particles.position])
 
     def end(self, particles: Particles, velocity: Sequence[wp.array]) -> None:
-        """Move the bodies' particles again after all have moved, and correct their momenta.
+        """Move the bodies' particles again, and correct their momenta.
 
         Args:
             particles: those of `begin`, in their order, with new velocities (updated: position,
@@ -339,7 +339,10 @@ def _about_center(sums: Sums) -> np.ndarray:
 
 
 def _about_mean(sums: Sums) -> np.ndarray:
-    """Return the sums of the squares of velocities relative to the bodies' own, shape (bodies,)."""
+    """Return the sums of squared velocities relative to the bodies' means.
+
+    The shape is (bodies,).
+    """
     return sums[:, 16] - (sums[:, 4:7] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
 
 

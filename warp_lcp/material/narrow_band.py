@@ -442,7 +442,7 @@ class NarrowBand:
             self._fall(number % 2 == 1)
 
     def _fall(self, forth: bool) -> None:
-        """Launch a pass that lowers the depth of cells to the limit set by their neighbors."""
+        """Launch a pass that lowers the depth of cells to their neighbors' limit."""
         if self.grid.device.is_cpu:
             clear(self._changed)
         plane, row = (0, 0) if forth else self._last

@@ -143,7 +143,7 @@ def make_boundary(
     *,
     solids: Sequence[PlacedSolid] | None = None,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Return the boundary of the scene, its solids and walls, and warnings; collective.
+    """Return the scene's boundary (solids and walls) and warnings; collective.
 
     Args:
         scene: the scene.
@@ -263,7 +263,7 @@ class Parts:
 def make_spray(
     scene: ParticleScene, coverage: DomainWindow | None, placed: Sequence[PlacedSolid]
 ) -> Spray | None:
-    """Return the spray, which carries lone particles without a grid; None if not possible.
+    """Return the spray for lone particles without a grid; None if not possible.
 
     The scene needs a grid that follows the material, and no surface mesh.
     """
@@ -380,7 +380,7 @@ def make_particles(
     folder: Path,
     without: np.ndarray | None = None,
 ) -> tuple[Particles, list[str]]:
-    """Return the particles of all materials, in the order of `seed_materials`, and warnings.
+    """Return the particles of all materials, as of `seed_materials`, and warnings.
 
     Arguments as of `seed_materials`.
 
@@ -395,7 +395,10 @@ def make_particles(
 
 
 def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:
-    """Return the number that particles of these materials carry, shape (n,); None if none."""
+    """Return the number that particles carry, shape (n,), by material.
+
+    Returns None if they carry none.
+    """
     kept = scene.kept(scene.materials()[1])
     return None if kept is None else np.array([*kept, 1.0], dtype=np.float32)[owner]
 
@@ -462,7 +465,7 @@ def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Out
 def make_narrow_band(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path
 ) -> NarrowBand | None:
-    """Return the narrow band, which carries deep material; None if it is off. Collective."""
+    """Return the narrow band of deep material, None if it is off; collective."""
     settings, particles = scene.particles.narrow_band, scene.particles
     if settings is None:
         return None

@@ -1,4 +1,4 @@
-"""Checkpoints of particle simulations: on the same grid, another one, or more ranks."""
+"""Checkpoints of particle simulations, for any grid and number of ranks."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class ParticleCheckpoints(ParticleFrames):
         return clock | known | particles | part.kept(self._fields()) | bodies | part.where()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`, which on several ranks is that of one process; collective.
+        """Continue from `state`, on ranks that of one process; collective.
 
         Raises:
             ValueError: the arrays do not belong to this scene; on all ranks.
@@ -198,7 +198,7 @@ class ParticleCheckpoints(ParticleFrames):
         self._take_pieces([part.migrate(piece, list(self.particles.arrays()), before)], expected)
 
     def _everyone(self) -> int:
-        """Return the number of particles on all ranks, with those of a narrow band's interior."""
+        """Return the number of particles on all ranks, narrow band interior included."""
         return sum(self.particles.exchange.counts) + (
             self.band.held if self.band is not None else 0
         )

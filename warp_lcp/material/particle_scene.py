@@ -1,4 +1,4 @@
-"""Scenes of a material on particles: sampling, sources, drains, estimates of a run."""
+"""Scenes of materials on particles: sampling, sources, estimates of a run."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class ParticleSettings(Table):
     narrow_band: NarrowBandSettings | None = None
 
     def reseed_range(self, dimension: int) -> tuple[int, int]:
-        """Return the least and the largest number of particles that reseeding leaves in a cell."""
+        """Return the range of particle numbers of cells that reseeding leaves alone."""
         at_rest, given = self.per_axis**dimension, self.reseed or Reseed()
         return given.min or math.ceil(0.375 * at_rest), given.max or 2 * at_rest
 
@@ -130,7 +130,7 @@ class ParticleScene(Scene):
 
     @abstractmethod
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
-        """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
+        """Return the key of the material's shapes, such as `liquid`, and the shapes."""
 
     def kept(
         self, materials: Sequence[MaterialProperties | SourceProperties]
@@ -332,7 +332,7 @@ class ParticleScene(Scene):
         return at_start + (int(min(let_in, 2.0**62)) if later and held.all() else 0)
 
     def _band_volume(self, shape: MaterialProperties, width: float) -> float:
-        """Return the part of a shape's bounding box within a narrow band [m^3; m^2 in 2-D].
+        """Return the volume of a shape's box in a narrow band [m^3; m^2 in 2-D].
 
         It is no deeper than the band below a free side.
         """

@@ -122,7 +122,7 @@ class ParticleSimulation(ParticleCheckpoints):
         spray: Spray | None = None,
         notes: Sequence[str] = (),
     ) -> None:
-        """Allocate the fields, fill the sources that run at the start and sort the particles."""
+        """Allocate the fields, fill running sources and sort the particles."""
         self.scene, self.particles, self.outlets, self.bodies = scene, particles, outlets, bodies
         self._bodies_at_start = (
             [body.state() for body in bodies.bodies] if bodies is not None else []
@@ -376,7 +376,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals.max_speed + self.kick_dt * math.sqrt(self.gravity @ self.gravity)
 
     def particles_to_grid(self, window: Window) -> None:
-        """Transfer the particles' velocities to the faces, and apply gravity for `kick_dt`."""
+        """Transfer particle velocities to the faces, and apply gravity for `kick_dt`."""
         p = self.particles
         with self.watch.stage(
             "particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights
@@ -675,7 +675,10 @@ class ParticleSimulation(ParticleCheckpoints):
         return {name: found.get(name) for name in self._columns}
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns, see `warp_lcp.material.particle_log.columns`."""
+        """Return the names of the log's columns.
+
+        See `warp_lcp.material.particle_log.columns`.
+        """
         told = {
             **{
                 "stopped": True,
@@ -741,7 +744,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals if self.band is None else self.band.with_interior(totals)
 
     def _exchange(self, dt: float) -> dict[str, int]:
-        """Remove particles at outlets and add those of sources; return the counts of all ranks."""
+        """Remove particles at outlets, add those of sources; return global counts."""
         span, drained, departed = (self.time, self.time + dt), 0, 0
         with self.watch.stage("sources and outlets", self.particles.position):
             for outlets in [] if self.outlets is None else [self.outlets]:

@@ -165,7 +165,7 @@ class Reseeding:
             self._inside.launch(kernels.find_kernel, inputs)
 
     def _exchange(self, particles: Particles) -> None:
-        """Launch the moves of particles between neighboring cells, one direction at a time."""
+        """Launch moves of particles between neighboring cells, direction by direction."""
         offsets = self._offsets if particles.offsets is None else particles.offsets
         count = int(self._list.count.value)
         inputs = [

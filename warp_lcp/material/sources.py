@@ -397,7 +397,7 @@ class Sources:
         return [float(v) * (time - source.start) for v in source.velocity]
 
     def _box(self, cells: np.ndarray) -> tuple[list[float], list[float]] | None:
-        """Return the low and the high corner [m] of cells (k, j, i); None if there are none."""
+        """Return the low and high corner [m] of cells (k, j, i); None without cells."""
         if not len(cells):
             return None
         low, high = (
@@ -421,7 +421,7 @@ class Sources:
 
 
 def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) -> np.ndarray:
-    """Return the source that each open cell belongs to, -1 for none, shape (nz, ny, nx)."""
+    """Return the source of each open cell, -1 for none, shape (nz, ny, nx)."""
     nz, ny, nx = (n - 2 for n in grid.shape)
     K, J, I = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
     centers = (

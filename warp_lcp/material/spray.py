@@ -136,7 +136,7 @@ class Spray:
         )
 
     def behind(self, name: str, array: np.ndarray) -> np.ndarray:
-        """Append the array of the spray to that of the particles on the grid, shape (n, 3)."""
+        """Append the spray's array to that of the particles on the grid, (n, 3)."""
         own = self.particles.arrays().get(name)
         return np.concatenate(
             [

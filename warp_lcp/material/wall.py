@@ -105,7 +105,10 @@ def closed_face_kernel(
     solid: F32,
     field: F32,
 ):
-    """Set closed faces to the wall's normal velocity, or remove the part into the wall."""
+    """Set the wall's normal velocity on closed faces, or limit theirs.
+
+    Where the material may leave, only the part into the wall is removed.
+    """
     c, b, a = cell_below(axis, k, j, i)
     here = index[k, j, i]
     below = index[c, b, a]
