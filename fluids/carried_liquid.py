@@ -1,4 +1,4 @@
-"""Liquid beside thin rigid bodies that moves with them: up to the centers of cells."""
+"""Liquid that moves with thin rigid bodies, up to the nearest cell centers."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from warp_lcp.rigid.body import PLANAR
 
 
 class CarriedLiquid:
-    """What thin rigid bodies take along of the liquid beside them.
+    """Added mass of the liquid beside thin rigid bodies.
 
-    The pressure acts on such a body at cells' centers, a cell apart. What lies between them and the
-    body, of the mass m of each face f along its normal n, has the body's velocity V there, n . V_f.
-    With the unit motions c_f of the body's point at the face, the matrix G = sum of m c c' and the
-    sum g of m c u* of the liquid's velocities u*,
+    The pressure acts on such a body at cells' centers, a cell apart. The liquid between these
+    centers and the body moves with the body: its mass m at each face f has, along the normal n, the
+    body's velocity n . V_f there. With the unit motions c_f of the body's point at the face, the
+    matrix G = sum of m c c' and the sum g of m c u* of the liquid's velocities u*,
 
         V = V* + H (I + g - G V)
 
-    after impulses I, where H is the inverse of the body's mass: it has the inverse mass
-    W = (1 + H G)^-1 H, and of impulses I it gets I - G W I.
+    after impulses I, where H is the inverse of the body's mass matrix. The body then has the
+    inverse mass W = (1 + H G)^-1 H, and of impulses I its own share is I - G W I.
 
     Args:
         grid: the grid.
@@ -49,7 +49,7 @@ class CarriedLiquid:
         self._body[bodies.numbers] = np.arange(count)
 
     def take(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
-        """Find the liquid, and share its momentum with the bodies; collective.
+        """Compute G and g, and share the liquid's momentum with the bodies; collective.
 
         Args:
             velocity: u* of each component [m/s].
@@ -69,7 +69,7 @@ class CarriedLiquid:
         return np.asarray(0.5 * (joined + joined.swapaxes(-1, -2)))
 
     def share(self, impulses: np.ndarray) -> np.ndarray:
-        """Return what the bodies get of impulses, shape (n, k)."""
+        """Return the bodies' own share of impulses, shape (n, k)."""
         inverse = self.bodies.bodies.inverse_masses(self.grid.dimension)
         changed = np.einsum("nij,nj->ni", self.inverse_masses(inverse), impulses)
         return np.asarray(impulses - np.einsum("nij,nj->ni", self.mass, changed))
@@ -78,7 +78,7 @@ class CarriedLiquid:
         return np.asarray(np.eye(inverse.shape[-1]) + inverse @ self.mass)
 
     def _find(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
-        """Sum up G and g over the faces of this process, and then over all."""
+        """Sum up G and g over the faces of this process, and then over all processes."""
         grid, part, barriers = self.grid, self.grid.part, self.barriers
         near = barriers.reach.common(grid.domain)
         window = None if near is None else near.common(part.faces(near))
@@ -95,7 +95,7 @@ class CarriedLiquid:
             u, wet = velocity[axis].numpy(), kind.numpy() == FLUID
             below = np.where(wet[under], barriers.below[axis].numpy()[here], 0.0)
             above = np.where(wet[here], barriers.above[axis].numpy()[here], 0.0)
-            # velocities of the next faces: particles may not see this one
+            # Velocities of the neighboring faces, since particles may not see this one.
             moved = below * u[under] + above * u[over]
             place = (np.array(here).T[:, ::-1] + np.array(grid.origin) - 0.5) * grid.spacing
             place[:, axis] -= 0.5 * grid.spacing

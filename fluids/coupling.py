@@ -231,7 +231,7 @@ class BodyCoupling:
             self.carried.take(velocity, kind)
 
     def _block(self) -> tuple[list[int], list[int]] | None:
-        """Return the first and last cell (x, y, z) beside moving solids; None: there is none."""
+        """Return the first and last cell (x, y, z) beside moving solids; None without any."""
         block = self.boundary.cut.moving_block()
         if self.carried is None or self.boundary.barriers is None:
             return block

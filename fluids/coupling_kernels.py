@@ -20,7 +20,7 @@ class Solids:
     walls: WallKernelFields
     bodies: int
     body: _I32  # body of each wall number; -1 for a wall that is no body
-    center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]
+    center: wp.array(dtype=wp.vec3d)  # center of mass of each body [m]
     low: wp.vec3i  # first (k, j, i) of the stored fields of the problem
     rows: int  # rows per plane of these fields
     row: int  # length of a row of these fields

@@ -32,7 +32,7 @@ SPARE = 1.5  # factor on the number of entries when the buffer is enlarged
 
 
 def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
-    """Return the solids of a boundary as the kernel struct `wall_kernels.WallKernelFields`."""
+    """Return the solids of a boundary as `wall_kernels.WallKernelFields`."""
     S = WallKernelFields()
     S.planes, S.spacing, S.origin = grid.planes, grid.spacing, wp.vec3i(*grid.origin)
     if isinstance(boundary, CutBoundary):

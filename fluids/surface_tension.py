@@ -84,8 +84,7 @@ class SurfaceTension:
     without this term. Beside walls particles represent only the open part of a cell's kernel, see
     `whole_share`.
 
-    Thin solids, which hold apart what is on their two sides, see `warp_lcp.grid.barriers`, are met
-    at 90 degrees.
+    The contact angle at thin solids is 90 degrees, see `warp_lcp.grid.barriers`.
 
     Args:
         grid: the grid.
@@ -382,7 +381,7 @@ def wall_cells(
     Args:
         grid: the grid.
         base: int8, SOLID or AIR, in the stored shape.
-        distance: distance to solids at the cells' low corners [cells]; None: solids are whole
+        distance: distance to solids at the cells' low corners [cells]; None if solids are whole
             cells.
 
     Returns:

@@ -10,7 +10,7 @@ from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 MODULE = "fluids.surface_tension_barriers"
-STEEP = wp.constant(1.0e-4)  # the least square of a slope that tells a direction
+STEEP = wp.constant(1.0e-4)  # least square of a slope that defines a direction
 BAND = wp.constant(SHARE)
 _AIR, _FLUID, _SOLID = (wp.constant(wp.int8(kind)) for kind in (AIR, FLUID, SOLID))
 
@@ -30,9 +30,9 @@ def curvature_kernel(
     limit: float,
     bend: F32,
 ):
-    """Find the curvature again, see `surface_tension.h`.
+    """Compute the curvature again near thin solids, see `surface_tension.h`.
 
-    Others stand for cells beyond thin solids.
+    Cells beyond a thin solid are replaced by cells on the near side.
     """
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         share = 2.0 * once[k, j, i] - twice[k, j, i]
@@ -72,7 +72,7 @@ def curvature_kernel(
 def jump_kernel(
     k, j, i, near: U8, apart: U8, planes: int, scale: float, kind: I8, bend: F32, jump: F32
 ):
-    """Set the jump again in cells beside the surface: that of the cell's own curvature."""
+    """Set the jump again in cells beside the surface, from the cell's own curvature."""
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         own = kind[k, j, i]
         value = float(0.0)

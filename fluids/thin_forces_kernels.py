@@ -1,14 +1,17 @@
 # mypy: ignore-errors
-"""Kernel of the pressure's force on thin solids, by the vector area of the wall between cells."""
+"""Kernel of the pressure's force on thin solids.
+
+The force acts on the vector area of the wall between cells.
+"""
 
 import warp as wp
 
 from warp_lcp.fluids.wall_kernels import WallKernelFields, cell_center, crossing_on, fields_on, put
 from warp_lcp.grid.cell_kernel import F64, INTS, U8, cell_kernel, next_to
 
-OPEN = -1.0  # the distance to a wall along an edge that none crosses
-MIDWAY = 0.5  # cells: the distance to other walls, which close a face between two cells
-PASSES = 4  # over the corners of a cube, to find which are connected
+OPEN = -1.0  # distance along an edge that no wall crosses
+MIDWAY = 0.5  # cells: distance to other walls, which close a face between two cells
+PASSES = 4  # passes over the corners of a cube, to find which are connected
 
 _OPEN, _MIDWAY = wp.constant(OPEN), wp.constant(MIDWAY)
 Distances = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
@@ -17,20 +20,23 @@ Numbers = wp.types.matrix(shape=(8, 3), dtype=wp.int32)
 
 @wp.struct
 class Cube:
-    """The cube, in 2-D the square, between the centers of neighboring cells.
+    """Cube (in 2-D the square) between the centers of neighboring cells.
 
-    Bit `a` of a corner's number says whether it is the far one along axis a.
+    Bit `a` of a corner's number is set if the corner is the far one along axis a.
     """
 
     distance: Distances  # from a corner to the wall on the edge along an axis [cells], OPEN without
-    number: Numbers  # of the thin solid there, 0: another wall
-    sides: wp.vec3i  # in which direction the far corners lie, 1 or -1
+    number: Numbers  # number of the thin solid there, 0 for another wall
+    sides: wp.vec3i  # direction of the far corners, 1 or -1
     planes: int
 
 
 @wp.func
 def edge_of(S: WallKernelFields, axis: int, side: int, k: int, j: int, i: int):
-    """Return the distance from a cell's center to the wall before the next center, and its number."""
+    """Return the distance from a cell's center to the wall before the next center.
+
+    Also returns the number of the thin solid; the distance is OPEN without a wall.
+    """
     c, b, a = next_to(axis, wp.where(side > 0, 1, 0), k, j, i)
     distance = _OPEN
     crossed, below, above = crossing_on(S, axis, c, b, a)
@@ -45,7 +51,10 @@ def edge_of(S: WallKernelFields, axis: int, side: int, k: int, j: int, i: int):
 
 @wp.func
 def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
-    """Return the cube between a cell's center, its corner 0, and those in an octant around it."""
+    """Return the cube between the centers of a cell and its neighbors in an octant.
+
+    The cell is corner 0.
+    """
     cube = Cube()
     cube.planes = S.planes
     cube.sides = wp.vec3i(
@@ -65,7 +74,7 @@ def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
 
 @wp.func
 def connected(cube: Cube):
-    """Return the corners that edges without a wall connect with corner 0, a bit each."""
+    """Return the corners that edges without walls connect with corner 0, one bit each."""
     found = int(1)
     for _pass in range(PASSES):
         for n in range(4 * cube.planes):
@@ -78,7 +87,7 @@ def connected(cube: Cube):
 
 @wp.func
 def open_length(cube: Cube, found: int, first: int, axis: int):
-    """Return how much of an edge belongs to the connected corners [cells]."""
+    """Return the length of an edge that belongs to the connected corners [cells]."""
     second = first ^ (1 << axis)
     length = float(0.0)
     if (found >> first) & 1 != 0:
@@ -90,9 +99,10 @@ def open_length(cube: Cube, found: int, first: int, axis: int):
 
 @wp.func
 def arc_area(count: int, a: float, b: float, alike: bool):
-    """Return the part of a square around `count` corners in a row, with walls at a and b beyond.
+    """Return the area of a square around `count` corners in a row, between two walls.
 
-    One solid is taken to be straight between them; two meet at a right angle.
+    The walls are at a and b on the edges before and after these corners. A single solid is assumed
+    to be straight between them; two solids meet at a right angle.
     """
     share = wp.where(alike, 0.5, 1.0)
     area = 0.5 * (a + b)
@@ -105,10 +115,13 @@ def arc_area(count: int, a: float, b: float, alike: bool):
 
 @wp.func
 def lean(S: WallKernelFields, cube: Cube, at: wp.vec3i, corner: int, axis: int, other: int):
-    """Return how much farther the wall along an axis is from the next center away from the square.
+    """Return the slope of a wall, from its distance at the next cell center.
 
-    `at` is the cell of corner 0. It is 0 for a wall along the other axis of the square, and -1
-    where there is none.
+    That center lies outside of the square.
+
+    It is the increase of the wall's distance along `axis` from the corner to that center; `at` is
+    the cell of corner 0. The slope is 0 for a wall along the other axis of the square, and -1 if
+    there is no wall.
     """
     c, b, a = next_to(0, wp.where(corner & 1 != 0, cube.sides[0], 0), at[2], at[1], at[0])
     c, b, a = next_to(1, wp.where(corner & 2 != 0, cube.sides[1], 0), c, b, a)
@@ -129,10 +142,10 @@ def lean(S: WallKernelFields, cube: Cube, at: wp.vec3i, corner: int, axis: int, 
 
 @wp.func
 def corner_area(a: float, b: float, lean_a: float, lean_b: float):
-    """Return the area between a center and walls at a and b along two axes, continued to a corner.
+    """Return the area between a center and walls at a and b along two axes.
 
-    Walls x = a - lean_a y and y = b - lean_b x that meet beyond both are two sides of a corner.
-    Else, and where one is not known, a straight wall joins a and b.
+    Walls x = a - lean_a y and y = b - lean_b x that meet beyond both points are the two sides of a
+    corner. Otherwise, and where a slope is not known, a straight wall joins a and b.
     """
     area = 0.5 * a * b
     scale = 1.0 - lean_a * lean_b
@@ -148,9 +161,9 @@ def corner_area(a: float, b: float, lean_a: float, lean_b: float):
 def open_area(
     S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, first: int, along: int, other: int
 ):
-    """Return how much of a square of the cube belongs to the connected corners [cells^2].
+    """Return the area of a square that belongs to the connected corners [cells^2].
 
-    Walls on its edges divide its corners, taken around it, into arcs.
+    Walls on its edges divide its corners, in their order around the square, into arcs.
     """
     area = float(0.0)
     walls = int(0)
@@ -186,10 +199,11 @@ def open_area(
 
 @wp.func
 def wall_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, axis: int):
-    """Return the part along an axis of the vector area of the wall around the connected corners.
+    """Return the component along an axis of the wall's vector area in the cube.
 
-    It points into the wall [cells, 3-D: cells^2]. With the open parts of the cube's sides it closes
-    the surface of what the wall leaves of the cube, and so has the opposite of their sum.
+    The wall is the one around the connected corners; the vector points into it [cells, 3-D:
+    cells^2]. The wall and the open parts of the cube's sides form a closed surface, so the wall's
+    vector area is minus the sum of theirs.
     """
     along = (axis + 1) % (cube.planes + 1)
     near = float(0.0)
@@ -205,9 +219,10 @@ def wall_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, axis: i
 
 @wp.func
 def shared_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, crossed: int):
-    """Return the vector area that the wall on corner 0's edge along an axis has a share in.
+    """Return the vector area of the wall on an edge of corner 0, as a share.
 
-    Each part belongs to the walls on edges along its own axis or, without those, to all.
+    Each component belongs to the walls on edges along its own axis; without such walls it is
+    divided among all.
     """
     counts = wp.vec3i()
     for n in range(4 * cube.planes):
@@ -243,10 +258,11 @@ def thin_pressure_kernel(
     kick_z: float,
     scale: wp.float64,
 ):
-    """Count where thin solids cross the edges from a row's cells, or write the impulses there.
+    """Count where edges from a row's cells cross thin solids, or write impulses.
 
-    An edge joins the centers of two cells. x is continued along it, at the gradient of rest, to the
-    wall, and acts on the wall's vector area in the cubes around the edge: `scale` x per face.
+    An edge joins the centers of two cells. x is extrapolated along the edge to the wall, with the
+    hydrostatic gradient, and acts on the wall's vector area in the cubes around the edge: the
+    impulse is `scale` x per face.
     """
     row = k * x.shape[1] + j
     begin = int(0)

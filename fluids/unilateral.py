@@ -61,8 +61,8 @@ class UnilateralPressure(PressureProjection):
     seems to overfill the cells ahead and is blown off. The gradient accelerates the mean of both
     cells.
 
-    Cells that are less than a quarter open hold too few particles for a density: they accept what
-    fits, and do not settle.
+    Cells that are less than a quarter open hold too few particles for a density: their room is the
+    only limit, and they do not settle.
 
     The density uses a kernel three cells wide, so that the two layers of cells beneath a surface
     are not full and have no pressure until they are slightly compressed.

@@ -374,11 +374,11 @@ class Viscosity:
         return impulses
 
     def _pull_of_thin(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
-        """Return what faces beside thin solids lose to these, in units of a cell's mass.
+        """Return the momentum loss of faces beside thin solids, per mass of a cell.
 
         Args:
-            velocity: that the step has made [m/s].
-            points: about which moments are taken [m], shape (solids, 3).
+            velocity: velocity after the step [m/s].
+            points: reference points of the moments [m], shape (solids, 3).
 
         Returns:
             [m/s] and [m^2/s], shape (solids, 3 or 6).
@@ -520,7 +520,7 @@ class Viscosity:
         self.multigrid.set_up()
 
     def _hold_apart(self, kind: wp.array, contact: wp.array) -> None:
-        """Launch what cuts links at thin solids, and ties them to these."""
+        """Launch the kernels that cut links at thin solids, and link faces to the solids."""
         grid, fine, barriers = self.grid, self._fine, self.grid.barriers
         assert isinstance(self.boundary, CutBoundary), "thin solids are among cut cells"
         cut = self.boundary.cut

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Viscosity beside thin solids: liquid pulls at them, and not at what is beyond them."""
+"""Viscosity beside thin solids: links end at the solid and do not cross it."""
 
 import warp as wp
 
@@ -8,7 +8,7 @@ from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID
 
 MODULE = "fluids.viscosity_barriers"
-HALF = wp.constant(0.5)  # cells from a face to a thin solid that it is apart from its neighbor by
+HALF = wp.constant(0.5)  # cells from a face to a thin solid that separates it from its neighbor
 _FLUID, _RELEASED = wp.constant(wp.int8(FLUID)), wp.constant(wp.uint8(RELEASED))
 FLOATS = wp.array(dtype=wp.float32)
 TURNS, SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
@@ -16,13 +16,13 @@ TURNS, SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
 
 @wp.func
 def apart_below(apart: U8, axis: int, k: int, j: int, i: int):
-    """Return whether a solid stands between a place and the one before it along an axis."""
+    """Return whether a solid separates a place from the one before it along an axis."""
     return ((int(apart[k, j, i]) >> axis) & 1) == 1
 
 
 @cell_kernel(MODULE)
 def crossed_kernel(k, j, i, number: I16, slip: FLOATS, distance: F32, hold: F32):
-    """Enter the faces that thin solids cross: they lie on them."""
+    """Set the wall distance of faces that thin solids cross: they lie on the solid."""
     solid = int(number[k, j, i])
     if solid > 0:
         distance[k, j, i] = 0.0
@@ -54,33 +54,35 @@ def pull_kernel(
     speed: F32,
     owner: I16,
 ):
-    """Sum up a face's links to thin solids beside it along another axis.
+    """Sum up the links of a face to thin solids beside it along another axis.
 
-    A link that a solid cuts ends at it, half a cell away or behind it by the slip length.
+    A link that a solid cuts ends at the solid, half a cell away, or behind it by the slip length.
+    Its weight is tau V nu_rel / (1/2 + slip).
 
     Args:
         k: plane of the face.
         j: row of the face.
         i: place in its row.
-        axis: of the component.
-        other: the axis across which its faces are looked at.
-        apart: of the component's faces, see `warp_lcp.grid.barriers`.
-        number: of the solids that cross the faces of the other component.
-        volume: share of each face's cube that liquid fills.
-        relative: viscosity on faces, see `fluids.viscosity`; null: it is the same everywhere.
-        kind: of cells.
-        contact: of cells; walls that let go of one do not pull.
+        axis: axis of the component.
+        other: axis along which the neighboring faces lie.
+        apart: bits of the component's faces, see `warp_lcp.grid.barriers`.
+        number: numbers of the solids that cross the faces of the component along `other`, 0 for
+            none.
+        volume: liquid fraction of each face's cube.
+        relative: relative viscosity on faces, see `fluids.viscosity`; null if all are equal.
+        kind: kind of cells.
+        contact: contact of cells; RELEASED cells have no link to walls.
         tau: weight of a link.
         slip: slip length of each solid [cells].
         turn: a solid's point x moves at turn x + shift.
-        shift: see there.
-        origin: cells of a larger grid before the first one of this.
+        shift: see `turn` [m/s].
+        origin: cells of the larger grid before the first cell of this one.
         planes: 1 in 2-D, else 2.
-        dx: a cell's edge [m].
-        begins: whether this is the first of the other axes: what is there is forgotten.
-        weight: of the links together (updated).
+        dx: edge of a cell [m].
+        begins: whether `other` is the first of the other axes; earlier sums are then discarded.
+        weight: total weight of the links (updated).
         speed: mean velocity of the solids along the axis [m/s] (updated).
-        owner: number of one of them (updated).
+        owner: number of one of the solids (updated).
     """
     total = float(0.0)
     moved = float(0.0)
@@ -135,14 +137,17 @@ def pull_kernel(
 
 @cell_kernel(MODULE)
 def part_kernel(k, j, i, a: int, b: int, apart_a: U8, apart_b: U8, edge: F32):
-    """Cut the links across an edge of the axes a and b whose faces a thin solid holds apart."""
+    """Cut the links across an edge of axes a and b at a thin solid."""
     if apart_below(apart_a, b, k, j, i) or apart_below(apart_b, a, k, j, i):
         edge[k, j, i] = 0.0
 
 
 @cell_kernel(MODULE)
 def mix_kernel(k, j, i, near: U8, cell: F32, mixed: F32):
-    """Count all squares of the rate of strain near thin solids: products go with cut edges."""
+    """Count all squares of the strain rate near thin solids.
+
+    The products of different components vanish there, since their edges are cut.
+    """
     if near[k, j, i] != wp.uint8(0):
         cell[k, j, i] = cell[k, j, i] + mixed[k, j, i]
         mixed[k, j, i] = 0.0

@@ -19,7 +19,7 @@ class WallKernelFields:
     spacing: wp.float64
     origin: wp.vec3i  # offset of this grid's first cell in a larger grid
     index: I32  # null with cut cells
-    distance: F32  # of nodes from the solids [cells]; only with cut cells
+    distance: F32  # distance of nodes from the solids [cells]; only with cut cells
     moving: Moving  # share and number of moving solids
     open_x: F32
     open_y: F32

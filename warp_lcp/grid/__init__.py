@@ -1,1 +1,4 @@
-"""The staggered grid and what lives on it: fields, particles and their transfer, advection, solids as signed distance and as cells."""
+"""Staggered grid: fields, particles, transfer, advection, solids.
+
+Solids are given as signed distances, as cut cells or as whole cells.
+"""

@@ -1,4 +1,7 @@
-"""What particles reach of a grid: pieces of its rows, where a box around all of them would be mostly empty."""
+"""Active row segments: the part of the grid that particles reach.
+
+A box around all particles may be mostly empty. Passes then visit only segments of its rows.
+"""
 
 import math
 from dataclasses import replace
@@ -12,25 +15,25 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 
-# of a box that may be visited in part: finding the part costs as much as a pass over particles and
-# one over segments
+# Least cells of a box that is visited in part. Finding the part costs as much as a pass over the
+# particles and one over the segments.
 LEAST_CELLS = 1 << 17
-MOST = 0.4  # of a box's segments that a part may have
-REST = 6  # steps after which one looks again whether a part has become smaller
+MOST = 0.4  # largest active share of a box's segments
+REST = 6  # steps between tests of a box that was not worth visiting in part
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
 MARK = KERNELS["warp_lcp.grid.active_rows.mark_segments"]
 
 
 class ActiveRows:
-    """Find what the particles of a simulation reach.
+    """Active row segments of a simulation's particles.
 
-    A step leaves something in fields where it reaches, nothing elsewhere: one that visits what is
-    reached in it and what was in the step before leaves fields as if it had visited all cells.
+    A step writes values where it reaches and leaves zeros elsewhere. A pass that visits what this
+    step and the step before it reach therefore leaves fields as if it had visited all cells.
 
     Args:
-        grid: of the particles.
-        before: what has looked at another part of the same domain, whose cells begin a multiple of
+        grid: the grid of the particles.
+        before: the active rows of another part of the same domain, whose cells begin a multiple of
             `SEGMENT` apart.
     """
 
@@ -39,16 +42,17 @@ class ActiveRows:
         nz, ny, nx = grid.shape
         self._marks: wp.array[wp.uint8] | None = None
         self._shape = nz, ny, -(-nx // SEGMENT)
-        self._step = -1  # that has been looked at
-        self._now: np.ndarray | None = None  # what it reaches
-        self._before: np.ndarray | None = None  # and what the one before it did; None: not known
+        self._step = -1  # number of the last step
+        self._now: np.ndarray | None = None  # segments that the last step reaches
+        # Segments that the step before it reached; None if not known.
+        self._before: np.ndarray | None = None
         self._rest = -1  # the step until which all is visited
         self.active = not grid.device.is_cuda and grid.size >= LEAST_CELLS
         if before is not None and self.active:
             self._take(before)
 
     def _take(self, other: "ActiveRows") -> None:
-        """Go on from what another one has found."""
+        """Copy the segments that another object has found."""
         if other._now is None:
             return
         shift = np.array(other.grid.origin) - self.grid.origin
@@ -64,13 +68,13 @@ class ActiveRows:
         self._step, self._now = other._step, made
 
     def window(self, box: Window, particles: Particles, grow: int, step: int) -> Window:
-        """Return what must be visited of a box.
+        """Return the window of cells that a step must visit.
 
         Args:
-            box: of all that particles reach.
-            particles: where they are.
+            box: cells around everything that particles reach.
+            particles: the particles.
             grow: cells that they reach beyond their own.
-            step: number of the step; what it has reached before counts as well.
+            step: number of the step; cells that the previous step reached are included.
         """
         whole = math.prod(end - start for start, end in zip(box.low, box.high, strict=True))
         if not self.active or whole < LEAST_CELLS or step < self._rest:
@@ -89,7 +93,7 @@ class ActiveRows:
         return replace(box, near=both)
 
     def _near(self, box: Window, particles: Particles, grow: int) -> np.ndarray:
-        """Return which segments of rows are reached."""
+        """Return the marks of row segments that particles reach."""
         if self._marks is None:
             self._marks = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=self.grid.device)
         self._marks.zero_()
@@ -118,7 +122,7 @@ class ActiveRows:
 
 
 def spread(marks: np.ndarray, cells: int, axis: int) -> np.ndarray:
-    """Return bytes that are 1 where one is within some cells along an axis."""
+    """Return bytes that are 1 within some cells of a 1 along an axis."""
     if cells == 0:
         return marks
     width, all = 1, 2 * cells + 1

@@ -3,27 +3,27 @@
 Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962].
 Three ways:
 
-Particles among whole cells (`advect`) never enter a SOLID one. Every stage walks from cell to cell:
-a particle that meets a closed face stops before it and slides along it. Whole-cell solids need no
-distance, and a distance would not work: pushing particles out along it strands them in SOLID cells.
-The number of cells to the nearest solid shows which particles cannot be stopped; only the others
-walk.
+Particles among whole cells (`advect`) never enter a SOLID cell. Every stage walks from cell to
+cell: a particle that meets a closed face stops before it and slides along it. A distance would not
+work here: pushing particles out along it strands them in SOLID cells. The number of cells to the
+nearest solid shows which particles cannot be stopped; only the others walk.
 
-Particles among walls that are given by their distance (`advect_with_distance`). One whose distance
-to walls exceeds its way needs no care. The others go in strides that the distance allows, but of
-half a cell at least, so that one that rests on a wall gets on; whoever ends a stride too near a
-wall or inside it is put back along the normal. On a plane that takes just the normal part from the
-way. The rest of the way loses its part into the wall, and between two walls all but the part along
-their edge. A stride that would end on another side of a wall is halved, so that plates of more than
-a cell are not tunnelled at any speed. Positions are measured by the distance that is interpolated
-between nodes, which defines where solids are, and by that to the domain's walls.
+Particles among walls that are given by their distance (`advect_with_distance`) move freely if their
+distance to walls exceeds their path. The others move in strides that the distance allows, but of
+half a cell at least, so that a particle at rest on a wall can move. A particle that ends a stride
+too near a wall or inside it is put back along the normal; on a plane this removes just the normal
+part of the path. The rest of the path loses its part into the wall, and between two walls all but
+the part along their edge. A stride that would end on another side of a wall is halved, so that
+particles do not tunnel through plates of more than a cell at any speed. The distance is
+interpolated between nodes, which defines where solids are, and combined with that to the domain's
+walls.
 
 Fields (`carry_field`): f(x, t + dt) = f(y, t), where y is found by such a step back along the
-velocity, so that they go the same way as particles. A velocity is interpolated by cubics through
-four nodes along each axis (Catmull and Rom's), kept within the range of the 2^dimension nodes
-around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80 steps,
-with linear interpolation 23 %. A distance is interpolated linearly, which is exact where it is one
-to a plane.
+velocity, so that fields and particles follow the same path. A velocity is interpolated by cubics
+through four nodes along each axis (Catmull and Rom's), limited to the range of the 2^dimension
+nodes around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80
+steps, with linear interpolation 23 %. A distance is interpolated linearly, which is exact for the
+distance to a plane.
 """
 
 import functools
@@ -41,27 +41,28 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.memory import Scalar, scaled
 from warp_lcp.operators.grid_poisson import SOLID
 
-# cells; a particle that moves further in a step takes the careful way, which is always right
+# Cells. A particle that moves further in a step walks from cell to cell, which is always right.
 MAX_CLEARANCE = 6
 CENTERS = 3  # the `axis` of a field at cell centers
 
-# where particles are put: float32 positions in 10^3 cells round by less than the difference
+# Distance from walls [cells] at which particles are put. Float32 positions in 10^3 cells round by
+# less than its excess over MARGIN.
 AIM = 1.1 * MARGIN
-SLACK = 0.25  # cells by which the interpolated distance may exceed the way that is free
-# cells a particle goes near a wall before it looks again; shorter where it would come out on
-# another side
+SLACK = 0.25  # largest excess of the interpolated distance over the free distance [cells]
+# Stride [cells] of a particle near a wall before it evaluates the distance again; shorter where the
+# stride would end on another side of the wall.
 STRIDE = 0.5
-SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
-STRIDES = 64  # of a move: 32 cells along a wall
-# walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides
-# over
+SHORTEST = 0.02  # shortest stride [cells], where a wall is thinner than that
+STRIDES = 64  # most strides of a move: 32 cells along a wall
+# Cosine between the normals of two walls. Walls whose normals are further apart stop a particle
+# between them; along nearer ones it slides.
 CORNER = 0.5
-BEND = 0.9  # normals that are nearer than this are one wall
-LEG = 0.25  # cells of such a search in one direction
-# cells that a step may put a particle back: more than its stride and the diagonal of the walls'
-# rounding
+BEND = 0.9  # cosine between normals above which two walls count as one
+LEG = 0.25  # step [cells] of the search for a way out along one direction
+# Cells by which a step may put a particle back: more than its stride and the diagonal of the walls'
+# rounding.
 REACH = 1.0
-PUSH = 3.0  # cells that a wall may push a particle in a step
+PUSH = 3.0  # cells by which a wall may push a particle in a step
 
 _WALLS = {
     "MARGIN": MARGIN,
@@ -110,7 +111,10 @@ def carry_pass(axis: int) -> StencilKernel:
 def clearance_kernel(
     cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)
 ):
-    """Pass `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE; pass d marks those around cells of d - 1 with d.
+    """Mark cells at one distance from the nearest SOLID cell per launch.
+
+    The launch with `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE. The launch with
+    distance d marks the cells around those of d - 1 with d.
 
     In place without a race: a cell that another thread marks in this launch was more than d - 1 and
     becomes d, no source either way.
@@ -187,12 +191,12 @@ def advect(
     Args:
         grid: the grid.
         fields: velocity of each component on the faces [m/s].
-        room: of `clearance`. Every particle lies in a cell that is not SOLID.
+        room: result of `clearance`. Every particle lies in a cell that is not SOLID.
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that a closed face stopped.
-        endless: has bit n set if axis n has no end: velocities beyond its sides are those at the
-            other, as the ring's are. Particles may end up there.
+        endless: bit n is set if axis n is periodic: velocities beyond its sides are those at the
+            opposite side, as are the ring's. Particles may end up beyond a side.
     """
     launch(
         advect_pass(endless),
@@ -221,8 +225,8 @@ def advect_with_distance(
 
     No particle ends within MARGIN cells of a wall unless it started there.
 
-    Where no way back out of a wall is found within a cell, a particle stays where its last stride
-    was open. A move goes at most 1024 cells, and 32 along walls.
+    Where no place outside of a wall is found within a cell, a particle stays where its last open
+    stride ended. A move goes at most 1024 cells, and 32 along walls.
 
     Args:
         grid: the grid.
@@ -232,9 +236,9 @@ def advect_with_distance(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
             beyond.
-        endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
+        endless: bit n is set if axis n is periodic, see `advect`; its sides count as open.
     """
     launch(
         distance_pass(endless),
@@ -269,7 +273,7 @@ def push_out(
         moved: int32, shape (1,): raised by the number of particles that were put outside.
         left: int32, shape (1,): raised by the number of those for which no way out was found; they
             stay where they were.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
     """
     launch(
         PUSH_OUT,
@@ -301,7 +305,7 @@ def carry_field(
     Args:
         grid: the grid.
         window: cells to consider, in the domain and the ring's upper layer.
-        velocity: of each component on the faces [m/s].
+        velocity: velocity of each component on the faces [m/s].
         way: dt / dx [s/m].
         field: float32, of faces or cells; not `out`.
         out: float32 (written). Where the level is no more than `least`: the velocity as it was, 0

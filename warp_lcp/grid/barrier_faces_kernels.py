@@ -1,5 +1,9 @@
 # mypy: ignore-errors
-"""Kernels of faces and cells beside thin solids: what these cross and how much of a kernel is seen."""
+"""Kernels of faces and cells beside thin solids.
+
+They find the faces that thin solids cross, and the share of each cell's density kernel that its
+center sees.
+"""
 
 import warp as wp
 
@@ -44,7 +48,10 @@ def near_kernel(k, j, i, B: Barrier, near: U8):
 
 @cell_kernel(MODULE)
 def apart_kernel(k, j, i, B: Barrier, axis: int, apart: U8):
-    """Set bit d where a solid stands between a place of a field and the one before it along axis d."""
+    """Mark places of a field that a solid separates from their lower neighbors.
+
+    Bit d is set where a solid stands between a place and the one before it along axis d.
+    """
     bits = int(0)
     if B.near[k, j, i] != wp.uint8(0):
         x = place_of(B, axis, k, j, i)
@@ -70,10 +77,10 @@ def cross_kernel(
     below: F32,
     above: F32,
 ):
-    """Close the lower faces between cells whose centers a solid stands between; the domain's stay its own.
+    """Close the lower faces between cells whose centers a solid separates.
 
-    `below` and `above` are the distances to it from the centers of the cells below and above a
-    face, in cells.
+    Faces of the domain keep their state. `below` and `above` are the distances [cells] to the solid
+    from the centers of the cells below and above a face.
     """
     crossed = int(0)
     if (int(apart[k, j, i]) >> axis) & 1 != 0:
@@ -84,7 +91,7 @@ def cross_kernel(
             found, t = wall_between(B, x, y)
             crossed = found
             above[k, j, i] = wp.min(t, 1.0)
-            # which rounding may let miss an end that lies on the surface
+            # Rounding may make the path miss a solid on whose surface one of its ends lies.
             _found, t = wall_between(B, y, x)
             below[k, j, i] = wp.min(t, 1.0)
             if open[k, j, i] > 0.0:
@@ -95,7 +102,7 @@ def cross_kernel(
 
 @cell_kernel(MODULE)
 def solid_kernel(k, j, i, B: Barrier, ax: F32, ay: F32, az: F32, base: I8):
-    """A cell whose faces are all closed is SOLID."""
+    """Mark cells whose faces are all closed as SOLID."""
     if B.near[k, j, i] != wp.uint8(0) and base[k, j, i] == _AIR:
         open = ax[k, j, i] + ax[k, j, i + 1] + ay[k, j, i] + ay[k, j + 1, i]
         if B.planes == 2:
@@ -106,13 +113,13 @@ def solid_kernel(k, j, i, B: Barrier, ax: F32, ay: F32, az: F32, base: I8):
 
 @cell_kernel(MODULE)
 def calm_kernel(k, j, i, near: U8, base: I8, calm: I8):
-    """Copy the base of cells; SOLID where a thin solid is near."""
+    """Copy the base of cells; mark cells near a thin solid as SOLID."""
     calm[k, j, i] = wp.where(near[k, j, i] != wp.uint8(0), _SOLID, base[k, j, i])
 
 
 @wp.func
 def beside(B: Barrier, x: wp.vec3, y: wp.vec3, way: wp.vec3):
-    """Return whether a way from x to y beside the straight one is free, by `way` aside."""
+    """Return whether a path from x to y, shifted sideways by `way`, is free."""
     free = bool(False)
     if sees(B, x, x + way):
         if sees(B, x + way, y + way):
@@ -122,7 +129,10 @@ def beside(B: Barrier, x: wp.vec3, y: wp.vec3, way: wp.vec3):
 
 @cell_kernel(MODULE, ordered=True)
 def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INTS):
-    """Count the crossed faces of each solid that have a gap: a free way beside their centers, where the next face is closed as well."""
+    """Count the crossed faces of each solid that are beside a gap.
+
+    A face has a gap if the way beside its center is free although the next face is closed as well.
+    """
     if number[k, j, i] > wp.int16(0):
         y = place_of(B, CENTERS, k, j, i)
         c, b, a = cell_below(axis, k, j, i)
@@ -145,7 +155,10 @@ def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INT
 
 @cell_kernel(MODULE)
 def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
-    """Find the share of a cell's kernel that its center sees, by points of equal distance: `parts` a cell and axis."""
+    """Find the share of a cell's density kernel that its center sees.
+
+    The kernel is sampled at points of equal distance, `parts` per cell and axis.
+    """
     result = float(1.0)
     if B.near[k, j, i] != wp.uint8(0):
         x = place_of(B, CENTERS, k, j, i)
@@ -173,13 +186,13 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
 
 @cell_kernel(MODULE)
 def capacity_kernel(k, j, i, share: F32, capacity: F32):
-    """Reduce the open share of a cell's kernel to what its center sees of it."""
+    """Reduce the open share of a cell's kernel to what its center sees."""
     capacity[k, j, i] = capacity[k, j, i] * share[k, j, i]
 
 
 @cell_kernel(MOVING)
 def forget_kernel(k, j, i, number: I16, velocity: F32):
-    """Forget the velocity of solids on faces that they cross no more."""
+    """Clear the solids' velocity on faces that they no longer cross."""
     if number[k, j, i] > wp.int16(0):
         velocity[k, j, i] = 0.0
 
@@ -197,7 +210,7 @@ def wall_velocity_kernel(
 
 @cell_kernel(WHOLE, ordered=True)
 def whole_kernel(k, j, i, axis: int, number: I16, below: F32, above: F32, index: I32):
-    """Give the open cell nearer to a solid that crosses its face to that solid."""
+    """Assign the open cell nearer to a crossing solid to that solid."""
     if number[k, j, i] > wp.int16(0):
         c, b, a = cell_below(axis, k, j, i)
         if above[k, j, i] <= below[k, j, i]:

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Fields at cell centers on one side of thin solids: what is free to go where, and smoothing."""
+"""Fields at cell centers on one side of thin solids: free paths and smoothing."""
 
 import warp as wp
 
@@ -11,10 +11,10 @@ MODULE = "warp_lcp.grid.barrier_fields"
 
 @wp.func
 def free_path(apart: U8, k: int, j: int, i: int, dk: int, dj: int, di: int):
-    """Return whether no thin solid stands between a cell and one at most a cell away on each axis.
+    """Return whether no thin solid separates a cell from one of its neighbors.
 
-    Some way of steps along the axes must be free: the cells around are then on one side of what
-    is longer than a cell.
+    The neighbor is at most a cell away on each axis. Some path of steps along the axes must be
+    free: the two cells are then on the same side of every solid that is longer than a cell.
     """
     found = bool(False)
     for n in range(6):  # orders of the axes
@@ -41,14 +41,15 @@ def free_path(apart: U8, k: int, j: int, i: int, dk: int, dj: int, di: int):
 
 @wp.func
 def stand_in(apart: U8, k: int, j: int, i: int, way: wp.vec3i):
-    """Return the step to the cell that stands for the one a step `way` (z, y, x) from a cell.
+    """Return the step to the cell that replaces one at a step `way` (z, y, x).
 
-    That one itself if it is on the same side of thin solids; else what is left of the step without
-    one of its axes, or two, which mirrors what is beside the cell; else no step.
+    It is that cell if it is on the same side of thin solids. Otherwise the step is shortened by one
+    of its axes, or by two, which mirrors the values beside the cell. If none of these is free,
+    there is no step.
     """
     result = way
     free = free_path(apart, k, j, i, way[0], way[1], way[2])
-    for without in range(1, 7):  # of the axes, one a bit: 1, 2, 4, and then 3, 5, 6
+    for without in range(1, 7):  # axes to leave out, one a bit: 1, 2, 4, and then 3, 5, 6
         if not free:
             bits = int(without)
             if without == 3:
@@ -70,7 +71,7 @@ def stand_in(apart: U8, k: int, j: int, i: int, way: wp.vec3i):
 
 @wp.func
 def has_neighbors(field: U8, planes: int, k: int, j: int, i: int):
-    """Return whether all cells around a stored one are stored."""
+    """Return whether all cells around a cell are stored."""
     result = i > 0 and j > 0 and i + 1 < field.shape[2] and j + 1 < field.shape[1]
     if planes == 2 and (k == 0 or k + 1 == field.shape[0]):
         result = False
@@ -79,7 +80,10 @@ def has_neighbors(field: U8, planes: int, k: int, j: int, i: int):
 
 @cell_kernel(MODULE)
 def binomial_kernel(k, j, i, near: U8, apart: U8, planes: int, source: F32, out: F32):
-    """Make a binomial pass (1, 2, 1)/4 again near thin solids: others stand for cells beyond."""
+    """Repeat a binomial pass (1, 2, 1)/4 near thin solids.
+
+    Values from beyond the solids are left out.
+    """
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         total = float(0.0)
         for n in range(wp.where(planes == 2, 27, 9)):
@@ -111,7 +115,9 @@ def shift_kernel(
     known: I8,
     out: F32,
 ):
-    """Bring phi back to a cell's center again by what is on its side of thin solids.
+    """Shift phi back to a cell's center near thin solids.
+
+    Only values on the cell's own side are used.
 
     See `warp_lcp.grid.level_set_kernels.wall_shift_kernel`.
     """

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""What thin solids hold apart: lines of sight between places of the grid, and the nearest solid."""
+"""Lines of sight past thin solids, and the nearest solid of a point."""
 
 import warp as wp
 
@@ -7,10 +7,11 @@ from warp_lcp.grid.cell_kernel import U8
 from warp_lcp.grid.thin_walls_kernels import GROUPS, MISS, SHAPES, away, hit, into_group
 
 CENTERS = 3  # the `axis` of a field at cell centers
-# cells from a cell's center to a solid that may be between a particle in the cell and a face that
-# it touches, or a kernel's end
+# Cells from a cell's center to a solid that may stand between a particle in the cell and a face
+# that it touches, or an end of the cell's kernel.
 REACH = 2.8
-# cells: points within it of a surface lie on it, and in the solid; particles keep a larger distance
+# Cells. Points within this distance of a surface count as in the solid; particles keep a larger
+# distance.
 SURFACE = 1.0e-6
 
 _MISS = wp.constant(wp.float64(MISS))
@@ -19,7 +20,7 @@ TURNS, SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
 
 @wp.struct
 class Barrier:
-    """Thin solids and the grid that they stand in."""
+    """Thin solids and their grid, as kernels take them."""
 
     shapes: SHAPES
     groups: GROUPS
@@ -42,7 +43,10 @@ def place_of(B: Barrier, axis: int, k: int, j: int, i: int):
 
 @wp.func
 def wall_between(B: Barrier, x: wp.vec3, y: wp.vec3):
-    """Return the number of the first solid on the way from x to y, or that one of them lies in, 0: none; and where on the way it is."""
+    """Return the first solid on the path from x to y, and where on the path it is.
+
+    The number is 0 if no solid is on the path. A solid that contains an end of the path counts.
+    """
     t = _MISS
     found = int(0)
     for g in range(B.groups.shape[0]):
@@ -73,7 +77,10 @@ def sees(B: Barrier, x: wp.vec3, y: wp.vec3):
 
 @wp.func
 def nearest_wall(B: Barrier, x: wp.vec3, reach: float):
-    """Return the solid nearest to a point, 0 if none is within `reach` [m], the direction away from it and the distance [m]."""
+    """Return the nearest solid of a point within `reach` [m].
+
+    Returns its number (0 if there is none), the direction away from it and the distance [m].
+    """
     least = wp.float64(reach)
     found = int(0)
     normal = wp.vec3()

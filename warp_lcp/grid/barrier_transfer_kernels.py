@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of particles beside thin solids: density, velocities to and from faces, and paths."""
+"""Particle kernels near thin solids: density, velocity transfer, advection."""
 
 import warp as wp
 
@@ -7,10 +7,10 @@ from warp_lcp.grid.barrier_geometry import CENTERS, Barrier, place_of, sees
 from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, U8, cell_kernel, list_kernel, spline
 
 MODULE = "warp_lcp.grid.barriers.transfer"
-# the least weight of a face that a particle's own cell has, as in `warp_lcp.grid.transfer`
+# Least weight of a face of a particle's own cell, as in `warp_lcp.grid.transfer`.
 EDGE = 1.0e-5
 TINY_WEIGHT = 1.0e-9
-FREE = 2.5  # cells from solids that cut cells, beyond which a particle's way is not theirs
+FREE = 2.5  # cells from other solids beyond which these do not affect a particle's path
 
 VEC8 = wp.types.vector(length=8, dtype=wp.float32)
 
@@ -39,7 +39,10 @@ def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: PO
 
 @wp.func
 def tent(B: Barrier, axis: int, way: wp.vec3):
-    """Return the weight of a face at a distance [cells] from a particle; its cell's own faces have some."""
+    """Return the tent weight of a face at a distance `way` [cells] from a particle.
+
+    The weight of faces of the particle's own cell is positive.
+    """
     w = float(1.0)
     for d in range(B.planes + 1):
         part = 1.0 - wp.abs(way[d])
@@ -63,7 +66,7 @@ def gather_kernel(
     field: F32,
     weight: F32,
 ):
-    """Average the velocities of the particles around a face that it sees."""
+    """Average the velocities of the particles that a face sees around it."""
     if B.near[k, j, i] != wp.uint8(0):
         face = place_of(B, axis, k, j, i)
         momentum = float(0.0)
@@ -88,9 +91,10 @@ def gather_kernel(
 
 @wp.func
 def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
-    """Return what a point sees of the faces of a component around it, their gradient [1/m], and the weight of those that it sees.
+    """Interpolate a component from the faces that a point sees.
 
-    Those that it does not see have the mean of the others.
+    Returns the value, its gradient [1/m] and the weight of the visible faces. Faces that the point
+    does not see get the mean of the others.
     """
     g = x / B.dx + wp.vec3(
         1.0 - float(B.origin[0]), 1.0 - float(B.origin[1]), 1.0 - float(B.origin[2])
@@ -147,7 +151,10 @@ def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
 
 @wp.func
 def cell_at(B: Barrier, x: wp.vec3, shape: wp.vec3i):
-    """Return the stored cell (k, j, i) of a point [m]; the nearest one of the grid of a point outside."""
+    """Return the stored cell (k, j, i) of a point [m].
+
+    For a point outside the grid it is the nearest cell.
+    """
     i = wp.clamp(int(wp.floor(x[0] / B.dx)) + 1 - B.origin[0], 0, shape[2] - 1)
     j = wp.clamp(int(wp.floor(x[1] / B.dx)) + 1 - B.origin[1], 0, shape[1] - 1)
     k = int(1)
@@ -175,7 +182,12 @@ def interpolate_kernel(
     velocity: POINTS,
     gradient: POINTS,
 ):
-    """Give particles near thin solids what they see of the velocity of faces, see `warp_lcp.grid.transfer`."""
+    """Interpolate the velocity at particles from the faces that they see.
+
+    Only particles near thin solids are considered.
+
+    See `warp_lcp.grid.transfer`.
+    """
     x = position[i]
     c, b, a = cell_at(B, x, shape_of(B.near))
     if B.near[c, b, a] != wp.uint8(0):
@@ -193,7 +205,10 @@ def interpolate_kernel(
 
 @wp.func
 def velocity_at(B: Barrier, u: F32, v: F32, w: F32, x: wp.vec3):
-    """Return what a point sees of the velocity [m/s]; 0 along an axis of which it sees no face."""
+    """Interpolate the velocity [m/s] from the faces that a point sees.
+
+    The component along an axis is 0 if no face of that axis is visible.
+    """
     a, _a, _sa = seen(B, 0, x, u)
     b, _b, _sb = seen(B, 1, x, v)
     c = float(0.0)
@@ -218,10 +233,11 @@ def carry_kernel(
     start: POINTS,
     position: POINTS,
 ):
-    """Move particles that start near thin solids, and far from others, by the velocity that they see.
+    """Advect particles that start near thin solids by the velocity that they see.
 
-    It is that of half their way, if this is between `low` and `high`: the domain. They stop at
-    `least` and `most`, which are those or, where sides let them pass, infinite.
+    Particles far from these solids are left out. The velocity is that of the midpoint of their
+    path, if the midpoint is between `low` and `high`, the corners of the domain. Particles stop at
+    `least` and `most`: these corners or, where sides let particles pass, infinity.
     """
     x = start[i]
     c, b, a = cell_at(B, x, shape_of(B.near))

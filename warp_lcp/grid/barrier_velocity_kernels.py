@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of velocities beside thin solids: on the faces that these cross, and continued."""
+"""Velocity kernels beside thin solids: crossed faces and extrapolation."""
 
 import warp as wp
 
@@ -19,7 +19,7 @@ MODULE = "warp_lcp.grid.barriers.velocity"
 
 @wp.struct
 class Components:
-    """A field of faces a component; w is null in 2-D."""
+    """Face fields of the components; w is null in 2-D."""
 
     u: F32
     v: F32
@@ -28,7 +28,7 @@ class Components:
 
 @wp.struct
 class Marks:
-    """Marks of faces."""
+    """Marks of the faces of the components."""
 
     u: I8
     v: I8
@@ -37,7 +37,10 @@ class Marks:
 
 @wp.func
 def mean_around(B: Barrier, axis: int, other: int, k: int, j: int, i: int, field: F32, known: I8):
-    """Return the mean of the known faces of another component around a face that it sees, 0 if there are none."""
+    """Return the mean of another component over the known faces that a face sees.
+
+    The mean is 0 if there are none.
+    """
     x = place_of(B, axis, k, j, i)
     total = float(0.0)
     count = float(0.0)
@@ -72,9 +75,11 @@ def constrain_kernel(
     released: int,
     result: F32,
 ):
-    """Write what crossed faces become: without the velocity into the wall that they are beside, or any relative to it along its normal.
+    """Write the velocity of crossed faces, without the part through their wall.
 
-    They lie on one side of the wall, and only what is there sees them.
+    A face loses the relative velocity into its wall; where the wall holds the material it loses all
+    relative velocity along the normal. A crossed face lies on one side of the wall, and only places
+    on that side see it.
     """
     if number[k, j, i] > wp.int16(0):
         own = of_axis(axis, U.u, U.v, U.w, k, j, i)
@@ -109,7 +114,10 @@ def constrain_kernel(
 
 @cell_kernel(MODULE)
 def take_kernel(k, j, i, number: I16, result: F32, field: F32, known: I8):
-    """Take the results of `constrain_kernel`; the faces are of no more use to those that solids cut."""
+    """Copy the results of `constrain_kernel`, and mark those faces as unknown.
+
+    Faces that solids cut must not use them any more.
+    """
     if number[k, j, i] > wp.int16(0):
         field[k, j, i] = result[k, j, i]
         known[k, j, i] = wp.int8(0)

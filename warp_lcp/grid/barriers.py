@@ -1,13 +1,15 @@
-"""Barriers: solids thinner than cells, which hold apart what lies on their two sides.
+"""Barriers: solids thinner than cells, which separate material on their sides.
 
 A face between two cells is closed where a solid stands between the cells' centers, although neither
-lies in it, and has the velocity of the solid there. Nothing else is exchanged either: a particle
-takes part in the faces and cells that it sees, in a straight line, and a field is continued from
-places that are seen. So both sides have velocities, pressures, densities and a surface of their
-own, in the same fields: a place belongs to the side of the wall that it lies on. What a particle
-does not see of the faces around it has the mean of what it sees.
+center lies in it. The face has the velocity of the solid there.
 
-Far from these solids everything is as without them, and costs a byte a cell.
+All exchange takes place along lines of sight. A particle contributes to the faces and cells that it
+sees in a straight line, and a field is extrapolated from places that are seen. Faces that a
+particle does not see get the mean of those that it sees. Both sides so have velocities, pressures,
+densities and a surface of their own, in the same fields: a place belongs to the side of the wall
+that it lies on.
+
+Far from these solids nothing changes, and the cost is one byte a cell.
 """
 
 from collections.abc import Sequence
@@ -29,19 +31,20 @@ from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.kernels.launch_graph import copy
 from warp_lcp.operators.grid_poisson import FLUID
 
-# Cells. The level set and velocities are continued two layers into what is thicker and cuts cells;
-# in thinner solids they would reach the layers of the other side.
+# Cells. The level set and velocities are extrapolated two layers into thicker solids, which cut
+# cells; in thinner solids these layers would overlap those of the other side.
 BARRIER = 3.0
-PARTS = {2: 6, 3: 3}  # points of a cell an axis, for the share of its kernel that its center sees
-PARTS_MOVING = {2: 4, 3: 2}  # the same, at each step
-COST = 256  # of a particle, in cells of a usual pass
+# Sample points per cell and axis, for the share of its kernel that its center sees.
+PARTS = {2: 6, 3: 3}
+PARTS_MOVING = {2: 4, 3: 2}  # sample points per cell and axis if solids move, in each step
+COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
 
 @list_kernel("warp_lcp.grid.barriers.bring")
 @no_type_check
 def bring_kernel(i, start: POINTS, aim: POINTS, position: POINTS):
-    """Bring a particle to its aim, if it has one that is not its start."""
+    """Move a particle to its target, unless the target is its start."""
     a = aim[i]
     s = start[i]
     if a[0] != s[0] or a[1] != s[1] or a[2] != s[2]:
@@ -49,15 +52,15 @@ def bring_kernel(i, start: POINTS, aim: POINTS, position: POINTS):
 
 
 class Barriers:
-    """Faces that thin solids cross, and transfers that keep to one side of them.
+    """Faces that thin solids cross, and transfers that stay on one side of the solids.
 
     Args:
         grid: the grid.
         walls: the solids.
-        cut: cut cells of the others, which know the velocities of all.
+        cut: cut cells of the other solids; it has the velocities of all solids.
 
     Attributes:
-        near: uint8, 1 in cells that one of the solids is near.
+        near: uint8, 1 in cells near one of the solids.
         apart: uint8 for the faces of each component and, last, the cells: bit d is set where a
             solid stands between a place and the one before it along axis d.
         number: int16, one field a component: the solid that crosses a lower face, 0 if none does.
@@ -100,10 +103,11 @@ class Barriers:
             self._place()
 
     def _place(self) -> None:
-        """Find the places that the solids hold apart."""
+        """Find the cells, faces and neighbors that the solids separate."""
         grid, barrier = self.grid, self._barrier
         now = self._around()
-        before, self._window = self._window or now, now  # what is no longer near is marked so
+        # Cells that are no longer near are unmarked.
+        before, self._window = self._window or now, now
         low, high = [*map(min, now.low, before.low)], [*map(max, now.high, before.high)]
         self._all = Window.of(low, high, grid.device)
         self._all.launch(faces_kernels.near_kernel, [barrier, self.near])
@@ -116,7 +120,7 @@ class Barriers:
         self._all.launch(faces_kernels.share_kernel, [barrier, parts, self._share])
 
     def _around(self) -> Window:
-        """Return the cells near the solids, those of the ring among them."""
+        """Return the cells near the solids, cells of the ring included."""
         grid = self.grid
         low, high = self.walls.bounds()
         first = np.clip(
@@ -161,9 +165,9 @@ class Barriers:
             )
 
     def enter(self, index: wp.array) -> None:
-        """Enter the solids into whole cells.
+        """Mark whole cells as the solids' cells.
 
-        Of two cells whose face one crosses the nearer is its.
+        Of the two cells beside a crossed face the nearer one belongs to the solid.
 
         Args:
             index: int32: -1 in open cells, the wall's number elsewhere (updated).
@@ -174,21 +178,21 @@ class Barriers:
             self._all.launch(faces_kernels.whole_kernel, [axis, number, below, above, index])
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of the placed solids; on ranks, others know those beyond the box."""
+        """Return the fields of the placed solids, whose ghost cells other ranks fill."""
         return [self.near, *self.apart, *self.number, *self.below, *self.above, self.calm]
 
     @property
     def reach(self) -> Window:
-        """Cells near the solids, where these are and were."""
+        """Cells near the solids at their current and previous places."""
         return self._all
 
     @property
     def names(self) -> list[str]:
-        """Return what messages call the solids."""
+        """Return the names of the solids for messages."""
         return [self.cut.names[number] for number in self.walls.numbers]
 
     def notes(self) -> list[str]:
-        """Return a warning for each solid beside which a gap is too narrow; collective."""
+        """Return a warning for each solid that is beside a too narrow gap; collective."""
         cut, part = self.cut, self.grid.part
         inner = self._all.common(part.owned)
         gaps = wp.zeros(len(cut.names), dtype=wp.int32, device=self.grid.device)
@@ -214,7 +218,10 @@ class Barriers:
         field: wp.array,
         weight: wp.array,
     ) -> None:
-        """Average velocities again on faces near the solids; arguments as of `warp_lcp.grid.transfer.particles_to_faces`."""
+        """Average velocities again on faces near the solids.
+
+        Arguments as of `warp_lcp.grid.transfer.particles_to_faces`.
+        """
         window.launch(
             transfer_kernels.gather_kernel,
             [self._barrier, axis, offsets, position, velocity, gradient, field, weight],
@@ -231,7 +238,7 @@ class Barriers:
         velocity: wp.array,
         gradient: wp.array | None,
     ) -> None:
-        """Interpolate again at particles near the solids.
+        """Interpolate velocities again at particles near the solids.
 
         Args as of `warp_lcp.grid.transfer.faces_to_particles`, but:
             before: velocities before, for FLIP [m/s].
@@ -248,18 +255,18 @@ class Barriers:
     def density(
         self, window: Window, offsets: wp.array, position: wp.array, density: wp.array, each: float
     ) -> None:
-        """Add up particles again in cells near the solids, `each` of them."""
+        """Add up the particles again in cells near the solids; each adds `each`."""
         window.launch(
             transfer_kernels.density_kernel, [self._barrier, each, offsets, position, density]
         )
 
     def smooth(self, window: Window, source: wp.array, out: wp.array) -> None:
-        """Make a binomial pass again in cells near the solids, by what is on their side of these.
+        """Repeat a binomial pass near the solids, with values from the same side only.
 
         Args:
             window: cells of the pass.
             source: float32 field.
-            out: what the pass has made of it (updated).
+            out: result of the pass (updated).
         """
         given = [self.near, self.apart[-1], self.grid.planes, source, out]
         window.launch(binomial_kernel, given)
@@ -274,7 +281,7 @@ class Barriers:
         known: wp.array,
         out: wp.array,
     ) -> None:
-        """Bring a smooth distance back to the cells' centers again in cells near the solids.
+        """Shift a smooth distance back to the cells' centers again, near the solids.
 
         Args as of `warp_lcp.grid.level_set_kernels.wall_shift_kernel`, but:
             window: cells of the pass.
@@ -283,14 +290,16 @@ class Barriers:
         window.launch(shift_kernel, [*given, capacity, phi, known, out])
 
     def carry(self, velocity: Faces, dt: float, start: wp.array) -> None:
-        """Find where particles near the solids go by what they see of the velocity, before the solids move.
+        """Advect particles near the solids by the velocity that they see.
+
+        The solids have not moved yet. `bring` moves the particles later.
 
         Args:
-            velocity: of each component on the faces [m/s].
+            velocity: velocity of each component on the faces [m/s].
             dt: time step [s].
-            start: where they are [m], shape (n,).
+            start: places of the particles [m], shape (n,).
         """
-        if len(start) == 0:  # of a rank without material
+        if len(start) == 0:  # a rank without material
             return
         if len(self._aim) < len(start):
             self._aim = wp.empty(
@@ -306,11 +315,11 @@ class Barriers:
         )
 
     def bring(self, start: wp.array, position: wp.array) -> None:
-        """Bring particles to where `carry` has found.
+        """Move particles to the places that `carry` has found.
 
         Args:
-            start: as there.
-            position: where others come to [m], shape (n,) (updated).
+            start: places before the step, as passed to `carry`.
+            position: places of all particles after the step [m], shape (n,) (updated).
         """
         if len(position) == 0:
             return
@@ -330,11 +339,11 @@ class Barriers:
         contact: wp.array,
         released: int,
     ) -> None:
-        """Let crossed faces keep what of a velocity does not go through the wall that they are beside.
+        """Remove the velocity through the walls from crossed faces.
 
         Args:
             window: faces to consider.
-            velocity: of each component [m/s] (updated).
+            velocity: velocity of each component [m/s] (updated).
             known: int8, positive where it is known (updated: 0 on crossed faces).
             kind: int8 of AIR, FLUID, SOLID.
             contact: uint8, `released` where material leaves its wall.

@@ -1,4 +1,4 @@
-"""Boxes of cells of a grid, of which processes have one each."""
+"""Boxes of cells of a grid; each process has one."""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Kernels that are written for a cell, or for a piece of a row: how threads share the cells of a `CellRange` stands here alone."""
+"""Kernel factories: make kernels of functions of one cell or row piece.
+
+Only this module defines how threads share the cells of a `CellRange`.
+"""
 
 import ast
 import inspect
@@ -47,7 +50,7 @@ for i in range(tasks[0] + own, wp.max(tasks[1], tasks[0] + own + 1)):
 
 @wp.func
 def cell_below(axis: int, k: int, j: int, i: int):
-    """Return the cell on the other side of a cell's lower face; at the array's edge the cell itself."""
+    """Return the cell below a cell's lower face; at the array's edge the cell itself."""
     return (
         wp.max(k - wp.where(axis == 2, 1, 0), 0),
         wp.max(j - wp.where(axis == 1, 1, 0), 0),
@@ -67,7 +70,7 @@ def next_to(axis: int, step: int, k: int, j: int, i: int):
 
 @wp.func
 def of_axis(axis: int, x: Any, y: Any, z: Any, k: int, j: int, i: int):
-    """Return the value at a face of the component along an axis; z is null in 2-D."""
+    """Return the value on a face of the component along an axis; z is null in 2-D."""
     value = x[k, j, i]
     if axis == 1:
         value = y[k, j, i]
@@ -86,7 +89,10 @@ def spline(d: float):
 
 @wp.func
 def interpolated(field: F32, planes: int, x: float, y: float, z: float):
-    """Return what lies between a field's elements, at coordinates that are brought within the array; in 2-D those of the plane k = 1."""
+    """Interpolate a field linearly at grid coordinates.
+
+    Coordinates are clamped to the array; 2-D uses the plane k = 1.
+    """
     cx = wp.clamp(x, 0.0, float(field.shape[2]) - 1.001)
     cy = wp.clamp(y, 0.0, float(field.shape[1]) - 1.001)
     i = int(cx)
@@ -118,12 +124,13 @@ def interpolated(field: F32, planes: int, x: float, y: float, z: float):
 
 
 def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], wp.Kernel]:
-    """Return a decorator that makes a kernel(cells, ...) for `Window.launch`, in a Warp module, of what is done to a cell or a piece.
+    """Return a decorator that makes a kernel(cells, ...) of a function of one cell.
 
-    The function's parameters without a type are the kernel's own: the cell `k, j, i`, or the piece
-    `k, j, first, end` of a row, the cells first <= i < end, and how many planes, rows and pieces
-    are before it, `plane, row, chunk`. A function cannot return early. Where cells write what
-    others read or write, `ordered`, one CPU thread takes them in order.
+    The kernel is launched by `Window.launch`; `module` is its Warp module. Parameters of the
+    function without a type are set by the kernel: the cell `k, j, i`, or the piece `k, j, first,
+    end` of a row, the cells first <= i < end; and `plane, row, chunk`, the number of planes, rows
+    and pieces before it. The function cannot return early. With `ordered` one CPU thread visits the
+    cells in order, for cells that write what others read or write.
     """
 
     def made(function: Callable) -> wp.Kernel:
@@ -135,10 +142,11 @@ def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], w
 
 
 def list_kernel(module: str) -> Callable:
-    """Return a decorator that makes a kernel(tasks, ...) for `launch_list`, in a Warp module, of what is done to an element `i` of lists.
+    """Return a decorator for kernels(tasks, ...) of functions of a list entry.
 
-    The function's parameter without a type is `i`. It cannot return early, and writes nothing that
-    others read or write.
+    The kernel is launched by `launch_list`; `module` is its Warp module. The function's parameter
+    without a type is the entry `i`. It cannot return early, and writes nothing that other entries
+    read or write.
     """
     return lambda function: _made(function, module, ("tasks", wp.vec2i), ELEMENTS, "")
 
@@ -153,15 +161,17 @@ def launch_list(
     launch: Launch | None = None,
     ordered: bool = False,
 ) -> None:
-    """Launch a kernel of `list_kernel`, or record it: then for as many as the list of one of its arrays has when it runs.
+    """Launch a kernel of `list_kernel`, or record the launch.
+
+    A recorded launch visits as many entries as the list of one of its arrays has when it runs.
 
     Args:
-        kernel: what is launched.
-        count: elements.
+        kernel: the kernel.
+        count: number of entries.
         inputs: its arguments but for the first.
-        device: where.
-        cost: of an element, in cells of a usual pass.
-        launch: of a program.
+        device: device of the arrays.
+        cost: work of an entry, in cells of a usual pass.
+        launch: the launch function of a launch graph.
         ordered: whether several entries may write the same element.
     """
     listed = (
@@ -184,7 +194,7 @@ def launch_list(
 
 @forward_kernel(module="warp_lcp.grid.scan")
 def scan_kernel(values: INTS, sums: INTS, inclusive: int):
-    """Write the sum of the values before each, or up to and with it."""
+    """Write the prefix sums of values, exclusive or inclusive."""
     total = int(0)
     for n in range(values.shape[0]):
         value = values[n]
@@ -193,7 +203,7 @@ def scan_kernel(values: INTS, sums: INTS, inclusive: int):
 
 
 def scan(values: wp.array, sums: wp.array, *, inclusive: bool) -> None:
-    """Launch prefix sums of int32 numbers, or record them; both arrays may be the same."""
+    """Launch or record prefix sums of int32 numbers; both arrays may be the same."""
     if values.device.is_cuda:
         call(partial(wp.utils.array_scan, values, sums, inclusive=inclusive))
     else:
@@ -209,7 +219,10 @@ def _kernel(function: Callable, module: str) -> wp.Kernel:
 def _made(
     function: Callable, module: str, first: tuple[str, Any], loop: str, before: str
 ) -> wp.Kernel:
-    """Put the function's body, behind what opens a task, into the loop over tasks. Warp is given the text that results, which it hashes."""
+    """Make a kernel: insert the function's body into the loop over tasks.
+
+    Warp gets the resulting source text, and hashes it.
+    """
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     made = tree.body[0]
     typed = [

@@ -1,8 +1,8 @@
 """Cut cells: open fractions of faces and the velocity of solids.
 
-All of it comes from the solids' signed distances at the nodes of the grid (the cells' corners),
-linear in between: exact for planes, of second order for smooth walls; at a solid's edges, and where
-it or a gap is thinner than two cells, off by a part of a cell.
+They are computed from the solids' signed distances at the nodes of the grid (the cells' corners),
+linear in between. This is exact for planes and of second order for smooth walls. At a solid's
+edges, and where it or a gap is thinner than two cells, the error is a part of a cell.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.operators.grid_poisson import SOLID
 
-CLOSE = 1.0  # cells from a solid within which the sides of a periodic axis must be alike
+CLOSE = 1.0  # cells from a solid within which the two sides of a periodic axis must agree
 NOWHERE: NodeBox = (0, 0, 0), (0, 0, 0)  # a box without nodes
 
-DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
+DEEP = 1e-2  # cells from a solid's surface within which a node lies on it
 
 
 class CutCells:
@@ -53,11 +53,11 @@ class CutCells:
         solids: in the order of their numbers, 1 + s; the domain is number 0.
         wall_separating: whether liquid may leave the domain's wall.
         capacity: whether to keep the capacity.
-        remarks: make notes of faces and refuse a grid without open cells; False: the grid is a part
-            of a larger one.
-        left_out: numbers of solids that cut no cells; their velocities are kept.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid
-            closes them, and the ring is air.
+        remarks: write notes about faces, and refuse a grid without open cells; False for a part of
+            a larger grid.
+        left_out: numbers of solids that cut no cells; their velocities are still computed.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no
+            solid closes them, and the ring is air.
 
     Attributes:
         distance: float32 signed distance to the nearest solid at nodes [cells], positive in the
@@ -70,17 +70,16 @@ class CutCells:
         wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open
             faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
-        capacity: float32 integral of the cell's quadratic B-spline kernel over what is open, 1 away
-            from walls; None if not asked for.
-        velocity: float32 mean velocity of what is not open of each face [m/s], the component along
-            the face's normal: that of the solid that moves, times its part; None when no solid
-            moves.
+        capacity: float32 integral of the cell's quadratic B-spline kernel over the open space, 1
+            away from walls; None if not requested.
+        velocity: float32 mean velocity of the closed part of each face [m/s], the component along
+            the face's normal: that of the moving solid, times its part; None when no solid moves.
         turn: mat33 of shape (1 + solids,): the velocity of a solid's point x is turn x + shift
             [1/s].
         shift: vec3 [m/s].
         separating: uint8 of shape (1 + solids,).
-        names: of those numbers, the first "domain".
-        notes: warnings worth a line at the start of a run.
+        names: names of the solids by number, the first "domain".
+        notes: warnings for the start of a run.
         whole_cells: whether every face is open or closed, no solid reaches into a cell with an open
             face and nothing moves.
         moves: whether a solid moves.
@@ -109,7 +108,7 @@ class CutCells:
             frozenset(left_out),
         )
         self.moves = any(solid.motion is not None for solid in solids)
-        # between the sides of each periodic axis that is cut [cells]
+        # Differences of distances between the sides of each periodic axis that is cut [cells].
         self._differences: dict[int, float] = {}
         self.names = ("domain", *(solid.name for solid in solids))
         self.separating = wp.array(
@@ -150,9 +149,10 @@ class CutCells:
             self._marks,
         )
         wp.copy(self.base, self._marks)
-        # nodes near the solids that move, where the velocity was filled last
+        # Nodes near the moving solids at the last update of the velocity.
         self._moved_from: NodeBox | None = None
-        self._moved_to: NodeBox | None = None  # and where they are
+        # Nodes near the moving solids at their current places.
+        self._moved_to: NodeBox | None = None
         moving = [
             (number, solid)
             for number, solid in enumerate(solids, start=1)
@@ -174,7 +174,7 @@ class CutCells:
             self._standing.copy_from(self._nodes)
             self._flat = self._flat_cells(standing)
             self._near, self._swept = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
-            # a mesh is measured in parts, and the host decides about each
+            # A mesh is measured in parts, and the host decides about each part.
             measured = any(isinstance(run, int) for run in self._runs)
             self._entering = LaunchGraph(grid.device, self._launch_entering, at_once=measured)
             self._refreshing = LaunchGraph(grid.device, self._launch_refreshing)
@@ -196,7 +196,7 @@ class CutCells:
             del self._sampler, self._nodes, self._marks
 
     def _cutting(self) -> Iterator[tuple[int, PlacedSolid]]:
-        """Yield the solids that cut cells, and their numbers."""
+        """Yield the solids that cut cells, with their numbers."""
         return (
             (number, solid)
             for number, solid in enumerate(self.solids, start=1)
@@ -232,7 +232,7 @@ class CutCells:
         self._refreshing.run()
 
     def accompany(self, before: Callable[[], None], after: Callable[[], None]) -> None:
-        """Have `place` launch more, before distances change and after all else."""
+        """Register launches of `place`: before distances change, and at the end."""
         self._before, self._after = before, after
         self._entering.forget()
         self._refreshing.forget()
@@ -240,12 +240,12 @@ class CutCells:
     def set_velocity(self, time: float, dt: float) -> None:
         """Set the velocity: displacement of the solids' points over a time, divided by it.
 
-        So the volume that a wall sweeps is its displacement's, whatever the motion is like within
-        the step. Bodies that the material moves have the velocities of their state: those are what
-        it changes, and no rotation of such a field changes a volume.
+        The volume that a wall sweeps so equals that of its displacement, whatever the motion within
+        the step. Bodies that the material moves have the velocities of their state: these are what
+        the material changes, and a rotation of such a field changes no volume.
 
         Args:
-            time: at which the solids were placed [s].
+            time: time at which the solids were placed [s].
             dt: how long from there on [s]; negative: the step that ended at `time`.
 
         Raises:
@@ -274,7 +274,7 @@ class CutCells:
         """Launch the pass that sets the velocity of the solids on faces."""
         assert self.velocity is not None, "a solid moves"
         grid = self.grid
-        # in 2-D no third one
+        # 2-D has no third component.
         fields = [
             field
             for each in (self.open, self.wall, self.velocity)
@@ -305,7 +305,10 @@ class CutCells:
         return (first, last) if all(map(le, first, last)) else None
 
     def _enter_moving(self, time: float) -> None:
-        """Enter the solids that move into the distances, and mark again the cells that only their centers tell about."""
+        """Enter the distances of the moving solids, and repeat the test of flat cells.
+
+        Flat cells have distance 0 at all corners; only their centers show whether they are open.
+        """
         rotations, translations = self.motions.poses([time])
         self._poses = rotations[0], translations[0]
         self._placed_at: dict[int, Geometry] = {}
@@ -331,7 +334,10 @@ class CutCells:
         self._after()
 
     def _launch_entering(self) -> None:
-        """Enter the moving solids into the distances of the standing ones; list the cells that only their centers tell about."""
+        """Launch the entry of the moving solids' distances, and list the flat cells.
+
+        Flat cells have distance 0 at all corners; only their centers show whether they are open.
+        """
         self._before()
         self._nodes.copy_from(self._standing)
         copy(self.base, self._marks)
@@ -342,7 +348,10 @@ class CutCells:
             self._flat.mark(self._nodes, self._near, self.base)
 
     def _flat_cells(self, standing: Sequence[tuple[int, Geometry]]) -> FlatCells | None:
-        """Return what marks gaps of one cell without the host; None on the CPU, and where a solid is none of tables or meshes."""
+        """Return the marker of gaps of one cell that works without the host.
+
+        Returns None on the CPU, and if a solid is neither of shapes that tables hold nor a mesh.
+        """
         moving = [run for run in self._runs if not isinstance(run, int)]
         grid = self.grid
         suits = grid.device.is_cuda and not grid.part.shared and len(moving) == len(self._runs)
@@ -350,7 +359,10 @@ class CutCells:
         return None if still is None else FlatCells(self.grid, [*still, *moving])
 
     def _placed(self, place: int) -> Geometry:
-        """Return a solid that moves where it is, by its place among those; the same object until it moves again."""
+        """Return a moving solid at its current place, by its index among the moving ones.
+
+        The object stays the same until the solid moves again.
+        """
         if place not in self._placed_at:
             rotations, translations = self._poses
             pose = Pose(rotations[place], translations[place])
@@ -358,7 +370,7 @@ class CutCells:
         return self._placed_at[place]
 
     def _all_placed(self) -> list[Geometry]:
-        """Return all solids where they are."""
+        """Return all solids at their current places."""
         standing = [solid.geometry for _, solid in self._cutting() if solid.motion is None]
         return [
             *standing,
@@ -370,9 +382,9 @@ class CutCells:
         ]
 
     def _enter(self) -> None:
-        """Enter the distances of the solids that move where they are.
+        """Enter the distances of the moving solids at their current places.
 
-        A mesh takes microseconds a node, so that several processes share its nodes; then it is
+        A mesh takes microseconds a node, so several processes share its nodes; then this is
         collective.
         """
         placed = {run: self._placed(run) for run in self._runs if isinstance(run, int)}
@@ -387,7 +399,7 @@ class CutCells:
                 self._sampler.enter(self._nodes, self._moving[run], placed[run])
 
     def _join(self) -> None:
-        """Take distances, and the marks in `base`, beyond the sides of periodic axes that are cut from the ranks there."""
+        """Fill distances and marks beyond cut periodic sides from the ranks there."""
         part, near = self.grid.part, self._nodes.near
         if not part.joined:
             return
@@ -395,7 +407,7 @@ class CutCells:
         part.fill(*self._nodes.arrays, self.base)
         apart = np.abs(measured - np.clip(near.numpy(), -CLOSE, CLOSE))
         for axis in part.joined:
-            # the domain's upper side, where the part reaches it
+            # The domain's upper side, if the part reaches it.
             end = self.grid.domain_counts[axis] + 1 - self.grid.origin[axis]
             self._differences[axis] = float(
                 np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0)
@@ -414,14 +426,14 @@ class CutCells:
         return float(self.grid.part.ranks.max(mine))
 
     def _refresh(self) -> None:
-        """Fill everything that follows from the distances."""
+        """Recompute all fields that follow from the distances."""
         grid, nodes = self.grid, self._nodes
         planes = grid.planes
         ax, ay, az = [*self.open, *self.open[1:2]][:3]  # in 2-D nothing is done to the third
         wx, wy, wz = [*self.wall, *self.wall[1:2]][:3]
         d, o, d2, o2 = nodes.arrays
         clear(self._counts)
-        # the marks are in `base`, until the next kernel fills it
+        # The marks are in `base` until the next kernel fills it.
         grid.domain.run(
             kernels.FRACTIONS,
             planes=planes,
@@ -475,7 +487,11 @@ class CutCells:
         grid.window(low, high).launch(kernels.side_kernel, inputs)
 
     def _reaches_into_open_cells(self) -> bool:
-        """Return whether a corner of a cell with an open face lies in a solid: diagonals through corners leave faces open or closed too."""
+        """Return whether a corner of a cell with an open face lies in a solid.
+
+        Diagonals through corners leave faces open or closed, too, so the open fractions do not show
+        it.
+        """
         corners = self.distance.numpy()
         for axis in range(self.grid.dimension):
             corners = np.minimum(corners, np.roll(corners, -1, axis=2 - axis))
@@ -486,7 +502,7 @@ class CutCells:
         )
 
     def _result_notes(self, dropped: int) -> list[str]:
-        """Return what is to be said about the faces."""
+        """Return notes about the faces."""
         grid = self.grid
         check_open(not self.solids or bool((grid.interior(self.base.numpy()) != SOLID).any()))
         counts = [
@@ -506,7 +522,7 @@ class CutCells:
 
 
 def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
-    """Return SOLID in the ring but beyond open sides, else 0, in the stored shape."""
+    """Return SOLID in the ring except beyond open sides, else 0, in the stored shape."""
     host = np.full(grid.shape, SOLID, dtype=np.int8)
     host[1:-1, 1:-1, 1:-1] = 0
     host[open_ring(grid.shape, open_sides)] = 0
@@ -514,7 +530,7 @@ def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
 
 
 def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
-    """Return the box around boxes of nodes; None: there are none."""
+    """Return the box around boxes of nodes; None if there are none."""
     lows, highs = zip(*boxes, strict=True) if boxes else ((), ())
     return (
         (tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True))))
@@ -526,7 +542,10 @@ def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
 def _runs(
     grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], left_out: Collection[int]
 ) -> Iterator[ShapeTable | PlacedMesh | int]:
-    """Cut solids, in order, into tables of those next to each other that tables hold, on a GPU meshes, and the places of others."""
+    """Split solids, in order, into tables of neighboring entries that tables hold.
+
+    On a GPU meshes are yielded as `PlacedMesh`, and other solids by their index.
+    """
     cutting = [place for place, (number, _) in enumerate(solids) if number not in left_out]
     for held, of in groupby(cutting, key=lambda place: ShapeTable.holds(solids[place][1])):
         if held:

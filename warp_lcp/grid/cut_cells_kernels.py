@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""What solids leave open of faces and cells, and how fast they move, from their distances at the nodes (`node_distance`)."""
+"""Open fractions of faces and cells, and solid velocities, from node distances.
+
+See `warp_lcp.grid.node_distance`.
+"""
 
 import itertools
 from pathlib import Path
@@ -15,8 +18,8 @@ from warp_lcp.kernels.launch_graph import launch
 from warp_lcp.kernels.native import text
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
-# open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the
-# condition number
+# Open fractions below this become 0. Raised to it, they would lift a flow along the wall; kept,
+# they would spoil the condition number.
 DROP = 1.0e-3
 CLOSED, OPEN, CUT = 0, 1, 2  # states of cells
 
@@ -44,7 +47,7 @@ def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 @wp.func
 def corner(axis: int, planes: int, n: int):
-    """Return how far (k, j, i) the n-th of the four corners of a lower face is from the first."""
+    """Return the offset (k, j, i) of the n-th corner of a lower face from its first."""
     a = n & 1
     b = n >> 1
     dk = b * wp.where(axis == 2, 0, planes - 1)
@@ -54,7 +57,7 @@ def corner(axis: int, planes: int, n: int):
 
 @wp.func
 def open_face(near: F32, axis: int, planes: int, k: int, j: int, i: int):
-    """Return which share of a lower face is open, from a distance at nodes."""
+    """Return the open fraction of a lower face, from the distance at its nodes."""
     c, b, a = corner(axis, planes, 1)
     z, y, x = corner(axis, planes, 2)
     return open_area(
@@ -78,7 +81,10 @@ def side_kernel(
     wall: I16,
     counts: wp.array(dtype=wp.int32),
 ):
-    """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
+    """Fill the open fractions and wall numbers of faces on an open side of the domain.
+
+    Count the dropped and the partial faces.
+    """
     free = open_face(near, axis, planes, k, j, i)
     if free > 0.0 and free < DROP:
         free = float(0.0)
@@ -102,7 +108,7 @@ _TURNS, _SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
 
 @wp.struct
 class Moving:
-    """What tells which solids that move cover a face."""
+    """Node distances and marks of moving solids, to find the one on a face."""
 
     nodes: Nearest
     standing: F32  # distance to the nearest solid that stands still, at nodes [cells]
@@ -111,7 +117,10 @@ class Moving:
 
 @wp.func
 def least_moving(S: Moving, k: int, j: int, i: int):
-    """Return the moving solid among a node's two nearest, 0 if neither moves, and its distance [cells]."""
+    """Return the moving solid among a node's two nearest, and its distance [cells].
+
+    The number is 0 if neither moves.
+    """
     solid = int(S.nodes.owner[k, j, i])
     d = S.nodes.near[k, j, i]
     if S.moves[solid] == wp.uint8(0):
@@ -124,11 +133,11 @@ def least_moving(S: Moving, k: int, j: int, i: int):
 
 @wp.func
 def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open: F32, wall: I16):
-    """Return the moving solid that covers a face, 0 if none does, and its part of what is not open.
+    """Return the moving solid that covers a face, and its part of the closed fraction.
 
-    What the solids that stand still cover rests, and so does a face of the domain but for the part
-    that a moving solid covers: of a piston that slides over a floor, the part above the floor
-    displaces liquid.
+    The number is 0 if no moving solid covers it. The part that standing solids cover is at rest. So
+    is a face of the domain but for the part that a moving solid covers: of a piston that slides
+    over a floor, the part above the floor displaces liquid.
     """
     free = open[k, j, i]
     solid = int(0)
@@ -170,7 +179,10 @@ def face_velocity(
     turn: _TURNS,
     shift: _SHIFTS,
 ):
-    """Return the mean velocity of what is not open of a face [m/s], at its center turn x + shift of a solid that moves."""
+    """Return the mean velocity [m/s] over the closed fraction of a face.
+
+    A moving solid has the velocity turn x + shift at the face's center x.
+    """
     value = float(0.0)
     solid, part = moving_part(S, axis, planes, k, j, i, open, wall)
     if solid > 0:
@@ -219,7 +231,7 @@ def velocity_kernel(
 
 
 options = {"module": "warp_lcp.grid.capacity"}
-COLORS = 3  # along an axis: as many cells as a kernel reaches over
+COLORS = 3  # colors along an axis: the width of a kernel in cells
 
 OPEN_CELLS = KERNELS["warp_lcp.grid.capacity.open_cells"]
 
@@ -230,10 +242,10 @@ def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
 
 @forward_kernel(**options)
 def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
-    """Integrate over every third cut cell along each axis, from cell (color[2], color[1], color[0]) of the box on.
+    """Integrate the kernels of every third cut cell along each axis.
 
-    Cells add to their neighbors: those of one color have none in common, so nothing races and sums
-    keep their order.
+    The first cell is (color[2], color[1], color[0]) of the box. Cells add to their neighbors. Cells
+    of one color have no neighbors in common, so there are no races and sums keep their order.
     """
     plane, row, chunk = wp.tid()
     k = cells.k + color[2] + COLORS * plane
@@ -254,7 +266,7 @@ def cut_in_order_kernel(
     state: I8,
     capacity: F32,
 ):
-    """Integrate over the cut cells of a box, color after color; one thread."""
+    """Integrate over the cut cells of a box, color after color, on one thread."""
     colors = COLORS * COLORS
     if planes == 2:
         colors = colors * COLORS
@@ -277,7 +289,7 @@ def integrate_kernel(
     capacity: wp.array,
     origin: tuple[int, int, int] = (0, 0, 0),
 ) -> None:
-    """Integrate each cell's kernel over what is open.
+    """Integrate each cell's kernel over the open space.
 
     Args:
         window: all cells of the grid without the ring.
@@ -285,7 +297,8 @@ def integrate_kernel(
         near: float32, signed distance of the solids at the nodes [cells].
         state: int8, CLOSED, OPEN or CUT.
         capacity: float32 (written, the ring included).
-        origin: of a part of a grid, in which sums then keep the order that they have in all of it.
+        origin: cells of the whole grid before this part; sums then have the order of the whole
+            grid.
     """
     everywhere = Window(
         (1, 0, 0) if planes == 1 else (0, 0, 0),
@@ -310,8 +323,8 @@ def integrate_kernel(
         range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)
     ):
         z, y, x = ((c - before) % COLORS for c, before in zip(color, reversed(origin), strict=True))
-        # rows and planes of this color; chunks of a row are counted in cells of this color too, the
-        # last may be empty
+        # Rows and planes of this color. Chunks of a row are counted in cells of this color, too;
+        # the last may be empty.
         rows = [
             -(-max(high - low - color, 0) // COLORS)
             for low, high, color in zip(window.low, window.high, (z, y, x), strict=True)

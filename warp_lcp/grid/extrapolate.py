@@ -11,10 +11,10 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.kernels import KernelFile
 
-BLOCKED = -1  # not to be filled
-UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
-# layers around faces with weight: as far as the density of a cell tells of particles beyond its
-# neighbors
+BLOCKED = -1  # mark of faces that are not filled
+UNKNOWN = 0  # mark of faces to fill; positive: layer in which a face became known, 1 at the start
+# Layers around faces with weight: the range in which particles beyond its neighbors affect the
+# density of a cell.
 REACH = 2
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
@@ -24,14 +24,18 @@ LAYER = KERNELS["warp_lcp.grid.extrapolate.fill_layer"]
 @cell_kernel("warp_lcp.grid.extrapolate")
 @typing.no_type_check
 def weighted_kernel(k, j, i, least: float, weight: F32, known: I8):
-    """Mark the faces that particles gave more weight than `least`."""
+    """Mark the faces whose particle weight exceeds `least`."""
     known[k, j, i] = wp.where(weight[k, j, i] > least, wp.int8(1), wp.int8(0))
 
 
 @cell_kernel("warp_lcp.grid.barriers.fill")
 @typing.no_type_check
 def fill_side_kernel(k, j, i, layer: int, fill: int, apart: U8, known: I8, field: F32):
-    """Fill faces marked `fill` from neighbors known up to `layer` that no solid stands between, and mark them layer + 1."""
+    """Fill one layer of faces by the mean of their known neighbors.
+
+    Faces marked `fill` are filled from neighbors known up to `layer` that no thin solid separates
+    from them, and are marked layer + 1.
+    """
     if int(known[k, j, i]) == fill:
         total = float(0.0)
         count = float(0.0)
@@ -68,15 +72,15 @@ def complete(
 ) -> None:
     """Extrapolate the particles' velocity to nearby faces without weight.
 
-    Cells beyond those may be full or dense.
+    Cells beyond these faces may be full or dense.
 
     Args:
         window: faces to consider.
-        velocity: of each component [m/s] (updated).
-        weights: of the particles on each component's faces.
+        velocity: velocity of each component [m/s] (updated).
+        weights: weights of the particles on each component's faces.
         known: scratch memory, int8, one field a component.
-        join: as of `extrapolate`.
-        barriers: solids thinner than cells; None: there are none.
+        join: see `extrapolate`.
+        barriers: solids thinner than cells; None if there are none.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
         window.clear(marks)
@@ -118,8 +122,8 @@ def extrapolate(
         fill: the mark of the faces to fill, `UNKNOWN` or `BLOCKED`.
         join: called with known and field after each layer, where faces at two sides of the domain
             are the same.
-        apart: uint8, which neighbors thin solids hold apart, see `warp_lcp.grid.barriers`; None:
-            none.
+        apart: uint8, the neighbors that thin solids separate, see `warp_lcp.grid.barriers`; None if
+            there are none.
 
     Raises:
         ValueError: the marks would not fit in int8.

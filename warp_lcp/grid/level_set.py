@@ -15,26 +15,26 @@ from warp_lcp.grid.staggered import COPY, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.window_reduction import WindowTally
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 
-REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
-QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL
+REACH = 1.5  # half the width of a cell's kernel [cells]
+QUANTILE = 3.7191  # quantile of the normal distribution at 1 - level_set_kernels.TAIL
 Fill = Callable[[Window, wp.array], None]
-PARTS = {2: 4, 3: 2}  # points an axis that a cell on the surface is sampled at
+PARTS = {2: 4, 3: 2}  # sample points per axis of a cell on the surface
 
 
 class LevelSet:
     """Level set: signed distance of cell centers to the liquid's surface.
 
     The density is the sum of the particles' quadratic B-splines at the cell's center, in units of
-    the density at rest. Divided by the capacity, what the cell's kernel can hold beside solids, it
-    is the filled share of the kernel, and phi is the distance at which a half space fills that
-    share: unbiased for a plane along an axis, at a wall that the plane is perpendicular to as well,
-    without a radius to tune. A plane across the axes is off by up to 0.01 cells. A film on a wall
+    the density at rest. Divided by the capacity, the open share of the cell's kernel beside solids,
+    it is the filled share of the kernel, and phi is the distance at which a half space fills that
+    share. For a plane along an axis this is unbiased, without a radius to tune, also at a wall
+    perpendicular to the plane. A plane across the axes is off by up to 0.01 cells. A film on a wall
     within the kernel's reach looks too thin: phi is 0 with the liquid still 0.11 cells above the
     center of a cell that the wall bounds, 0.36 above a center that lies on the wall.
 
     Binomial passes (1, 2, 1)/4 over density and capacity make the kernel wider and closer to the
-    normal distribution of variance 1/4 + passes/2, whose quantile phi then is. They quiet a surface
-    at rest and erase thin fronts.
+    normal distribution of variance 1/4 + passes/2; phi is then its quantile. They remove noise from
+    a surface at rest, and erase thin fronts.
 
     Args:
         grid: the grid.
@@ -45,8 +45,8 @@ class LevelSet:
         phi: [cells], float32, < 0 in the liquid, within +-`limit`; SOLID cells within two of an
             open one have the mean of their neighbors, others and all cells outside the window are
             air.
-        density: in units of the density at rest, float32, in open cells and in SOLID ones next to
-            them.
+        density: density in units of the density at rest, float32, in open cells and in SOLID ones
+            next to them.
         limit: the largest |phi| [cells].
 
     Raises:
@@ -91,9 +91,10 @@ class LevelSet:
             particles: the liquid. If it is indexed it must not have moved since it was sorted: each
                 cell then gathers from the particles around it, the same bits on every run of a GPU.
                 Otherwise they scatter.
-            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side:
-                what a pass reads from beyond the window then stays out of reach of the density.
-            capacity: share of each cell's kernel that is open, float32; None: 1 everywhere.
+            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side.
+                Values that a pass reads from beyond the window are then out of reach of the
+                density.
+            capacity: open share of each cell's kernel, float32; None for 1.
             base: int8, SOLID in cells that hold no liquid.
             fill: adds the density of liquid without particles in a window.
         """
@@ -101,7 +102,7 @@ class LevelSet:
         self.compute(particles, window, capacity, base, fill=fill)
 
     def leave(self, window: Window) -> None:
-        """Clear what the last update has left in another window."""
+        """Clear what the last update has written to another window."""
         before, self._filled = self._filled, window.now
         if before is not None and (before.low, before.high) != (window.low, window.high):
             self._left.move_to(before)
@@ -119,15 +120,15 @@ class LevelSet:
         *,
         fill: Fill | None = None,
     ) -> None:
-        """Launch what `update` does after `leave`."""
+        """Launch the computation of `update` after `leave`."""
         grid = self.grid
         particle_density(grid, particles, window, self.particles_a_cell, self.density)
         if fill is not None:
             fill(window, self.density)
         density, smooth = self.density, None
         if self.smoothing:
-            # a pass looks one cell beyond the window, where an earlier update may have left
-            # something
+            # A pass reads one cell beyond the window, where an earlier update may have written
+            # values.
             clear(*self._scratch[:2])
             density = self._smoothed(window, self.density, self._scratch[0], self._scratch[1])
             if capacity is not None:
@@ -165,7 +166,7 @@ class LevelSet:
         Args:
             distance: signed distance to the solids at the cells' low corners [cells], > 0 in the
                 open, float32; None: solids are the cells that were SOLID in the last update.
-            window: that of the last update.
+            window: window of the last update.
         """
         self.measure(distance, window)
         return self.measured

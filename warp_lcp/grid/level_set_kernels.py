@@ -1,9 +1,10 @@
 # mypy: ignore-errors
-"""Kernels of the level set: the particles' density, the distance that a filled share of a cell's kernel means, the volume it encloses.
+"""Kernels of the level set: density, distance from the filled share, volume.
 
-A cell's kernel is the quadratic B-spline around its center, three cells wide along each axis. G(s),
-the share of it that a half space filled up to s cells from its center holds, is a cubic in pieces:
-(s + 3/2)^3 / 6 up to -1/2, 1/2 + 3/4 s - s^3 / 3 up to 1/2, and G(-s) = 1 - G(s).
+A cell's kernel is the quadratic B-spline around its center, three cells wide along each axis. G(s)
+is the share of the kernel that a half space filled up to s cells from the center holds, a cubic in
+pieces: (s + 3/2)^3 / 6 up to -1/2, 1/2 + 3/4 s - s^3 / 3 up to 1/2, and G(-s) = 1 - G(s). phi is
+minus the s at which G(s) is the filled share.
 """
 
 from pathlib import Path
@@ -14,12 +15,12 @@ from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.kernels import KernelFile
 from warp_lcp.operators.grid_poisson import SOLID
 
-# Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and
-# an empty wedge deep in the liquid would count as air, into which the liquid falls. Such a cell is
-# given its neighbors' distance.
+# Least open share of a cell's kernel. Where less is open, it holds too few particles (one, of four
+# a cell), and an empty wedge deep in the liquid would count as air, into which the liquid falls.
+# Such a cell gets its neighbors' distance.
 MIN_CAPACITY = 0.25
-TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
-EXTENDED = 2  # layers of cells without a distance of their own that are given one
+TAIL = 1e-4  # least filled share with a quantile, after smoothing
+EXTENDED = 2  # layers of cells to which the distance is extrapolated
 
 _CONSTANTS = {"MIN_CAPACITY": MIN_CAPACITY, "TAIL": TAIL, "SOLID": SOLID}
 KERNELS = KernelFile(Path(__file__).parent / "headers/level_set.h", _CONSTANTS)
@@ -32,7 +33,7 @@ GATHER = KERNELS["warp_lcp.grid.density.gather_density"]
 
 @wp.func
 def slope_beside(here: float, below: float, above: float, has_below: bool, has_above: bool):
-    """Return the central difference, or the one-sided one where only one neighbor has a value."""
+    """Return the central difference, or the one-sided one with one neighbor only."""
     if has_below and has_above:
         return 0.5 * (above - below)
     if has_above:
@@ -46,11 +47,11 @@ def slope_beside(here: float, below: float, above: float, has_below: bool, has_a
 def wall_shift_kernel(
     k, j, i, variance: float, limit: float, capacity: F32, phi: F32, known: I8, out: F32
 ):
-    """Bring phi from the mean place of the open part of a cell's kernel back to the cell's center.
+    """Shift phi from the centroid of a kernel's open part back to the cell's center.
 
-    A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s =
-    integral of (x - c) K over the open part by its capacity. For a Gaussian of that variance s =
-    variance grad(capacity) / capacity; hence phi - s . grad(phi).
+    A wall cuts a part off the kernel, so the remaining part measures the liquid at c + s, with s =
+    integral of (x - c) K over the open part, divided by the capacity. For a Gaussian of this
+    variance s = variance grad(capacity) / capacity. Hence the result phi - s . grad(phi).
     """
     one = wp.int8(1)
     here = phi[k, j, i]
@@ -102,14 +103,14 @@ def wall_shift_kernel(
 
 @cell_kernel("warp_lcp.grid.level_set")
 def clear_kernel(k, j, i, limit: float, phi: F32, known: I8):
-    """Forget what an earlier update left: air."""
+    """Reset the level set to air where an earlier update has written."""
     phi[k, j, i] = limit
     known[k, j, i] = wp.int8(0)
 
 
 @cell_kernel("warp_lcp.grid.level_set")
 def whole_cell_capacity_kernel(k, j, i, planes: int, base: I8, capacity: F32):
-    """Add up the shares 1/6, 2/3, 1/6 of a cell's kernel that lie in the open cells around it."""
+    """Sum up the shares 1/6, 2/3, 1/6 of a cell's kernel over open cells."""
     total = float(0.0)
     for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, base.shape[0])):
         for b in range(wp.max(j - 1, 0), wp.min(j + 2, base.shape[1])):

@@ -2,16 +2,16 @@
 
 Closed, without duplicate points; segments in 2-D.
 
-One thread takes a row of cells, and knows from a scan where its points and triangles go. A point
+One thread takes a row of cells; a prefix sum gives the places of its points and triangles. A point
 belongs to the node at the low end of its edge; a node's points are numbered x, y, z from the number
-that the node keeps.
+that the node stores.
 
-The triangles of a case are worked out from the cube instead of typed in. Corner c of a cell lies at
-(c & 1, c >> 1 & 1, c >> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a +
-b runs along axis a from the b-th of the four corners that are low along it. On a face each run of
-inside corners is cut off by a segment, so that two cells see the same segments on the face between
-them: the surface is closed. No triangle has an edge within a face that is no segment, so that each
-of its edges belongs to two triangles.
+The triangles of a case are computed from the cube. Corner c of a cell lies at (c & 1, c >> 1 & 1, c
+>> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a + b runs along axis a
+from the b-th of the four corners that are low along it. On a face each run of inside corners is cut
+off by a segment, so that two cells have the same segments on the face between them: the surface is
+closed. A triangle has no edge within a face except segments, so that each of its edges belongs to
+two triangles.
 """
 
 import functools
@@ -25,7 +25,7 @@ import warp as wp
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 
-MOST = 5  # triangles of a cell
+MOST = 5  # most triangles of a cell
 EDGES = tuple(
     (corner, corner | 1 << axis)
     for axis in range(3)
@@ -53,7 +53,10 @@ def _edge(a: int, b: int) -> Edge:
 
 
 def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Edge]]:
-    """Return what cuts off the runs of inside corners of a face, each from the edge before a run to the edge after it."""
+    """Return the segments that cut off the runs of inside corners of a face.
+
+    Each goes from the edge before a run to the edge after it.
+    """
     inside = [bool(case >> corner & 1) for corner in face]
     found = []
     for n in range(4):
@@ -66,7 +69,10 @@ def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Ed
 
 
 def _loops(case: int) -> list[Loop]:
-    """Return the closed lines in which the surface meets the cell's faces, counterclockwise seen from outside the material."""
+    """Return the closed lines in which the surface meets the cell's faces.
+
+    They are counterclockwise seen from outside the material.
+    """
     follows = dict(itertools.chain(*(_segments(case, face) for face in _faces())))
     loops = []
     while follows:
@@ -95,11 +101,16 @@ def _midpoint(edge: Edge) -> np.ndarray:
 
 @functools.cache
 def _cut(loop: Loop) -> Cut | None:
-    """Return the triangulation of a loop with the shortest diagonals, and their length; None: all have a diagonal within a face."""
+    """Return the triangulation of a loop with the shortest diagonals.
+
+    Also returns their length.
+
+    Returns None if every triangulation has a diagonal within a face.
+    """
     if len(loop) == 3:
         return 0.0, ((loop[0], loop[1], loop[2]),)
     best = None
-    # the corner opposite to the side between the loop's ends
+    # The corner opposite to the side between the loop's ends.
     for middle in range(1, len(loop) - 1):
         parts: list[Cut] = [(0.0, ((loop[0], loop[middle], loop[-1]),))]
         for part in (loop[: middle + 1], loop[middle:]):
@@ -154,7 +165,8 @@ def segment_table() -> np.ndarray:
     return table
 
 
-# of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
+# Fraction of an edge. A point keeps this distance from its ends, so that no triangle shrinks to
+# nothing.
 CLOSEST = 0.01
 
 
@@ -196,10 +208,9 @@ class MarchingCubes:
     def contour(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the surface phi = 0, linear between cell centers.
 
-        Flat on the domain's sides where it is cut off there.
-
-        Where it meets a side at a right angle it ends there in an edge: what crosses it between
-        centers beside a side is put on the side. The same points in the same order on every run.
+        The surface is flat on the domain's sides where it is cut off there. Where it meets a side
+        at a right angle it ends there in an edge: crossings between centers beside a side are moved
+        onto the side. The points and their order are the same on every run.
 
         Args:
             phi: float32 at cell centers, in the stored shape; > 0 in the ring, so that the surface
@@ -213,7 +224,7 @@ class MarchingCubes:
             grid.shape[1] - 1,
             grid.shape[2] - 1,
         )
-        # between the centers of cells and of their upper neighbors
+        # Cells between the centers of cells and of their upper neighbors.
         cells = Window(low, high, device)
         owned, made = self._counted(cells, phi)
         points = wp.empty(_total(owned[1]), dtype=wp.vec3, device=device)
@@ -237,8 +248,8 @@ class MarchingCubes:
         """Return the corners of the last surface that lie in given cells.
 
         Args:
-            phi: as `contour` was given it.
-            number: as it has left it.
+            phi: the field passed to `contour`.
+            number: the numbers that `contour` has written.
             cells: between the centers of these and of their upper neighbors.
         """
         return self._corners(cells, phi, number, self._counted(cells, phi)[1])
@@ -246,7 +257,10 @@ class MarchingCubes:
     def _counted(
         self, cells: Window, phi: wp.array
     ) -> tuple[tuple[wp.array, wp.array], tuple[wp.array, wp.array]]:
-        """Return how many points nodes of rows own, and triangles their cells have, each with sums up to and with each row."""
+        """Count the points that the nodes of each row own and the triangles of its cells.
+
+        Each count comes with its inclusive prefix sums over rows.
+        """
         owned, made = (wp.empty(cells.rows, dtype=wp.int32, device=cells.device) for _ in range(2))
         cells.run(
             COUNT,
@@ -267,7 +281,7 @@ class MarchingCubes:
     def _corners(
         self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]
     ) -> wp.array:
-        """Return the triangles of cells, whose rows have so many."""
+        """Return the triangles of cells, given the number of them in each row."""
         corners = wp.empty(
             (_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device
         )
@@ -286,5 +300,5 @@ class MarchingCubes:
 
 
 def _total(ends: wp.array) -> int:
-    """Return the last of sums."""
+    """Return the last of the prefix sums."""
     return int(ends[-1:].numpy()[0])

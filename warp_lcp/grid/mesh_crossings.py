@@ -1,9 +1,9 @@
-"""Where a closed surface crosses itself, or lies inside itself: there the winding number is neither 0 nor 1.
+"""Self-intersections of a closed surface, and parts inside other parts.
 
-Two triangles cross where the segments that each has in common with the other's plane overlap. Parts
-that only touch do so too, face to face or along edges; so winding numbers on the four sides of the
-crossing decide. Parts that do not cross have the same winding number all over, which one of their
-triangles tells.
+There the winding number is neither 0 nor 1. Two triangles cross where the segments that each shares
+with the other's plane overlap. Parts that only touch, face to face or along edges, do so too;
+therefore the winding numbers on the four sides of the crossing decide. A part that crosses no other
+has the same winding number everywhere, so one of its triangles decides for it.
 """
 
 import typing
@@ -17,30 +17,30 @@ from scipy.sparse.csgraph import connected_components
 from warp_lcp.kernels.compiler import forward_kernel
 
 MODULE = "warp_lcp.grid.mesh_crossings"
-# half diagonals of the mesh: closer than rounding of float64 coordinates tells
+# Half diagonals of the mesh. Rounding of float64 coordinates hides smaller distances.
 NEAR = wp.constant(1.0e-9)
-# a common segment that is shorter counts as a point: vertices are equal within 1e-6
+# A common segment that is shorter counts as a point: vertices are equal within 1e-6.
 SHORT = wp.constant(1.0e-5)
-# from the surface, where winding numbers are looked at; float32 tells it from 0
+# Distance from the surface at which winding numbers are evaluated; float32 resolves it.
 ASIDE = wp.constant(1.0e-4)
 DOUBLED = wp.constant(1)
 INVERTED = wp.constant(2)
-# points of the surface whose sides are looked at, to tell how much of it is wrong: to 1 %
+# Points of the surface at which both sides are evaluated, to estimate the wrong share of it to 1 %.
 SAMPLE = 4096
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """What is wrong with where a surface's triangles lie.
+    """Self-intersections of a surface.
 
     Attributes:
         count: triangles that cross others.
-        place: of the first of them, or else of a part that lies inside another, in the mesh's
-            units, shape (3,); None: all is well.
-        doubled: about which share of the surface's area lies inside the solid, between what is
-            surrounded once and twice.
-        inverted: about which share of it is turned inside out, so that what it surrounds counts as
-            outside.
+        place: the first crossing triangle, or else the first triangle of a part that lies inside
+            another, in the mesh's units, shape (3,); None if the surface is correct.
+        doubled: estimated share of the surface's area that lies inside the solid, between regions
+            that are surrounded once and twice.
+        inverted: estimated share of the area that is turned inside out, so that the volume it
+            surrounds counts as outside.
     """
 
     count: int = 0
@@ -62,7 +62,10 @@ def triangle(points: Points, corners: Corners, t: int):
 @wp.func
 @typing.no_type_check
 def side_of(mesh: wp.uint64, point: wp.vec3d) -> int:
-    """Return whether a point is surrounded more than once, DOUBLED, or less than never, INVERTED; else 0."""
+    """Return DOUBLED where the winding number exceeds 1, INVERTED where it is below 0.
+
+    Otherwise returns 0.
+    """
     x = wp.vec3(point)
     if wp.mesh_query_point_sign_winding_number(mesh, x, 1.0e10, 2.0, 1.5).sign < 0.0:
         return DOUBLED
@@ -74,7 +77,11 @@ def side_of(mesh: wp.uint64, point: wp.vec3d) -> int:
 @wp.func
 @typing.no_type_check
 def cut_by_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, h: wp.vec3d, along: wp.vec3d):
-    """Return the first and last point that a triangle has in a plane, which its corners have the heights `h` above, and how many."""
+    """Intersect a triangle with a plane.
+
+    `h` are the heights of its corners above the plane. Returns the first and the last point along
+    the direction `along`, and the number of points.
+    """
     low = a
     high = a
     found = int(0)
@@ -100,7 +107,7 @@ def cut_by_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, h: wp.vec3d, along: wp.v
 @wp.func
 @typing.no_type_check
 def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.float64:
-    """Return how far a point is above a plane; 0 for a corner that lies in it."""
+    """Return the height of a point above a plane; 0 for a corner that lies in it."""
     h = wp.dot(x - origin, normal)
     return wp.where(shared or wp.abs(h) < wp.float64(NEAR), wp.float64(0.0), h)
 
@@ -136,7 +143,7 @@ def find_crossings(
         d, e, f = triangle(points, corners, other)
         m = wp.normalize(wp.cross(e - d, f - d))
         line = wp.cross(n, m)
-        if wp.length(line) < wp.float64(1.0e-6):  # in parallel planes
+        if wp.length(line) < wp.float64(1.0e-6):  # the planes are parallel
             continue
         along = wp.normalize(line)
         h = wp.vec3d(
@@ -181,7 +188,10 @@ def look_beside(
     at: Points,
     kind: wp.array(dtype=wp.uint8),
 ):
-    """Tell at which points of triangles `which` one side is surrounded twice, DOUBLED, or less than never, INVERTED."""
+    """Mark points of triangles `which` that have a doubled or inverted side.
+
+    DOUBLED: one side is surrounded twice. INVERTED: one side has a negative winding number.
+    """
     i = wp.tid()
     a, b, c = triangle(points, corners, which[i])
     n = wp.normalize(wp.cross(b - a, c - a)) * wp.float64(ASIDE)
@@ -191,13 +201,13 @@ def look_beside(
 
 
 def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> Crossings:
-    """Return where a closed surface crosses itself or lies inside itself.
+    """Find where a closed surface crosses itself or lies inside itself.
 
     Args:
         mesh: the surface.
-        vertices: of it, in half diagonals of its bounding box from its center, float64 of shape (n,
-            3).
-        triangles: of it, int32 of shape (m, 3).
+        vertices: vertices of the surface, in half diagonals of its bounding box from its center,
+            float64 of shape (n, 3).
+        triangles: triangles of the surface, int32 of shape (m, 3).
     """
     device = mesh.points.device
     inputs = [
@@ -246,7 +256,7 @@ def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarr
 
 
 def _first_of_parts(triangles: np.ndarray, vertices: int) -> np.ndarray:
-    """Return the first triangle of each part that has no vertex in common with others."""
+    """Return the first triangle of each part; parts have no vertex in common."""
     rows, columns = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]]).T
     links = coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(vertices, vertices))
     _, label = connected_components(links, directed=False)

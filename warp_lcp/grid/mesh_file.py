@@ -17,9 +17,9 @@ import numpy as np
 from warp_lcp.files.size_limits import check_claim
 
 FORMATS = (".obj", ".ply", ".stl")
-MARK = b"\xef\xbb\xbf"  # that some editors write before UTF-8 text
-WIDE = (b"\xff\xfe", b"\xfe\xff")  # and before UTF-16
-# of a text STL, behind the first
+MARK = b"\xef\xbb\xbf"  # byte order mark that some editors write before UTF-8 text
+WIDE = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
+# Words of a text STL after the first.
 STL_WORDS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", flags=re.MULTILINE | re.IGNORECASE)
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("color", "<u2")])
@@ -40,11 +40,11 @@ PLY_TYPES = {
     for name in names.split()
 }
 PLY_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-# the names of a face's list of corners that are in use
+# Names of a face's list of corners in use.
 PLY_CORNERS = ("vertex_indices", "vertex_index")
 LARGEST_INDEX = 2**31 - 1
 
-Corners = list[np.ndarray]  # of polygons, each of shape (count, corners)
+Corners = list[np.ndarray]  # blocks of polygons, each of shape (count, corners)
 
 
 def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -119,12 +119,15 @@ def _triangulate(path: Path, points: np.ndarray, blocks: Corners) -> tuple[np.nd
 
 
 def _blocks(polygons: Sequence[Sequence[int] | np.ndarray]) -> Corners:
-    """Return polygons as arrays, one for each run of them that have as many corners."""
+    """Return polygons as arrays, one per run of equal numbers of corners."""
     return [np.array(list(run), dtype=np.int64) for _, run in itertools.groupby(polygons, key=len)]
 
 
 def _is_binary_stl(data: bytes) -> bool:
-    """Tell a binary STL by its length, or by what no text has: its first bytes may say "solid" all the same."""
+    """Return whether data is a binary STL.
+
+    Its length decides, or bytes that no text has: a binary file may begin with "solid", too.
+    """
     if len(data) < STL_HEADER:
         return False
     is_text = data.removeprefix(MARK).lstrip()[:5].lower() == b"solid" and (
@@ -138,7 +141,10 @@ def _stl_count(data: bytes) -> int:
 
 
 def _parse_binary_stl(data: bytes) -> tuple[np.ndarray, Corners]:
-    """Read the corners of a binary STL, three for each triangle; bytes behind the last one, which some programs write, are passed over."""
+    """Read the corners of a binary STL, three for each triangle.
+
+    Bytes after the last triangle, which some programs write, are ignored.
+    """
     count, held = _stl_count(data), (len(data) - STL_HEADER) // STL_TRIANGLE.itemsize
     if held < count:
         raise ValueError(
@@ -156,7 +162,7 @@ def _parse_binary_stl(data: bytes) -> tuple[np.ndarray, Corners]:
 
 
 def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Read the corners of a text STL; blank lines and words in capitals do not matter."""
+    """Read the corners of a text STL; blank lines and upper case are allowed."""
     data = data.removeprefix(MARK).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if not data.lstrip()[:5].lower() == b"solid":
         raise ValueError(
@@ -181,7 +187,10 @@ def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class _Element:
-    """A kind of records of a PLY file: how many it promises, and the name, type and, of a list, type of length of each property."""
+    """Record type of a PLY file: number of records, and properties.
+
+    A property has a name, a type and, if it is a list, the type of its length.
+    """
 
     name: str
     count: int
@@ -189,7 +198,7 @@ class _Element:
 
 
 def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
-    """Read vertices and faces of a PLY file; other elements and properties are passed over."""
+    """Read vertices and faces of a PLY file; ignore other elements and properties."""
     data = data.removeprefix(MARK)
     head = re.match(
         rb"ply[ \t]*(?P<end>\r\n|\n|\r)(?P<lines>.*?(?P=end))\s*end_header[ \t]*(?P=end)",
@@ -230,7 +239,7 @@ def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
 
 
 def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
-    """Return the order of bytes, None for text, and the elements that a header names."""
+    """Return the byte order, None for text, and the elements of a header."""
     order: str | None = ""
     elements: list[_Element] = []
     for line in text.splitlines():
@@ -255,14 +264,20 @@ def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
 
 
 class _Records:
-    """The body of a PLY file, one record after the other: numbers of bytes in an order, or words, where that is None."""
+    """Records of a PLY file, read in sequence: binary numbers or words of a text.
+
+    `order` is the byte order; None for text.
+    """
 
     def __init__(self, body: bytes, order: str | None) -> None:
         self.body: Any = body.split() if order is None else body
         self.order, self.at = order, 0
 
     def claim(self, element: _Element) -> dict[str, int]:
-        """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes, two a word]."""
+        """Return the least size of an element's records, and that of the data left.
+
+        `stored` and `held` are in bytes, two per word of a text.
+        """
         each = 2 if self.order is None else 1
         least = sum(self._width(length or kind) for _, kind, length in element.properties)
         return {"stored": each * element.count * least, "held": each * (len(self.body) - self.at)}
@@ -311,7 +326,10 @@ class _Records:
 
 
 def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:
-    """Read vertices and faces of an OBJ file, whose indices count from 1, or backwards from the last vertex so far."""
+    """Read vertices and faces of an OBJ file.
+
+    Indices count from 1, or backwards from the last vertex so far.
+    """
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     for line in (
@@ -335,7 +353,7 @@ def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:
 
 
 def _number(word: str | bytes) -> float:
-    """Return a coordinate; Python alone would take 1_0 for 10."""
+    """Return a coordinate; reject underscores, which Python accepts in 1_0."""
     text = word.decode("ascii", "replace") if isinstance(word, bytes) else word
     if "_" in text:
         raise ValueError(f"could not convert string to float: {text!r}")
@@ -343,7 +361,7 @@ def _number(word: str | bytes) -> float:
 
 
 def _index(word: Any) -> int:
-    """Return the number of a vertex, or of entries, no larger than any mesh has."""
+    """Return the number of a vertex, or of entries; limited to the largest mesh."""
     if isinstance(word, (str, bytes)) and ("_" if isinstance(word, str) else b"_") in word:  # type: ignore[operator]
         raise ValueError(f"a face names a vertex by {word!r}")
     index = int(word)

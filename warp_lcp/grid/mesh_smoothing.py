@@ -1,6 +1,6 @@
-"""Taubin smoothing of a closed surface: no shrinking.
+"""Taubin smoothing of a closed surface, which does not shrink it.
 
-A step of Laplacian smoothing, then a slightly longer one back.
+Each round is a step of Laplacian smoothing and a slightly longer step back.
 """
 
 import typing
@@ -15,12 +15,12 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
 
-# lattice cells from the domain's side: points that close the surface there are 0.01 off its other
-# sides
+# Lattice cells from the domain's side. Points that close the surface there are 0.01 off its other
+# sides.
 TOUCHING = 0.015
-ON_SIDE, ON_SOLID = 1, 2  # bits of a mark
-# lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can
-# tell
+ON_SIDE, ON_SOLID = 1, 2  # bits of a point's mark
+# Lattice cells. Tolerance of a point on a solid: the accuracy of a distance that is linear between
+# nodes.
 NEAR = 0.25
 
 _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
@@ -41,7 +41,10 @@ def hold_kernel(
     counts: wp.vec3,
     held: _BYTES,
 ):
-    """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids, with ON_SIDE + ON_SOLID."""
+    """Mark fixed points: those on the domain's sides, and those on solids.
+
+    The marks are ON_SIDE + ON_SOLID. The surface so ends in an edge at the sides.
+    """
     p = wp.tid()
     x = points[p] / dx
     mark = int(0)
@@ -70,7 +73,10 @@ def move_kernel(
     start: POINTS,
     points: POINTS,
 ):
-    """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""
+    """Move a point a share of the way to the mean of its neighbors.
+
+    It stays within the domain and within a distance `most` of its start.
+    """
     p = wp.tid()
     if held[p] != wp.uint8(0):
         return
@@ -86,11 +92,11 @@ def move_kernel(
     )
 
 
-# shares of the way to the neighbors' mean: waves longer than about 9 points keep their height,
-# short ones lose it
+# Shares of the way to the neighbors' mean. Waves longer than about 9 points keep their height,
+# shorter ones lose it.
 FORTH, BACK = 0.5, -0.53
-# lattice cells that a point may move: facets are shallower, drops of few points are not squeezed to
-# nothing
+# Lattice cells that a point may move. Facets are shallower; drops of few points are not squeezed to
+# nothing.
 MOST = 0.3
 
 
@@ -102,8 +108,8 @@ def smooth(
     Args:
         mesh: a closed surface from `warp_lcp.grid.marching_cubes` (updated).
         lattice: the grid that it was found on.
-        room: distance to solids at the lattice's cell centers [lattice cells], float32; None: there
-            are no solids.
+        room: distance to solids at the lattice's cell centers [lattice cells], float32; None if
+            there are no solids.
         rounds: steps forth and back; each lets a point look two points farther.
 
     Returns:
@@ -121,7 +127,7 @@ def smooth(
         device=device,
     )
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
-    # of the neighbors' coordinates, and how many they are
+    # Sums of the neighbors' coordinates, and the number of neighbors.
     sums = wp.empty((count, 4), dtype=wp.float32, device=device)
     size = wp.vec3(*lattice.extent)
     rows = chunks(len(mesh.corners), device)

@@ -20,29 +20,31 @@ import warp as wp
 
 from warp_lcp.grid.solids import Geometry
 
-# cells that the surface reaches into solids, so that renderers see no film of air and no two faces
-# at one place
+# Cells by which the surface reaches into solids, so that renderers see no film of air and no two
+# faces at one place.
 OVERLAP = 0.03
-# cells, of the differences that give grad d, and of a coordinate at least, which float32 rounds
+# Cells. Step of the differences that give grad d, and the least of a coordinate, which float32
+# rounds.
 STEP, ROUNDING = 0.01, 1.2e-5
-FARTHEST = 1.25  # cells that a point may move
-SHARP = 0.9  # cosine of the angle between normals: less is an edge of the solid
-# cells from the wall: a common point of planes farther from it is none of an edge, but of something
-# round
+FARTHEST = 1.25  # cells by which a point may move
+SHARP = 0.9  # cosine between normals below which there is an edge of the solid
+# Cells from the wall. A common point of planes farther from it belongs to no edge but to a round
+# surface.
 MISSED = 0.06
-SINGULAR = 0.05  # of the largest eigenvalue: directions in which planes do not tell where they meet
+# Fraction of the largest eigenvalue: along smaller ones the planes do not determine a point.
+SINGULAR = 0.05
 TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 TRIANGLE = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi / 3.0 * np.arange(3)])
 
 
 class MeshWalls:
-    """Signed distance to solids where they are.
+    """Signed distance to solids at their current places.
 
     Args:
         solids: the solids.
-        spacing: of the grid [m].
+        spacing: spacing of the grid [m].
         dimension: 2 or 3.
-        device: that the solids are on.
+        device: device of the solids.
     """
 
     def __init__(
@@ -51,7 +53,11 @@ class MeshWalls:
         self.solids, self.spacing, self.dimension, self.device = solids, spacing, dimension, device
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance from points [cells], shape (n, 3), to the nearest solid [cells], shape (n,); infinite where none is near."""
+        """Return the signed distance from points to the nearest solid.
+
+        Points [cells] have the shape (n, 3), distances [cells] the shape (n,); infinite where no
+        solid is near.
+        """
         nearest = np.full(len(points), np.inf)
         x = points * self.spacing
         for solid in self.solids:
@@ -69,7 +75,10 @@ class MeshWalls:
         return nearest
 
     def distance_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return d [cells], shape (n,), and grad d, shape (n, 3), from d at the corners of a small simplex around each point."""
+        """Return d [cells], shape (n,), and grad d, shape (n, 3), at points.
+
+        The gradient comes from differences over the corners of a small simplex around each point.
+        """
         directions = TETRAHEDRON if self.dimension == 3 else TRIANGLE
         step = np.maximum(STEP, ROUNDING * np.abs(points).max(axis=1, initial=0.0))[:, None]
         around = (points[:, None] + step[..., None] * directions).reshape(-1, 3)
@@ -88,11 +97,11 @@ def fit_to_walls(
     fixed: np.ndarray,
     walls: MeshWalls,
 ) -> np.ndarray:
-    """Return the points of a surface with those on solids moved onto the solids' shapes.
+    """Return a surface's points, with those on solids moved onto the shapes.
 
     Args:
-        points: of the surface [cells], shape (n, 3).
-        corners: of its triangles, shape (m, 3), or segments, shape (m, 2).
+        points: points of the surface [cells], shape (n, 3).
+        corners: corners of its triangles, shape (m, 3), or segments, shape (m, 2).
         on_solid: whether a point lies on a solid, shape (n,).
         fixed: which coordinates of a point may not change, as it lies on a side of the domain,
             bool, shape (n, 3).
@@ -106,7 +115,7 @@ def fit_to_walls(
         return points
     start, free = points[own].astype(np.float64), ~fixed[own]
     x, gradient, d = start.copy(), np.zeros_like(start), np.zeros(len(start))
-    # the second time from within rounding of the wall, so that its gradient is that there
+    # The second pass starts within rounding of the wall, so that the gradient is that at the wall.
     for _ in range(2):
         d, gradient = walls.distance_and_gradient(x)
         along = gradient * free
@@ -125,7 +134,10 @@ def fit_to_walls(
 
 
 def _sharp_edges(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return edges of the mesh that cross one of the solid, pairs of points, shape (e, 2); corners below 0 are not on a solid."""
+    """Return the edges of the mesh that cross an edge of a solid.
+
+    They are pairs of points, shape (e, 2). Corners below 0 are not on a solid.
+    """
     sides = [(0, 1)] if corners.shape[1] == 2 else [(0, 1), (1, 2), (2, 0)]
     edges = np.concatenate([corners[:, side] for side in sides])
     edges = np.unique(np.sort(edges[(edges >= 0).all(axis=1)], axis=1), axis=0)
@@ -143,7 +155,7 @@ def _sharpened(
         x: points on solids [cells], shape (n, 3).
         normal: unit normals there, shape (n, 3); 0: unknown.
         free: which coordinates may change, shape (n, 3).
-        corners: of triangles or segments, numbers of these points; below 0: of others.
+        corners: corners of triangles or segments, numbers of these points; below 0: of others.
         walls: the solids.
     """
     edges = _sharp_edges(corners, normal)
@@ -165,7 +177,7 @@ def _sharpened(
     _move(result, moves, around.of(moves[:, None]).common_point(x[moves]), free, walls)
     if corners.shape[1] == 2:
         return result
-    # a triangle with a point on each of three edges cuts their corner off
+    # A triangle with a point on each of three edges cuts their corner off.
     touched = np.zeros(len(x) + 1, dtype=bool)
     touched[moves] = True
     triangles = corners[(corners >= 0).all(axis=1) & touched[corners].any(axis=1)]
@@ -181,7 +193,10 @@ def _sharpened(
 
 
 def _nearest_ends(x: np.ndarray, simplices: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return which corner of each simplex is nearest to its target, all of those that are, bool of the simplices' shape."""
+    """Return a mask of the corners of each simplex nearest to its target.
+
+    bool of the simplices' shape; several corners may be equally near.
+    """
     far = np.linalg.norm(x[simplices] - target[:, None], axis=2)
     return cast(np.ndarray, far <= far.min(axis=1, keepdims=True))
 
@@ -189,7 +204,10 @@ def _nearest_ends(x: np.ndarray, simplices: np.ndarray, target: np.ndarray) -> n
 def _move(
     x: np.ndarray, chosen: np.ndarray, target: np.ndarray, free: np.ndarray, walls: MeshWalls
 ) -> None:
-    """Move points (updated) to their targets, where these are on the wall, near, and along the sides that the points lie on."""
+    """Move points (updated) to targets that are on the wall and near.
+
+    Points move only along the sides of the domain that they lie on.
+    """
     way = target - x[chosen]
     good = (np.linalg.norm(way, axis=1) <= FARTHEST) & (np.abs(way * ~free[chosen]) < MISSED).all(
         axis=1
@@ -199,25 +217,31 @@ def _move(
 
 
 class Planes:
-    """Sets of planes n.x = n.p, by the normal equations of their common points: sums of n n' and of n (n.p)."""
+    """Sets of planes n.x = n.p, stored as the normal equations of their common points.
+
+    They are the sums of n n' and of n (n.p).
+    """
 
     def __init__(self, matrix: np.ndarray, right: np.ndarray) -> None:
         self.matrix, self.right = matrix, right
 
     @classmethod
     def through(cls, x: np.ndarray, normal: np.ndarray) -> Planes:
-        """Return a plane through each point, shape (n, 3), with this normal; 0: none."""
+        """Return a plane through each point, shape (n, 3), with this normal.
+
+        There is no plane where the normal is 0.
+        """
         return cls(
             normal[:, :, None] * normal[:, None, :],
             normal * np.einsum("ij,ij->i", normal, x)[:, None],
         )
 
     def of(self, groups: np.ndarray) -> Planes:
-        """Return the planes of groups of points together, shape (m, k)."""
+        """Return the combined planes of groups of points, shape (m, k)."""
         return Planes(self.matrix[groups].sum(axis=1), self.right[groups].sum(axis=1))
 
     def add(self, own: np.ndarray, other: Planes) -> None:
-        """Add the planes of other sets to those of some."""
+        """Add the planes of other sets to some of these."""
         np.add.at(self.matrix, own, other.matrix)
         np.add.at(self.right, own, other.right)
 
@@ -227,7 +251,10 @@ class Planes:
         self.right += x * ~free
 
     def common_point(self, near: np.ndarray) -> np.ndarray:
-        """Return the points that fit the sets best, by least squares, and of those the nearest to given ones, shape (n, 3)."""
+        """Return the least-squares common points of the sets, shape (n, 3).
+
+        If several points fit best, the one nearest to `near` is returned.
+        """
         residual = self.right - np.einsum("nij,nj->ni", self.matrix, near)
         values, vectors = np.linalg.eigh(self.matrix)
         inverse = np.where(values > SINGULAR * values[:, -1:], 1.0 / np.maximum(values, 1e-12), 0.0)

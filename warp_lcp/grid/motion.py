@@ -2,9 +2,9 @@
 
 A motion is a pose over time, relative to the placement in the scene.
 
-All motions are functions of time alone, in float64: a solid that turns for a million steps has not
-drifted, and a run that is resumed sees the same poses. Points and directions are those of the
-domain [m]; two coordinates mean z = 0, and a 2-D scene turns about z.
+All motions are functions of time alone, in float64: a solid that turns for a million steps does not
+drift, and a resumed run has the same poses. Points and directions are those of the domain [m]; two
+coordinates mean z = 0, and a 2-D scene turns about z.
 """
 
 from __future__ import annotations
@@ -24,15 +24,17 @@ from warp_lcp.kernels.host_kernel import HostKernel
 
 Vector = Sequence[float] | np.ndarray
 
-ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
-# [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
+# Largest error of R R' - 1 of a pose; products of a few rotations stay near 1e-15.
+ROTATION_ERROR = 1e-9
+# [m/s] or [degrees/s], between keyframes of a smooth motion, whose cubics use squares and higher
+# powers.
 FASTEST = 1e18
-SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
+SPEED_SAMPLES = 4  # parts of a time span in which the top speed is evaluated
 TOP_SPEED = HostKernel(
     KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.motion.top_speed"]
 )
 PARTS = np.arange(SPEED_SAMPLES + 1.0)
-UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
+UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of an unbounded solid
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
@@ -41,7 +43,7 @@ def keep_checked(frozen: Any, error: float) -> None:
 
     Args:
         frozen: the dataclass.
-        error: that R R' - 1 may have.
+        error: largest error of R R' - 1.
 
     Raises:
         ValueError: a value is not finite, or the matrix is not a rotation.
@@ -94,7 +96,10 @@ class Pose:
 
     @classmethod
     def _of(cls, rotation: np.ndarray, translation: np.ndarray) -> Pose:
-        """Return a pose that follows from others: to check it takes ten times as long as to find it."""
+        """Return a pose without checks, which take ten times as long as making it.
+
+        The values follow from poses that have been checked.
+        """
         made = object.__new__(cls)
         for name, array in (("rotation", rotation), ("translation", translation)):
             array.flags.writeable = False
@@ -177,7 +182,7 @@ class Rotation:
     Args:
         rate: [degrees/s], counterclockwise seen from the axis's tip.
         center: a point of the axis [m], 2 or 3 numbers.
-        axis: its direction, 3 numbers of any length but 0; z unless given.
+        axis: its direction, 3 numbers of any length but 0. Default: z.
         start: [s].
         stop: [s], > start; infinity: never.
 
@@ -217,11 +222,11 @@ class Sinusoid:
 
     Args:
         period: [s], > 0.
-        amplitude: of the shift [m], 2 or 3 numbers; none unless given.
+        amplitude: amplitude of the shift [m], 2 or 3 numbers. Default: 0.
         phase: [degrees].
         angle: amplitude of the angle [degrees].
-        center: a point of the axis of the swing [m], 2 or 3 numbers; it takes part in the shift.
-        axis: direction of that axis, 3 numbers of any length but 0; z unless given.
+        center: a point of the axis of the swing [m], 2 or 3 numbers; it moves with the shift.
+        axis: direction of that axis, 3 numbers of any length but 0. Default: z.
 
     Raises:
         ValueError: a value is not finite, the period is not positive, or the axis is zero.
@@ -262,12 +267,11 @@ class Keyframes:
 
     Args:
         times: [s], increasing, shape (n,), n >= 2.
-        translate: shifts [m], shape (n, 2) or (n, 3); none unless given.
+        translate: shifts [m], shape (n, 2) or (n, 3). Default: 0.
         rotate: [degrees]: angles about z, shape (n,), as many turns as they say; or angles about
             the fixed axes x, y, z in that order, shape (n, 3), of less than half a turn from one
             keyframe to the next.
-        center: the point [m] that the turns leave where it is, 2 or 3 numbers; it takes part in the
-            shifts.
+        center: the fixed point [m] of the rotations, 2 or 3 numbers; it moves with the shifts.
         smooth: whether velocities are continuous.
 
     Raises:
@@ -284,7 +288,7 @@ class Keyframes:
     _turns: _Turns | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the values and lay curves through them."""
+        """Check the values and build the curves."""
         times = np.array(self.times, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2:
             raise ValueError(f"times must be a list of at least two numbers, not {self.times}")
@@ -321,7 +325,7 @@ class Motions:
     """Motions of several solids, evaluated together.
 
     Args:
-        motions: of n solids.
+        motions: motions of n solids.
     """
 
     def __init__(self, motions: Sequence[Motion]) -> None:
@@ -336,7 +340,7 @@ class Motions:
         self._groups: list[tuple[Any, list[int], list[Any]]] = [
             (kind, numbers, [motions[n] for n in numbers]) for kind, numbers in of_kind.items()
         ]
-        # the kind of all
+        # The common type of all motions.
         self._alone: Any = next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None
         self._prescribed = [n for n, is_rigid in enumerate(rigid) if not is_rigid]
 
@@ -397,7 +401,7 @@ class Motions:
         Args:
             bounds: low and high corner [m] of a box around each solid as it is placed, shape (2,
                 3); None: it has no limits. Or these in one array, see `boxes_of`.
-            size: of the domain [m], shape (3,), z = 0 in 2-D.
+            size: sides of the domain [m], shape (3,), z = 0 in 2-D.
             time: [s].
             span: time to look ahead [s], > 0.
         """
@@ -405,7 +409,7 @@ class Motions:
             return 0.0
         n, m = len(self), SPEED_SAMPLES
         boxes = bounds if isinstance(bounds, np.ndarray) else boxes_of(bounds)
-        times = PARTS * ((time + span - time) / m) + time  # as np.linspace, which takes longer
+        times = PARTS * ((time + span - time) / m) + time  # as np.linspace, which is slower
         times[-1] = time + span
         R, t = self.poses(times)
         _, (fastest,) = TOP_SPEED.run((R, t, boxes, size), (), tasks=n, count=n, parts=m, span=span)
@@ -413,7 +417,7 @@ class Motions:
 
 
 def boxes_of(bounds: Sequence[np.ndarray | None]) -> np.ndarray:
-    """Return bounds, shape (2, 3) each, as one array; None: without limits."""
+    """Return boxes, shape (2, 3) each, as one array; None is an unbounded box."""
     return np.array([UNLIMITED if box is None else box for box in bounds]).reshape(-1, 2, 3)
 
 
@@ -443,7 +447,7 @@ class _Curve:
         self.times, self.values = times, values
         self._spline = None
         if smooth:
-            # by slopes of almost 0: weights of slopes that are 0
+            # Slopes of almost 0 give infinite weights; these belong to slopes that are 0.
             with np.errstate(over="ignore", divide="ignore"):
                 if (np.abs(np.diff(values, axis=0)) > FASTEST * np.diff(times)[:, None]).any():
                     raise ValueError("times are too close to each other for a smooth motion")
@@ -485,7 +489,7 @@ class _Turns:
                 "rotate must change by less than 180 degrees from one keyframe to the next, not "
                 f"from {first} to {last}; add one between"
             )
-        # lower case: about fixed axes
+        # Lower case: rotations about fixed axes.
         rotations = transform.Rotation.from_euler("xyz", angles, degrees=True)
         self._slerp = transform.Slerp(np.arange(len(times)), rotations)
         steps = (rotations[1:] * rotations[:-1].inv()).as_rotvec(degrees=True)
@@ -519,7 +523,7 @@ def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def _elapsed(time: float, start: float, stop: float) -> float:
-    """Return how long a motion from `start` to `stop` has gone on [s]."""
+    """Return the elapsed time [s] of a motion from `start` to `stop`."""
     return min(max(time, start), stop) - start
 
 

@@ -1,8 +1,8 @@
-"""Signed distances of solids at the nodes of a grid, in cells, positive in the open.
+"""Signed distances of solids at grid nodes, in cells, positive in the open.
 
-Node (k, j, i) is the low corner of stored cell (k, j, i). Each node keeps the two nearest solids,
-so that a face can tell which of them is nearest to its center. Distances below `FAR` cells are
-exact, others are at least that large: only nodes near solids are measured.
+Node (k, j, i) is the low corner of stored cell (k, j, i). Each node stores the two nearest solids,
+so that a face can choose the one nearest to its center. Distances below `FAR` cells are exact,
+others are at least that large: only nodes near solids are measured.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ PLACE = HostKernel(
         "warp_lcp.grid.node_distance.place"
     ]
 )
-# of the domain's longest side: distances below it are rounding errors of float32 positions, and
-# count as 0
+# Fraction of the domain's longest side. Smaller distances are rounding errors of float32 positions,
+# and count as 0.
 SNAP = 1e-6
 
 
@@ -57,7 +57,7 @@ class NodeDistances:
         owner: int16 its number; 0: none is near.
         next_near: float32 distance to the second nearest [cells].
         next_owner: int16 its number.
-        struct: what kernels take.
+        struct: the same as a kernel argument.
     """
 
     def __init__(self, grid: StaggeredGrid, *, second: bool) -> None:
@@ -78,13 +78,13 @@ class NodeDistances:
         return [self.near, self.owner, self.next_near, self.next_owner]
 
     def copy_from(self, other: NodeDistances) -> None:
-        """Become a copy of `other`."""
+        """Copy all fields from `other`."""
         for target, source in zip(self.arrays, other.arrays, strict=True):
             copy(target, source)
 
 
 def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) -> Window:
-    """Return the window of nodes low <= (x, y, z) < high, without cells where there are none."""
+    """Return the window of nodes low <= (x, y, z) < high, which may be empty."""
     if any(map(ge, low, high)):
         return Window((1, 1, 1), (1, 1, 2), grid.device)
     return Window(_kji(low), _kji(high), grid.device)
@@ -93,7 +93,10 @@ def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) ->
 def nodes_near(
     grid: StaggeredGrid, geometry: Geometry, reach: float = FAR
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the first stored node and the one past the last (x, y, z) within `reach` cells of a solid's bounds; None: there are none."""
+    """Return the range of nodes (x, y, z) within `reach` cells of a solid's box.
+
+    The first node and the one past the last; None if there are none.
+    """
     bounds = geometry.bounds()
     low, high = nodes_within(grid, UNLIMITED if bounds is None else bounds, reach)
     return (low, high) if (low < high).all() else None
@@ -108,9 +111,10 @@ def box_near(grid: StaggeredGrid, geometry: Geometry) -> NodeBox | None:
 def nodes_within(
     grid: StaggeredGrid, bounds: np.ndarray, reach: float = FAR
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return first nodes and those past the last (x, y, z) within `reach` cells of boxes [m], shape (..., 2, 3).
+    """Return the ranges of nodes (x, y, z) within `reach` cells of boxes [m].
 
-    Shapes (..., 3); not all of one are less than those of the other where no node is near.
+    Boxes have the shape (..., 2, 3). Returns the first nodes and those past the last, shape (...,
+    3) each. A box without nodes has a first node that is not below the last on some axis.
     """
     end = np.array(grid.shape[::-1])
     touched = np.clip(
@@ -126,17 +130,17 @@ def nodes_within(
 
 
 class ShapeTable:
-    """Solids of boxes, spheres, capsules and planes in one array on the device, to be entered by one launch.
+    """Device table of boxes, spheres, capsules and planes, entered by one launch.
 
     Args:
         grid: the grid.
-        solids: number and shape of each as the scene places it, of a kind that `holds` knows.
-        places: of these among the solids that move.
+        solids: number and shape of each as the scene places it, of a kind that `holds` accepts.
+        places: indices of these among the solids that move.
 
     Attributes:
         low: first node (x, y, z) near each solid where it is, shape (n, 3).
         high: one past the last.
-        box: around the nodes near them; None: there are none.
+        box: around the nodes near them; None if there are none.
     """
 
     def __init__(
@@ -196,7 +200,7 @@ class ShapeTable:
 
     @staticmethod
     def holds(geometry: Geometry) -> bool:
-        """Return whether a solid is of boxes, spheres, capsules and planes."""
+        """Return whether a solid consists of boxes, spheres, capsules and planes only."""
         return all(type(part) in KINDS for part in _parts(geometry))
 
     def place(self, rotation: np.ndarray, translation: np.ndarray) -> None:
@@ -232,7 +236,7 @@ class ShapeTable:
 
     @property
     def placed(self) -> wp.array:
-        """The shapes where they stand."""
+        """The shapes at their current places."""
         return self._shapes.array
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
@@ -244,7 +248,7 @@ class ShapeTable:
 
 
 class NodeSampler:
-    """Measure solids at nodes, or at the centers of cells, a part of them at a time.
+    """Measure solids at nodes or at the centers of cells, in blocks of limited size.
 
     Args:
         grid: the grid.
@@ -256,7 +260,7 @@ class NodeSampler:
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits
         self._points = wp.empty(size, dtype=wp.vec3, device=grid.device)
         self._distances = wp.empty(size, dtype=wp.float32, device=grid.device)
-        # (x, y, z, sign if sure)
+        # Points (x, y, z), and the sign if it is sure.
         self._list, self._sure = (
             wp.empty(size, dtype=wp.vec4i, device=grid.device) for _ in range(2)
         )
@@ -266,15 +270,16 @@ class NodeSampler:
         """Enter a solid's distances.
 
         Args:
-            nodes: where to (updated), of the sampler's grid or of another part of the same one.
+            nodes: node distances (updated) of the sampler's grid, or of another part of the same
+                grid.
             number: the solid's, > 0.
             geometry: the solid.
         """
         near, before = nodes_near(nodes.grid, geometry), nodes.grid.origin
         if near is None:
             return
-        # A mesh takes microseconds a node, most of them for the sign: the distance at the middle of
-        # a group of nodes tells whether the others matter, and the sign of many.
+        # A mesh takes microseconds a node, most of them for the sign. The distance at the middle of
+        # a group of nodes shows whether the others matter, and gives the sign of many.
         stride = COARSE if isinstance(geometry, TriangleMesh) else 1
         for block, distances in self.measured(
             geometry, *near, stride=stride, offset=0.5 * (stride - 1), before=before
@@ -307,12 +312,15 @@ class NodeSampler:
         marks: wp.array,
         listed: bool = False,
     ) -> None:
-        """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
+        """Mark open gaps of one cell as HOLLOW.
+
+        These are the cells that lie in the open although all their corners have distance 0. Plates
+        of one cell have such corners as well, and get no mark.
 
         Args:
             nodes: the distances to all solids.
-            solids: returns all of them, if there is such a cell.
-            low: first node (x, y, z) from which on cells are considered.
+            solids: function that returns all solids; it is called if there is such a cell.
+            low: first node (x, y, z) of the cells considered.
             high: one past the last node.
             marks: int8, one a stored cell (updated).
             listed: whether `list_flat_cells` has listed the cells.
@@ -348,13 +356,13 @@ class NodeSampler:
                 )
 
     def inner(self, low: Sequence[int], high: Sequence[int]) -> NodeBox:
-        """Return a box of nodes without those that are the low corner of no cell inside the ring."""
+        """Shrink a box of nodes to low corners of cells inside the ring."""
         return [max(start, 1) for start in low], [
             min(stop, end - 1) for stop, end in zip(high, self.grid.shape[::-1], strict=True)
         ]
 
     def list_flat_cells(self, nodes: NodeDistances, window: Window) -> None:
-        """List the cells of a window in the open whose corners all have distance 0."""
+        """List the cells of a window whose corners all have distance 0."""
         clear(self._listed)
         window.launch(
             kernels.find_flat_cells, [self.grid.planes, nodes.near, self._list, self._listed]
@@ -369,7 +377,10 @@ class NodeSampler:
         *,
         unsigned: bool = False,
     ) -> wp.array:
-        """Return the distances [m] of `count` points that a kernel makes; only a mesh can be asked for those without sign."""
+        """Return the distances [m] of `count` points that a kernel makes.
+
+        `unsigned` is possible for meshes only.
+        """
         points, distances = self._points[:count], self._distances[:count]
         wp.launch(fill, count, [*inputs, points], device=self.grid.device)
         if unsigned and isinstance(geometry, TriangleMesh):
@@ -399,15 +410,17 @@ class NodeSampler:
         offset: float,
         before: tuple[int, int, int] | None = None,
     ) -> Iterator[tuple[Any, wp.array]]:
-        """Cut a box of nodes into blocks that fit, planes or else rows, and yield each with its distances [m].
+        """Yield blocks of a box of nodes that fit in memory, each with its distances [m].
+
+        Blocks are planes or else rows.
 
         Args:
             geometry: the solid.
             low: first node (x, y, z).
             high: one past the last.
             stride: nodes along each axis for which one distance stands.
-            offset: from the low one of them to where it is measured, in cells.
-            before: cells (x, y, z) of the whole grid before the first node's; None: those before
+            offset: offset of the measured point from the low node of its group, in cells.
+            before: cells (x, y, z) of the whole grid before the first node's; None for those before
                 the sampler's grid.
         """
         room = len(self._points) // stride**3
@@ -434,7 +447,7 @@ class NodeSampler:
 
 
 def _parts(geometry: Geometry) -> list[Any]:
-    """Return the shapes that a solid is the union of."""
+    """Return the shapes of which a solid is the union."""
     return (
         [shape for part in geometry.parts for shape in _parts(part)]
         if isinstance(geometry, Union)

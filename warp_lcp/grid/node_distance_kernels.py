@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Distances of solids at nodes, and the cells that only their centers tell about."""
+"""Kernels of solids' distances at nodes, and of flat cells.
+
+A flat cell has distance 0 at all corners; only its center shows whether it is open.
+"""
 
 import warp as wp
 
@@ -18,10 +21,10 @@ from warp_lcp.grid.solids_kernels import (
 )
 from warp_lcp.kernels.compiler import forward_kernel
 
-FAR = 4.0  # cells: distances below it are exact, others at least this large
-COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
-ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
-# a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
+FAR = 4.0  # cells: smaller distances are exact, others at least this large
+COARSE = 3  # nodes along an axis of a group that is bounded by one distance
+ROUNDING = 1.0e-3  # cells: distances below this have no reliable sign
+# Mark of cells with distance 0 at all corners whose center is open: gaps of one cell.
 HOLLOW = 1
 
 BOX, SPHERE, CAPSULE, PLANE = range(4)  # kinds of a PlacedShape
@@ -32,7 +35,10 @@ options = {"module": "warp_lcp.grid.node_distance"}
 
 @wp.struct
 class Nearest:
-    """The two nearest solids of each node, see `warp_lcp.grid.node_distance.NodeDistances`."""
+    """The two nearest solids of each node.
+
+    See `warp_lcp.grid.node_distance.NodeDistances`.
+    """
 
     near: F32
     owner: I16
@@ -42,7 +48,7 @@ class Nearest:
 
 @wp.struct
 class PlacedShape:
-    """A shape of a solid where it stands."""
+    """A shape of a solid at its current place."""
 
     frame: ShapeFrame
     kind: int  # BOX, SPHERE, CAPSULE or PLANE
@@ -55,7 +61,7 @@ class ShapeGroup:
     """The shapes of a solid, and the box of nodes around it."""
 
     number: int
-    first: int  # of its shapes
+    first: int  # first of its shapes
     end: int  # one past the last
     low: wp.vec3i  # first node (x, y, z)
     high: wp.vec3i  # one past the last
@@ -78,7 +84,10 @@ def shape_distance(p: wp.vec3, shape: PlacedShape) -> float:
 
 @wp.func
 def enter(node: wp.vec3i, d: float, solid: int, nodes: Nearest):
-    """Enter a solid's distance d [cells] at a node among the two nearest; of solids equally near the first stays."""
+    """Enter a solid's distance d [cells] among the two nearest of a node.
+
+    Of solids equally near the first one stays.
+    """
     k = node[2]
     j = node[1]
     i = node[0]
@@ -94,7 +103,10 @@ def enter(node: wp.vec3i, d: float, solid: int, nodes: Nearest):
 
 @wp.func
 def snapped(meters: float, spacing: float, snap: float):
-    """Return a distance in cells; within `snap` of 0 it is 0, so that walls on faces stay there."""
+    """Return a distance in cells, 0 within `snap` of 0.
+
+    Walls on faces so stay there.
+    """
     d = meters / spacing
     if wp.abs(d) < snap:
         d = 0.0
@@ -120,7 +132,7 @@ def enter_solids(
     snap: float,
     nodes: Nearest,
 ):
-    """Enter the distances of several solids, one after the other, at a row of nodes."""
+    """Enter the distances of several solids, in sequence, at a row of nodes."""
     for s in range(solids.shape[0]):
         solid = solids[s]
         if k >= solid.low[2] and k < solid.high[2] and j >= solid.low[1] and j < solid.high[1]:
@@ -143,9 +155,10 @@ def claim_groups(
     sure: Listed,
     listed: wp.array(dtype=wp.int32),
 ):
-    """Bound the distances of groups of nodes by that of their middles; list the nodes that may be nearer than FAR.
+    """Bound the distances of groups of nodes by the distance of their middles.
 
-    A node that is nearer to the middle than the surface is lies on the same side: its sign is sure.
+    Nodes that may be nearer than FAR are listed. A node that is nearer to the middle than the
+    surface is lies on the same side: its sign is sure.
     """
     c = wp.tid()
     low = first_node(block, c)
@@ -171,7 +184,7 @@ def claim_groups(
 
 @forward_kernel(**options)
 def listed_points(block: Block, list: Listed, out: Points):
-    """Fill the places [m] of listed nodes, or with the block's offset of the centers of listed cells."""
+    """Fill the places [m] of listed nodes, or cell centers by the block's offset."""
     c = wp.tid()
     out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), block.offset)
 
@@ -180,7 +193,10 @@ def listed_points(block: Block, list: Listed, out: Points):
 def claim_listed(
     block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: Nearest
 ):
-    """Enter the distances [m] of a solid at listed nodes; where the list has a sign, it is that of the distance."""
+    """Enter the distances [m] of a solid at listed nodes.
+
+    Where the list has a sign, the distance gets that sign.
+    """
     c = wp.tid()
     node = list[c]
     d = snapped(distance[c], block.spacing, snap)
@@ -191,7 +207,10 @@ def claim_listed(
 
 @cell_kernel("warp_lcp.grid.node_distance", ordered=True)
 def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.array(dtype=wp.int32)):
-    """List the cells with distance 0 at all corners: a gap or a plate, one cell wide; only their centers tell which."""
+    """List the cells with distance 0 at all corners.
+
+    Each is a gap or a plate, one cell wide; only its center shows which.
+    """
     if near[k, j, i] == 0.0:
         most = wp.abs(near[k, j, i + 1]) + wp.abs(near[k, j + 1, i]) + wp.abs(near[k, j + 1, i + 1])
         if planes == 2:
@@ -205,7 +224,7 @@ def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.arr
 
 @forward_kernel(**options)
 def mark_listed(list: Listed, distance: Distances, begin: bool, marks: I8):
-    """Mark the listed cells HOLLOW that no solid so far covers at their center."""
+    """Mark the listed cells HOLLOW whose center no solid so far covers."""
     c = wp.tid()
     i = list[c][0]
     j = list[c][1]

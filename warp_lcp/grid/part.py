@@ -1,7 +1,7 @@
-"""The part of a grid that a process works on, and what it finds out from the processes that work on the others.
+"""Part of the grid that a process works on, and its communication with the others.
 
-One process works on all of the grid; then nothing is exchanged, and a sum over all processes is the
-number itself. The part of a rank among several is `warp_lcp.distributed.subdomain.Subdomain`.
+A single process works on the whole grid. Then nothing is exchanged, and a sum over all processes is
+the number itself. The part of a rank among several is `warp_lcp.distributed.subdomain.Subdomain`.
 Methods named *collective* must be called by every rank, in the same order, also by one that has no
 material.
 """
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
 
 class OneProcess:
-    """The only process: what `warp_lcp.distributed.ranks.Ranks` finds out about all is what it knows."""
+    """Communicator of a single process: every reduction returns its argument.
+
+    `warp_lcp.distributed.ranks.Ranks` is the communicator of several ranks.
+    """
 
     size, rank, is_root = 1, 0, True
 
@@ -63,15 +66,15 @@ ONE_PROCESS = OneProcess()
 
 
 class ParticleExchange:
-    """What a process's particles have to do with those of the others: here there are none.
+    """Exchange of particles between processes: a single process exchanges none.
 
     `warp_lcp.distributed.particles.ParticleMigration` is that of a rank among several.
 
     Args:
-        particles: of this process.
+        particles: the particles of this process.
 
     Attributes:
-        room: of the storage over the particles that it is made for.
+        room: factor of the particle storage over the number of particles.
     """
 
     room = 1.0
@@ -81,27 +84,30 @@ class ParticleExchange:
 
     @property
     def counts(self) -> list[int]:
-        """Particles of each process, as the last totals have found them."""
+        """Particles of each process at the last totals."""
         return [self.particles.count]
 
     @property
     def expected(self) -> int:
-        """How many particles all processes must have, as the last totals have found it: nothing but `append` and removal changes it."""
+        """Number of particles that all processes must have.
+
+        The last totals have counted them; only `append` and removal change the number.
+        """
         return self.particles.count
 
     def move_to(self, part: GridPart) -> None:
         """Work on another part of the grid from now on."""
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what a checkpoint keeps besides the particles' arrays."""
+        """Return the arrays that a checkpoint needs besides the particles' own."""
         return {}
 
     def next_place(self) -> int:
-        """Return a place in the order of sums that is behind those of all particles; collective."""
+        """Return a place in the order of sums after those of all particles; collective."""
         return 0
 
     def assign(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:
-        """Take other particles, in the order of their places; collective.
+        """Replace the particles by others, in the order of their places; collective.
 
         Args:
             arrays: float32 of shape (n, 3) for every name of `Particles.arrays`.
@@ -116,19 +122,22 @@ class ParticleExchange:
         """Count the particles of all processes; collective."""
 
     def appended(self, count: int) -> None:
-        """Take notice of so many particles that have been added behind the others."""
+        """Register particles that have been appended."""
 
     def removing(self, marks: wp.array) -> None:
-        """Take notice of the particles that are about to be removed: those whose mark is not 0."""
+        """Register the particles that are about to be removed: those whose mark is not 0."""
 
     def begin_sort(self) -> None:
-        """Bring the particles into the order that a stable sort starts from."""
+        """Restore the order of particles from which a stable sort starts."""
 
     def end_sort(self) -> None:
-        """Take notice of the order of a sort."""
+        """Register the order that a sort has made."""
 
     def arrange(self, *, sort: bool) -> None:
-        """Hand on particles that have left this process's part, take in ghosts, and sort or number all by cell; collective."""
+        """Migrate particles, fetch ghosts and sort or number all by cell; collective.
+
+        Particles that have left this process's part migrate to the process that owns their cell.
+        """
         if sort:
             self.particles.sort()
         else:
@@ -138,10 +147,10 @@ class ParticleExchange:
         """Copy positions of other ranks' particles within a cell as ghosts; collective."""
 
     def drop_ghosts(self) -> None:
-        """Keep this process's own particles alone."""
+        """Remove the ghosts; this process's own particles stay."""
 
     def with_ghosts(self, step: int) -> AbstractContextManager[None]:
-        """Return a context in which ghosts are there, all particles in the order of sums; collective.
+        """Return a context with ghosts, all particles in the order of sums; collective.
 
         Args:
             step: the particles are arranged as in a step of this number.
@@ -149,19 +158,22 @@ class ParticleExchange:
         return nullcontext()
 
     def joined_totals(self, own: ParticleTotals) -> ParticleTotals:
-        """Return the sums over all processes' particles, given those over this one's; collective."""
+        """Return the sums over the particles of all processes; collective.
+
+        `own` are the sums of this process.
+        """
         return own
 
 
 @dataclass(frozen=True)
 class BodyNumbers:
-    """Bodies of material in flight, given the trees of cells that each process has found.
+    """Airborne bodies of material, numbered from the trees of cells on each process.
 
     Attributes:
-        count: of bodies that this process knows.
-        several: how many of them, the first ones, several processes have trees of.
-        of_tree: the body of each tree of this process, int32, -1: none, shape (trees,); None: each
-            tree is a body.
+        count: number of bodies in this process's numbering.
+        several: number of bodies with trees on several processes; they come first.
+        of_tree: the body of each tree of this process, int32, shape (trees,), -1 if it has none;
+            None if each tree is a body.
     """
 
     count: int
@@ -170,22 +182,22 @@ class BodyNumbers:
 
 
 class GridPart:
-    """The part of a grid that a process works on: here all of it.
+    """Part of the grid that a process works on: here the whole grid.
 
     Args:
         grid: the grid, whose fields have the cells of the part and a ring, or layers of ghost
             cells, around them.
 
     Attributes:
-        grid: as given.
-        ranks: the processes that work on the grid.
-        decomposition: their boxes of cells; None: there is one process.
-        layers: of ghost cells around the part, its ring included.
-        shared: whether there may be others.
-        joined: axes without an end that are cut, along which another process goes on beyond the
-            domain's sides.
-        cuts: has bit n set if beyond side n of the part, see `warp_lcp.grid.sides`, another process
-            goes on.
+        grid: the grid.
+        ranks: the communicator of the processes that work on the grid.
+        decomposition: boxes of cells of the processes; None if there is one process.
+        layers: layers of ghost cells around the part, its ring included.
+        shared: whether several processes may work on the grid.
+        joined: periodic axes that are cut; beyond the domain's sides the part of another process
+            follows.
+        cuts: bit n is set if the part of another process follows beyond side n, see
+            `warp_lcp.grid.sides`.
     """
 
     shared: ClassVar[bool] = False
@@ -200,111 +212,138 @@ class GridPart:
 
     @property
     def across(self) -> Communicator | None:
-        """The other processes, as reductions take them; None: there are none."""
+        """The communicator that reductions use; None if there is one process."""
         return None
 
     @property
     def at_once(self) -> bool:
-        """Whether launches cannot be recorded where processes exchange ghost cells in them."""
+        """Whether launches that exchange ghost cells cannot be recorded."""
         return False
 
     @property
     def owned(self) -> Window:
-        """The cells that this process is the one to know."""
+        """The cells that this process owns."""
         return self.grid.domain
 
     @property
     def stored(self) -> Window:
-        """Stored cells that this process is the one to know: the owned ones, and the ring beside them at the domain's sides."""
+        """The stored cells that this process owns, with the ring at the domain's sides."""
         return self.grid.everywhere
 
     @property
     def first(self) -> tuple[int, int, int]:
-        """The first of them along x, y, z, counted from 0 in the whole domain."""
+        """First owned cell along x, y, z, counted from 0 in the whole domain."""
         return self.grid.origin
 
     def keep_own(self, cells: np.ndarray) -> None:
-        """Set a mask of the part's cells, bool of shape (nz, ny, nx), to False where another process owns them."""
+        """Set a mask of the part's cells to False where another process owns them.
+
+        The mask is bool of shape (nz, ny, nx).
+        """
 
     def exchange_of(self, particles: Particles) -> ParticleExchange:
-        """Return what particles on this part have to do with those of other processes."""
+        """Return the exchange of particles of this part with other processes."""
         return ParticleExchange(particles)
 
     def nearest(self, cells: np.ndarray) -> np.ndarray:
-        """Return cells (x, y, z) of the part, shape (n, 3), along axes without an end those images that are nearest to it."""
+        """Return the nearest periodic images of cells (x, y, z), shape (n, 3).
+
+        Along periodic axes the image that is nearest to the part is chosen.
+        """
         return cells
 
     def near(self, window: Window, layers: int) -> Window | None:
-        """Return the cells of a window that this process owns or that are at most so many layers away; None: none."""
+        """Return the cells of a window within some layers of the owned cells.
+
+        Returns None if there are none.
+        """
         return window
 
     def join_trees(
         self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array
     ) -> BodyNumbers:
-        """Join the trees of cells that reach over several processes' parts to bodies; collective.
+        """Join trees of cells across processes to bodies; collective.
 
         Args:
-            trees: how many this process has found.
-            seen: the cells that it has looked at; None: none.
-            parent: of each cell in its tree, int32, flat.
-            number: of each root's tree, -1: none, int32, flat.
+            trees: number of trees on this process.
+            seen: the cells that it has searched; None if there are none.
+            parent: parent of each cell in its tree, int32, flat.
+            number: number of the tree of each root, -1 for other cells, int32, flat.
             held: not 0 at roots of trees that a wall touches, flat.
         """
         return BodyNumbers(trees)
 
     @property
     def corners(self) -> tuple[Corner, Corner] | None:
-        """The first cell (x, y, z) and the one behind the last that a frame of this process shows; None: of the whole domain."""
+        """First cell (x, y, z) and the one past the last in a frame of this process.
+
+        None if the frame has the whole domain.
+        """
         return None
 
     def where(self) -> dict[str, np.ndarray]:
-        """Return what of the domain the fields of a checkpoint are: `box`, int64 (2, 3), its first cell and the one behind the last.
+        """Return the box of the checkpoint's fields in the domain.
 
-        Nothing of a whole domain.
+        `box` is int64 of shape (2, 3): the first cell and the one past the last. A whole domain has
+        no entry.
         """
         low = np.array(self.grid.origin)
         return {} if self.grid.whole is None else {"box": np.array([low, low + self.grid.counts])}
 
     def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what a checkpoint of this process keeps of fields, and of numbers among them, which stay as they are."""
+        """Return the arrays that a checkpoint of this process stores.
+
+        Fields are cut to the part; numbers among them stay unchanged.
+        """
         return dict(fields)
 
     @property
     def gathered_from(self) -> Corner:
-        """The first cell (x, y, z) of what `gathered` returns."""
+        """First cell (x, y, z) of the field that `gathered` returns."""
         return self.grid.origin
 
     def gathered(self, values: np.ndarray) -> np.ndarray | None:
-        """Return the whole grid's field on the first process, None elsewhere, given this part's without its ring; collective."""
+        """Gather the whole grid's field on the first process; collective.
+
+        `values` is this part's field without its ring. Other processes get None.
+        """
         return values
 
     def refill(self) -> Callable[[wp.array, wp.array], None] | None:
-        """Return what fills ghost cells of marks and velocities again after each layer that they are continued by; None: nothing."""
+        """Function that fills ghost cells of marks and velocities; None if there are none.
+
+        It is called after each extrapolated layer.
+        """
         return None
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
-        """Return how many cells the fastest particles move in a time step if that is out of the ghost cells, else 0; collective."""
+        """Return the cells that particles move in a step, if too many; collective.
+
+        Returns 0 if all stay within the ghost cells.
+        """
         return 0.0
 
     def should_rebalance(self, step: int) -> bool:
-        """Return whether processes look for better parts in a step."""
+        """Return whether processes check for better parts in a step."""
         return False
 
     def rebalance(self, particles: Particles, a_cell: int) -> GridPart | None:
-        """Return the part of the grid that this process should have, see `should_rebalance`; None: the one it has. Collective.
+        """Return the part of the grid that this process should have; collective.
+
+        See `should_rebalance`. Returns None if the part stays the same.
 
         Args:
-            particles: of this process, whose totals have been found.
-            a_cell: particles of a full cell.
+            particles: particles of this process; their totals have been computed.
+            a_cell: particles in a full cell.
         """
         return None
 
     def notes(self) -> list[str]:
-        """Return what is worth a line at the start of a run."""
+        """Return notes for the start of a run."""
         return []
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
-        """Return the process that owns each cell (x, y, z) of the whole domain, shape (n, 3)."""
+        """Return the process that owns each cell (x, y, z) of the domain, shape (n, 3)."""
         return np.zeros(len(cells), dtype=np.int64)
 
     def fill(
@@ -314,42 +353,53 @@ class GridPart:
         parts: int = 1,
         forest: Any = None,
     ) -> None:
-        """Fill the ghost cells of fields with what other processes know (halo exchange); collective.
+        """Fill the ghost cells of fields from the processes that own them; collective.
+
+        This is the halo exchange.
 
         Args:
-            fields: any types, or stacks of equally many layers, the last axes z, y, x.
-            width: how far from the owned cells; None: all.
-            parts: the fields are of `grid.refined(parts)`.
-            forest: of `forest`, for such fields; None: all cells.
+            fields: arrays of any types, or stacks of equally many layers; the last axes are z, y,
+                x.
+            width: layers next to the owned cells; None for all.
+            parts: the fields are those of `grid.refined(parts)`.
+            forest: result of `forest`, for such fields; None for all cells.
         """
 
     def faces(self, window: Window) -> Window:
-        """Return the cells whose lower faces this process adds up, of a window around its material."""
+        """Return the cells of a window whose lower faces this process sums up.
+
+        The window is one around its material.
+        """
         return window
 
     def whole(self, window: Window) -> Window:
-        """Return the cells that all processes visit together, of a window around this one's material."""
+        """Return the cells that all processes visit together, from one process's window.
+
+        The window is one around its material.
+        """
         return window
 
     def coarser(self, layers: int) -> StaggeredGrid | None:
-        """Return the grid of cells of twice the edge on which the same processes work (coarse level); None if they cannot share it.
+        """Return the coarse grid, of twice the spacing, shared by the same processes.
+
+        Returns None if they cannot share it.
 
         Args:
-            layers: of ghost cells of its parts, the ring included.
+            layers: layers of ghost cells of its parts, the ring included.
         """
         return self.grid.coarser()
 
     @property
     def row_ranks(self) -> Any:
-        """The processes that have cells of the same rows along x, in their order; None if rows are not cut."""
+        """Processes that share rows along x, in order; None if rows are whole."""
         return None
 
     def known_of(self, field: np.ndarray) -> np.ndarray:
-        """Return the view of a host's field on what this process alone knows."""
+        """Return the view of a host field on the cells that only this process stores."""
         return field
 
     def box_of(self, field: Any) -> Any:
-        """Return the view of a field, host or device, or of layers of one, on the owned cells."""
+        """Return the view of a field, host or device, or of layers of one, on owned cells."""
         low, high = self.owned.low, self.owned.high
         return field[
             (slice(None),) * (field.ndim - 3)
@@ -357,7 +407,10 @@ class GridPart:
         ]
 
     def filling(self, *fields: wp.array | np.ndarray, forest: Any) -> Task:
-        """Return `fill` of the cells of a `forest`, to run now or within a recorded program."""
+        """Return the exchange of a `forest`'s cells as a task.
+
+        It runs at once or within a launch graph.
+        """
         return Task(partial(self.fill, *fields, forest=forest))
 
     def forest(
@@ -368,24 +421,27 @@ class GridPart:
         which: np.ndarray | None = None,
         into: Any = None,
     ) -> Any:
-        """Return what `fill` exchanges of some cells alone; collective.
+        """Return an exchange restricted to some cells, for `fill`; collective.
 
         Args:
-            layers: of a field.
-            width: how far from the owned cells; None: all.
-            which: of a field's cells, bool; None: all.
-            into: a forest that this one replaces, in recorded exchanges too; None: there is none.
+            layers: number of layers of a field.
+            width: layers of ghost cells next to the owned cells; None for all.
+            which: bool mask of a field's cells; None for all.
+            into: a forest that this one replaces, in recorded exchanges too; None if there is none.
         """
 
     def box_like(self, field: wp.array) -> wp.array:
-        """Return the field that a problem on the owned cells has in place of a field: itself if it has no ghost cells."""
+        """Return the array that stands for a field in a problem on the owned cells.
+
+        It is the field itself if that has no ghost cells.
+        """
         return field
 
     def copy_to_box(self, field: wp.array, box: wp.array) -> None:
-        """Give a field of `box_like` what a field holds, if it does not share its memory."""
+        """Copy a field to the array of `box_like`, unless they share their memory."""
 
     def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
-        """Write the solution of a problem on the owned cells to a field, and what others have found to its ghost cells; collective.
+        """Write the solution on the owned cells to a field, with ghost cells; collective.
 
         Args:
             x: float32 or float64, with as many elements as `box_like(field)`.
@@ -395,7 +451,10 @@ class GridPart:
         convert(x.flatten(), field.flatten())
 
     def poisson(self, cells: np.ndarray, **coefficients: Any) -> GridPoisson:
-        """Return the operator of all processes' problem on the owned cells; coefficients are fields of `box_like`, see `GridPoisson`."""
+        """Return the operator of all processes' problem on the owned cells.
+
+        Coefficients are fields of `box_like`, see `GridPoisson`.
+        """
         return GridPoisson(
             cells, device=self.grid.device, decomposition=self.decomposition, **coefficients
         )

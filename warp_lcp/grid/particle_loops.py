@@ -1,9 +1,9 @@
-"""Passes over particles: how these are shared out, and what they are told of the grid.
+"""Passes over particles: division into tasks, and arguments about the grid.
 
-Written plainly, one thread a particle, the transfers take 71 and 74 ns a particle in 3-D and the
-advection 129 (one core, 8 particles a cell, sorted); as native loops over a grain of particles they
-take 25, 12 and 34. clang vectorizes a loop whose arrays it is told not to alias, gathers from the
-fields included.
+Written plainly, with one thread a particle, the transfers take 71 and 74 ns a particle in 3-D and
+the advection 129 (one core, 8 particles a cell, sorted). As native loops over a grain of particles
+they take 25, 12 and 34. clang vectorizes a loop over arrays that are declared not to alias, gathers
+from the fields included.
 """
 
 import ctypes
@@ -24,28 +24,29 @@ if TYPE_CHECKING:
 
     from warp_lcp.grid.staggered import StaggeredGrid
 
-# particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+# Particles per task of a CPU thread. The launch then costs nothing, and the arrays stay in the L2
+# cache.
 CPU_GRAIN = 4096
-# that a thread's planes are cut into where particles add to them: chunks that touch two shares are
-# read twice
+# Tasks per thread where particles add to planes of a field. Chunks that touch two tasks' planes are
+# read twice.
 SHARES = 2
-LEAST_PLANES = 4  # of a share
-PARTICLE = 16  # cells of a usual pass that a particle of one costs
-LIST_ROOM = 1.25  # of the threads of a captured launch over a list's entries
-# how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3
-# cells
+LEAST_PLANES = 4  # least planes of a task
+PARTICLE = 16  # work of a particle in a pass, in cells of a usual pass
+LIST_ROOM = 1.25  # factor on the threads of a captured launch over a list's entries
+# Distance that particles keep from walls, in cells: well above the rounding of float32 positions in
+# 10^3 cells.
 MARGIN = 1e-3
 KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 
 
 class ListMemory:
-    """A list that changes between the runs of recorded launches: its length, and where its arrays lie.
+    """List whose length and arrays change between the runs of recorded launches.
 
     Attributes:
-        count: its entries.
-        rows: of passes over them.
+        count: number of entries.
+        rows: division into rows of passes over them.
         entries: address of the number of entries, for kernels with a task an entry.
-        touched: memory of `touched_planes`.
+        touched: result array of `touched_planes`.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -58,7 +59,10 @@ class ListMemory:
         self.slot("touched of").point_to(self.touched)
 
     def take(self, count: int, arrays: Mapping[str, wp.array[Any]]) -> None:
-        """Take the list over: its length, and its arrays by name, which launches name by the same objects."""
+        """Use a list of this length and these arrays.
+
+        Recorded launches refer to the arrays by name.
+        """
         for name, array in arrays.items():
             self.slot(name).point_to(array)
             array.listed = self
@@ -72,7 +76,7 @@ class ListMemory:
         return found
 
     def resize(self, count: int) -> None:
-        """Have so many entries from now on."""
+        """Set the number of entries."""
         if count == self.count.value:
             return
         self.count.value = self._entries.value = count
@@ -97,7 +101,10 @@ TOUCHED: dict[Any, StencilKernel] = {
 
 
 def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[wp.int32] | None:
-    """Return the planes (rows in 2-D) of a field that the particles of each chunk may add to; None where one thread adds up all."""
+    """Return the planes of a field that the particles of each chunk may add to.
+
+    They are rows in 2-D. Returns None where one thread adds up all.
+    """
     if grid.device.is_cuda or get_threads() == 1:
         return None
     listed = getattr(position, "listed", None) if is_recording() else None
@@ -119,15 +126,18 @@ def scatter(
     runs: wp.array[wp.int32] | None = None,
     **given: Any,
 ) -> None:
-    """Launch a pass in which particles add to a field: on the CPU each task has planes of its own (rows in 2-D).
+    """Launch a pass in which particles add to a field.
+
+    On the CPU each task owns planes (rows in 2-D) of the field, so no two threads write to the
+    same.
 
     Args:
         passed: a kernel with `each_share` of `particles.h`.
-        grid: of the particles.
-        position: theirs.
-        touched: what `touched_planes` returns for them.
-        runs: of `Particles`.
-        structs: what else the pass takes, see `StencilKernel.bind`.
+        grid: grid of the particles.
+        position: positions of the particles.
+        touched: result of `touched_planes` for them.
+        runs: `runs` of `Particles`.
+        structs: further arguments of the pass, see `StencilKernel.bind`.
         given: likewise.
     """
     count, shares = len(position), 1
@@ -155,7 +165,7 @@ def scatter(
 
 @dataclass(frozen=True, slots=True)
 class GridPlacement:
-    """Spacing of a grid and its place in a larger one, as kernels over particles take them.
+    """Spacing of a grid and its place in a larger one, for particle kernels.
 
     Attributes:
         planes: nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D.
@@ -175,7 +185,7 @@ class GridPlacement:
 
 
 def chunks(count: int, device: wp.Device) -> Rows:
-    """Return how a list's entries are shared out."""
+    """Return the division of a list's entries into tasks."""
     return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN, weight=PARTICLE)
 
 
@@ -186,10 +196,10 @@ def launch(
     *structs: "DataclassInstance",
     **given: Any,
 ) -> None:
-    """Launch a pass, bound as by `StencilKernel.bind` with the grid's placement, over the first particles of a list.
+    """Launch a pass over the first particles of a list.
 
-    A launch that is recorded takes as many as the list has when it runs, if one of its arrays is of
-    a `ListMemory`.
+    Arguments are bound by `StencilKernel.bind`, with the grid's placement. A recorded launch visits
+    as many particles as the list has when it runs, if one of its arrays belongs to a `ListMemory`.
     """
     rows, listed = chunks(count, grid.device), None
     if is_recording():

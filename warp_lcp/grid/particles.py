@@ -21,20 +21,20 @@ from warp_lcp.kernels.memory import RowsMemory, Scalar, Slot, rows_memory
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.vectors import Tally
 
-CHUNK = 256  # the fewest particles that one thread adds up
-THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
-CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
-# of the storage when it is full: n appended particles are copied 2 n times at most, a third of it
-# lies idle at most
+CHUNK = 256  # fewest particles that one thread sums up
+THREADS = 1024  # most threads of a sum; the host adds their partial results
+CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # likewise on a GPU
+# Growth of the storage when it is full: n appended particles are copied at most 2 n times, and at
+# most a third of the storage is unused.
 GROWTH = 1.5
-# of the keys that are sorted: with more there is more to add up between two passes
+# Pieces of the keys in a sort. With more, the sums between two passes take longer.
 SORT_PIECES = 32
 # Places of particles in the order of all ranks' particles, see `warp_lcp.distributed.particles`.
-MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
-NEW = 1 << 62  # places from which on particles have come since the last sort
+MOST_A_CELL = 1 << 20  # particles; all places of a cell are numbers below those of the next cell
+NEW = 1 << 62  # first place of particles that were added since the last sort
 SORTED, UNSORTED = 0, 1  # steps in which `arrange` sorts, and in which it need not
-# steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL
-# 2, a sort costs 25 ns
+# Steps between sorts if nothing needs the order. At CFL 2 the transfers get no slower within 16
+# steps; a sort costs 25 ns a particle.
 SORT_EVERY = 8
 
 
@@ -94,8 +94,8 @@ class Column:
     Attributes:
         store: wp.vec3, shape (capacity,).
         count: vectors in use.
-        slot: where recorded launches find them; None: not yet known.
-        listed: their number, for recorded launches.
+        slot: address for recorded launches; None until it is known.
+        listed: number of vectors, for recorded launches.
     """
 
     slot: Slot | None = None
@@ -121,22 +121,22 @@ class Column:
         return self._view
 
     def use(self, count: int) -> None:
-        """Have so many vectors in use."""
+        """Set the number of vectors in use."""
         if count != self.count:
             self.count, self._view = count, None
 
     def publish(self, memory: ListMemory, name: str) -> None:
-        """Have recorded launches find the vectors in use by a name."""
+        """Publish the vectors in use to recorded launches, by a name."""
         self.slot, self.listed = memory.slot(name), memory
         self.slot.point_to_first(self.count, self.store)
         if self._view is not None:
             self._view.slot, self._view.listed = self.slot, memory
 
     def set_from(self, first: int, values: np.ndarray | float) -> None:
-        """Set the vectors in use from a number on.
+        """Set the vectors in use from an index on.
 
         Args:
-            first: that number.
+            first: the index.
             values: shape (count - first, 3), or one number for all.
         """
         if self._host is not None:
@@ -155,9 +155,9 @@ class Particles:
         position: [m], shape (n, 3); z = 0 in 2-D.
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
-        kept: a number of each particle that it takes along, shape (n,); None: they have none.
-        indexed: sort every step and know where each cell's particles begin, for transfers that
-            gather; those that need it on CUDA are the default there.
+        kept: a number that each particle carries, shape (n,); None if they carry none.
+        indexed: sort in every step and store the first particle of each cell, for transfers that
+            gather. Default on CUDA, if the transfers need it there.
 
     Attributes:
         count: particles.
@@ -165,9 +165,9 @@ class Particles:
             capacity,), the first `count` in use.
         offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort;
             None unless `indexed`.
-        runs: begin and end of each run of particles that lie in the order in which sums take them,
-            int32, shape (2 runs,); None: all do.
-        exchange: knows the particles of other processes, see `warp_lcp.grid.part.ParticleExchange`.
+        runs: begin and end of each run of particles in the order of summation, int32, shape (2
+            runs,); None if all particles are in this order.
+        exchange: exchange with other processes, see `warp_lcp.grid.part.ParticleExchange`.
 
     Raises:
         ValueError: the shapes do not match.
@@ -175,7 +175,7 @@ class Particles:
 
     runs: wp.array | None = None
     _order: wp.array  # scratch memory, as large as `key`
-    _spare: Column  # where the next reordered column goes
+    _spare: Column  # memory of the next reordered column
 
     def __init__(
         self,
@@ -206,7 +206,7 @@ class Particles:
         )
         self._removal = LaunchGraph(device, self._launch_removal)
         self._removed = DeviceScalar(device, 2, wp.int32)
-        # of the memory and the count that they are for
+        # Arrays and number of particles for which the launches were recorded.
         self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None
         self._stays: wp.array | None = None  # beside them
         self._total_rows = rows_memory(device, LIST_ROOM)
@@ -218,8 +218,8 @@ class Particles:
             self._sort_rows, self._sort_pieces = RowsMemory(), Scalar()
             self._counts = wp.zeros(0, dtype=wp.int32, device=device)
         self._last: ParticleTotals | None = None
-        self._totals_launched = False  # of the particles as they are, on a GPU
-        self._known: ParticleTotals | None = None  # that are right
+        self._totals_launched = False  # whether a GPU has the sums of the current particles
+        self._known: ParticleTotals | None = None  # current sums
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
         self.exchange = grid.part.exchange_of(self)
@@ -278,8 +278,8 @@ class Particles:
         Args:
             position: [m], shape (n, 3).
             velocity: [m/s], shape (n, 3).
-            kept: the number that each takes along, or one for all; for particles that have one, 1
-                unless given.
+            kept: the number that each carries, or one for all. Default: 1, for particles that carry
+                one.
 
         Raises:
             ValueError: the shapes do not match.
@@ -344,7 +344,10 @@ class Particles:
         self._removal.run(marks, self._stays if mine else self._order[: self.count])
 
     def _launch_removal(self, marks: wp.array, stay: wp.array) -> None:
-        """Launch the removal; on a GPU only the count of those that go and, in `stay`, 1 for those that stay."""
+        """Launch the removal.
+
+        On a GPU only count the removed particles, and write to `stay` 1 for those that stay.
+        """
         device = self.grid.device
         if device.is_cuda:
             clear(self._removed.array)
@@ -426,12 +429,12 @@ class Particles:
             view.assign(arrays[name])
 
     def set_runs(self, runs: wp.array) -> None:
-        """Have sums take the particles in the order of `runs`."""
+        """Let sums take the particles in the order of `runs`."""
         self.runs = runs
         self._memory.take(self.count, {"runs": runs})
 
     def resize(self, count: int) -> None:
-        """Have this many particles; those beyond the particles there were hold anything."""
+        """Set the number of particles; new ones have undefined values."""
         before, self.count, self._known, self._totals_launched = self.count, count, None, False
         if count > self._capacity:
             self._grow(before)
@@ -440,7 +443,7 @@ class Particles:
         self._publish()
 
     def _publish(self) -> None:
-        """Tell recorded launches how many particles there are, and where."""
+        """Publish the number and the arrays of the particles to recorded launches."""
         count, memory = self.count, self._memory
         if count != memory.count.value and self._tally is not None:
             self._total_rows.take(self._rows_of_totals().summed)
@@ -455,7 +458,7 @@ class Particles:
         memory.take(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
-        """Make room for `count` particles and more, and keep those there were `before`."""
+        """Enlarge the storage to at least `count` particles; keep the first `before`."""
         device = self.grid.device
         self._capacity = max(int(self.exchange.room * self.count), int(GROWTH * self._capacity), 1)
         for name in self._names:
@@ -466,7 +469,7 @@ class Particles:
         self._spare = Column(self._capacity, self.count, device)
         self.key = zeros(2 * self._capacity, wp.int32, device)
         self._order = zeros(2 * self._capacity, wp.int32, device)
-        self._sorting.forget()  # which knows the halves of both
+        self._sorting.forget()  # its recorded launches use both halves
 
     def arrange(self, step: int) -> None:
         """Number the particles by cell, with ghosts on ranks; collective.
@@ -540,7 +543,9 @@ class Particles:
             )
 
     def _keys_to_sort(self) -> int:
-        """Return how many keys a GPU sorts: at most a quarter more than particles.
+        """Return the number of keys that a GPU sorts.
+
+        It is at most a quarter more than the number of particles.
 
         So one graph serves many numbers of particles.
         """
@@ -548,11 +553,13 @@ class Particles:
         return min(-(-self.count // step) * step, self._capacity)
 
     def _launch_sort(self, keys: int = 0) -> None:
-        """Launch the numbering, the sort of the numbers, and the move of each column to where the one before it was.
+        """Launch the sort: number the particles, sort the numbers, reorder each column.
+
+        Each column moves to the memory of the column before it.
 
         Args:
-            keys: how many a GPU sorts: those behind the particles' have the largest number, and
-                stay behind them.
+            keys: number of keys that a GPU sorts; those after the particles' have the largest
+                number, and stay at the end.
         """
         device, size, count = self.grid.device, self.grid.size, self._memory.count
         bits = size.bit_length()
@@ -618,13 +625,13 @@ class Particles:
         return found
 
     def _rows_of_totals(self) -> Rows:
-        """Return how the particles are shared out for sums over them."""
+        """Return the division of the particles into rows for sums."""
         return Rows.entries(
             self.count, self.grid.device, _chunk_of_totals(self.count, self.grid.device)
         )
 
     def _launch_totals(self) -> None:
-        """Launch the sums over the particles, and those of the threads' sums."""
+        """Launch the sums over the particles, and over the threads' partial sums."""
         rows = replace(self._rows_of_totals(), memory=self._total_rows)
         if self._tally is not None:
             self._tally.take(
@@ -648,7 +655,7 @@ class Particles:
         ).launch()
 
     def launch_totals(self) -> None:
-        """Launch the next `totals` on a GPU, so that others are read with it.
+        """Launch the next `totals` on a GPU, so that they share a readback with others.
 
         They are launched again if particles come or go before.
         """
@@ -695,7 +702,7 @@ class Particles:
 
 
 def _chunk_of_totals(count: int, device: wp.Device) -> int:
-    """Return how many particles a thread adds up."""
+    """Return the number of particles that a thread sums up."""
     return max(
         CUDA_CHUNK if device.is_cuda else CHUNK,
         -(-count // (CUDA_THREADS if device.is_cuda else THREADS)),
@@ -703,12 +710,12 @@ def _chunk_of_totals(count: int, device: wp.Device) -> int:
 
 
 def _piece_of_sort(count: int) -> int:
-    """Return how many keys are a piece of those that are sorted."""
+    """Return the number of keys in one piece of a sort."""
     return max(CPU_GRAIN, -(-count // SORT_PIECES))
 
 
 def _rows_of_sort(count: int, device: wp.Device) -> Rows:
-    """Return the pieces in which keys are sorted."""
+    """Return the rows of a sort: one piece of keys a task."""
     return Rows.entries(count, device, _piece_of_sort(count), weight=4)
 
 
@@ -718,9 +725,9 @@ def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
 
 
 def digits_of(bits: int) -> tuple[int, int]:
-    """Return the rounds of the sort of keys of some bits, and the bits of a round."""
-    # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1
-    # cache
+    """Return the number of rounds of a radix sort, and the bits of a round."""
+    # An even number of rounds, so that the last one ends in the keys' own array. 2048 digits of a
+    # round stay in the L1 cache.
     rounds = 2 * -(-bits // 22)
     return rounds, -(-bits // rounds)
 
@@ -739,9 +746,9 @@ def sort_keys(
         keys: int32, not negative, and scratch memory of the same size.
         order: int32, which receives where each key was, and scratch memory.
         counts: int32, scratch memory for `pieces` of a round's digits and `APART` more.
-        rows: of the keys, a piece a task.
+        rows: rows of the keys, a piece a task.
         pieces: how many there are.
-        bits: that keys have at most.
+        bits: largest number of bits of a key.
     """
     device = counts.device
     rounds, each = digits_of(bits)
@@ -784,8 +791,8 @@ def lattice(
             it.
         per_axis: points along an edge of a cell.
         jitter: width of the uniform random displacement, as a fraction of the points' spacing.
-        random_seed: of the displacements, which are one sequence over all of the grid.
-        plane: which cells along z, counted from 0; 0 in 2-D.
+        random_seed: seed of the displacements, which are one sequence over all of the grid.
+        plane: index of the cells along z, from 0; 0 in 2-D.
 
     Returns:
         Points [m], shape (n, 3), z = 0 in 2-D.
@@ -803,7 +810,7 @@ def lattice(
     moved = np.empty((len(z), len(y), len(x), dimension))
     for number, layer in enumerate(z):
         drawn = np.random.PCG64(random_seed)
-        # what the points before have drawn
+        # Skip the random numbers of the points before.
         drawn.advance(int((layer * whole[1] + low[1]) * whole[0]) * dimension)
         rows = np.random.Generator(drawn).random((len(y), whole[0], dimension))
         moved[number] = rows[:, low[0] : high[0]]
@@ -836,7 +843,7 @@ def seed(
         per_axis: points along an edge of a cell, >= 1.
         jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter
             <= 1.
-        random_seed: of the displacements; they do not depend on the regions.
+        random_seed: seed of the displacements; they do not depend on the regions.
 
     Returns:
         Positions [m], float32, shape (n, 3), and the region of each, shape (n,).

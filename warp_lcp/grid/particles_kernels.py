@@ -26,7 +26,7 @@ SORT_PLACE = KERNELS.kernel("warp_lcp.grid.particles.sort_place", constants=_SOR
 def count_up_kernel(
     order: wp.array(dtype=wp.int32), key: wp.array(dtype=wp.int32), count: int, last: int
 ):
-    """Write 0, 1, 2, ..., and a key beyond all others behind those of the particles."""
+    """Write 0, 1, 2, ... and, after the particles' keys, a key larger than all others."""
     p = wp.tid()
     order[p] = p
     if p >= count:
@@ -35,7 +35,10 @@ def count_up_kernel(
 
 @forward_kernel(module="warp_lcp.grid.particles")
 def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(dtype=wp.int32)):
-    """Find the first particle of each cell, or of the next one that has any, among sorted keys."""
+    """Find the first particle of each cell, or of the next nonempty one.
+
+    The keys are sorted.
+    """
     cell = wp.tid()
     if cell > key[count - 1]:  # lower_bound would return the last particle
         offsets[cell] = count
@@ -50,7 +53,7 @@ def reorder_kernel(
     source: wp.array(dtype=wp.vec3),
     target: wp.array(dtype=wp.vec3),
 ):
-    """Take the particles in a new order."""
+    """Copy the particles in a new order."""
     target[i] = source[order[i]]
 
 
@@ -61,7 +64,10 @@ def stays_kernel(
     stays: wp.array(dtype=wp.int32),
     removed: wp.array(dtype=wp.int32),
 ):
-    """Write 1 for a particle without a mark, 0 for others; count those with the mark 1, and those with another."""
+    """Write 1 for each particle without a mark, else 0, and count removed particles.
+
+    Those with the mark 1 are counted apart from those with another mark.
+    """
     mark = marks[i]
     stays[i] = wp.where(mark == 0, 1, 0)
     if mark != 0:
@@ -75,7 +81,10 @@ def close_ranks_kernel(
     source: wp.array(dtype=wp.vec3),
     target: wp.array(dtype=wp.vec3),
 ):
-    """Move particles without a mark to where `stay`, the number of those up to and with each, says."""
+    """Move particles without a mark to their places after a removal.
+
+    `stay` is the inclusive prefix sum of the particles that stay.
+    """
     p = wp.tid()
     if marks[p] == 0:
         target[stay[p] - 1] = source[p]

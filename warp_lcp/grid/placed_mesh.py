@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Distances of a triangle mesh at nodes, without the host, and gaps of one cell between solids: on a GPU."""
+"""Distances of a moving triangle mesh at nodes, and gaps of one cell, on a GPU.
+
+The launches need no readback, so they can be recorded.
+"""
 
 import math
 from collections.abc import Sequence
@@ -64,7 +67,11 @@ def enter_mesh(
     solid: int,
     nodes: Nearest,
 ):
-    """Enter a mesh's distance at a node; that of the middle of its group bounds it, and may tell its sign, as in `claim_groups`."""
+    """Enter a mesh's distance at a node.
+
+    The distance at the middle of the node's group bounds it and may decide its sign, as in
+    `claim_groups`.
+    """
     block = blocks[0]
     node = wp.vec3i(i, j, k)
     a = (i - block.low[0]) // block.stride
@@ -114,7 +121,7 @@ def mark_flat_cells(
     begin: bool,
     marks: I8,
 ):
-    """Mark the flat cells HOLLOW that no solid so far covers at their center, see `mark_listed`."""
+    """Mark flat cells HOLLOW whose center no solid so far covers, see `mark_listed`."""
     if is_flat(k, j, i, planes, near):
         p = node_position(block, wp.vec3i(i, j, k), 0.5)
         if begin:
@@ -137,7 +144,7 @@ def mark_flat_cells_of_mesh(
     begin: bool,
     marks: I8,
 ):
-    """The same of a mesh."""
+    """Mark flat cells HOLLOW whose center a mesh and solids so far do not cover."""
     if is_flat(k, j, i, planes, near):
         if begin:
             marks[k, j, i] = _HOLLOW
@@ -146,13 +153,15 @@ def mark_flat_cells_of_mesh(
 
 
 class PlacedMesh:
-    """A mesh that moves, entered by launches that can be recorded; its form is that of `ShapeTable`.
+    """Moving mesh whose distances are entered by recordable launches.
+
+    It has the interface of `ShapeTable`.
 
     Args:
         grid: the grid.
         number: the solid's.
         geometry: the mesh as the scene places it.
-        places: of it among the solids that move.
+        places: index of the mesh among the solids that move.
     """
 
     def __init__(
@@ -203,13 +212,15 @@ class PlacedMesh:
     def mark(
         self, window: Window, near: wp.array, block: Any, marks: wp.array, *, begin: bool
     ) -> None:
-        """Unmark flat cells that it covers, see `FlatCells`."""
+        """Unmark flat cells that the mesh covers, see `FlatCells`."""
         inputs = [self.grid.planes, near, block, self._frame.array, self._mesh, begin, marks]
         window.launch(mark_flat_cells_of_mesh, inputs)
 
 
 class FlatCells:
-    """Gaps of one cell between solids, marked without the host, as `NodeSampler.look_at_centers` does.
+    """Mark gaps of one cell between solids without the host.
+
+    The marks are those of `NodeSampler.look_at_centers`.
 
     Args:
         grid: the grid.
@@ -221,7 +232,7 @@ class FlatCells:
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
 
     def mark(self, nodes: NodeDistances, window: Window, marks: wp.array) -> None:
-        """Mark as HOLLOW the cells of a window in the open whose corners all have distance 0.
+        """Mark open cells of a window HOLLOW whose corners all have distance 0.
 
         Args:
             nodes: the distances to all solids.
@@ -246,7 +257,7 @@ class FlatCells:
 def tables_of(
     grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]
 ) -> list[ShapeTable | PlacedMesh] | None:
-    """Return tables of solids that stand still, each at its place; None if there is one that none holds."""
+    """Return tables of standing solids, in order; None if one fits in no table."""
     made: list[ShapeTable | PlacedMesh] = []
     for number, geometry in solids:
         if ShapeTable.holds(geometry):

@@ -1,4 +1,7 @@
-"""Distances to solids that several processes measure together, each its share of the nodes."""
+"""Distances to solids, measured by several processes together.
+
+Each process measures its share of the nodes.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,19 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.solids_kernels import block_of
 from warp_lcp.grid.staggered import StaggeredGrid
 
-# nodes of the domain, and the distances [cells] there, shape (nz, ny, nx)
+# Nodes of the domain, and the distances [cells] there, shape (nz, ny, nx).
 Layer = tuple[CellBox, np.ndarray]
 
 
 def measure_together(
     sampler: NodeSampler, geometries: Mapping[int, Geometry]
 ) -> dict[int, list[Layer]]:
-    """Measure solids, each process a layer of equally many nodes of each solid; collective.
+    """Measure solids, each process one layer of the nodes of each solid; collective.
+
+    The layers of a solid have equally many nodes.
 
     Args:
-        sampler: of this process's part of the grid.
+        sampler: sampler of this process's part of the grid.
         geometries: the solids where they are, the same on all processes.
 
     Returns:
@@ -60,7 +65,10 @@ def measure_together(
 
 
 def layer_of(box: tuple[np.ndarray, np.ndarray], rank: int, ranks: int) -> CellBox:
-    """Return the layer of a box of nodes that a rank measures: across its longest axis, the first one the thickest."""
+    """Return the layer of a box of nodes that a rank measures.
+
+    The box is cut across its longest axis; the first layer is the thickest.
+    """
     low, high = (corner.copy() for corner in box)
     axis = int(np.argmax(high - low))
     thick, end = -(-int(high[axis] - low[axis]) // ranks), high[axis]
@@ -70,7 +78,7 @@ def layer_of(box: tuple[np.ndarray, np.ndarray], rank: int, ranks: int) -> CellB
 
 
 def _measure(sampler: NodeSampler, geometry: Geometry, layer: CellBox) -> np.ndarray:
-    """Return the distances of a solid at a layer of the domain's nodes [cells], flat."""
+    """Return the distances [cells] of a solid at a layer of the domain's nodes, flat."""
     if not layer.cells:
         return np.empty(0, dtype=np.float32)
     grid = sampler.grid
@@ -85,12 +93,12 @@ def _measure(sampler: NodeSampler, geometry: Geometry, layer: CellBox) -> np.nda
 
 
 def enter_layers(nodes: NodeDistances, number: int, layers: list[Layer]) -> None:
-    """Enter a solid's measured distances where this process's part of the grid has the nodes.
+    """Enter a solid's measured distances at the nodes of this process's part.
 
     Args:
-        nodes: where to (updated).
+        nodes: the node distances (updated).
         number: the solid's, > 0.
-        layers: of `measure_together`.
+        layers: layers of `measure_together`.
     """
     grid = nodes.grid
     stored = CellBox((0, 0, 0), grid.shape[::-1]).moved(grid.origin)

@@ -1,7 +1,8 @@
-"""Sides of the domain without a wall.
+"""Sides of the domain without a wall: open and periodic sides.
 
-Beyond an open side lies open air, and what crosses it has left. An axis without an end is periodic:
-what leaves at one side comes in at the other, and each field's ring holds what lies there.
+Beyond an open side is open air, and material that crosses the side has left. Along a periodic axis
+material that leaves at one side enters at the other, and each field's ring holds the values from
+the other side.
 """
 
 import functools
@@ -18,9 +19,9 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Launch, launch
 
-# at low x, high x, low y, high y, low z, high z; bit n is side n
+# At low x, high x, low y, high y, low z, high z; bit n is side n.
 SIDES = ("left", "right", "bottom", "top", "back", "front")
-# cells from an open side at which a particle has left: nearer than particles keep from walls
+# Cells from an open side within which a particle has left: less than particles keep from walls.
 GONE = 0.75 * MARGIN
 
 
@@ -39,7 +40,10 @@ def side_bits(names: Iterable[str]) -> int:
 
 
 def open_sides_of(grid: StaggeredGrid, bits: int) -> int:
-    """Return the sides of a grid that nothing closes: open ones of the domain, and those at which a part of it ends inside."""
+    """Return the open sides of a grid: open sides of the domain and sides of a part.
+
+    Sides of a part that end inside the domain count as open.
+    """
     for axis in range(grid.dimension):
         low, count = grid.origin[axis], grid.counts[axis]
         for number, inside in (
@@ -51,11 +55,13 @@ def open_sides_of(grid: StaggeredGrid, bits: int) -> int:
 
 
 def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
-    """Return which cells of the ring lie beyond open sides only, bool in the stored shape; a corner beyond a wall as well does not.
+    """Return a mask of the cells of the ring that lie beyond open sides only.
+
+    The result is bool in the stored shape. A corner cell that is beyond a wall as well is not open.
 
     Args:
         shape: (nz + 2, ny + 2, nx + 2).
-        bits: of `side_bits`.
+        bits: bits of `side_bits`.
     """
     outside, closed = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for number in range(len(SIDES)):
@@ -87,7 +93,10 @@ def continue_kernel(k, j, i, bits: int, nx: int, ny: int, nz: int, field: F32):
 
 
 def continue_beyond(grid: StaggeredGrid, bits: int, field: wp.array) -> None:
-    """Copy a float32 field from the cells beside open sides to those beyond; nothing happens without an open side."""
+    """Copy a float32 field from the cells beside open sides to those beyond.
+
+    Nothing happens without an open side.
+    """
     if bits:
         grid.everywhere.launch(continue_kernel, [bits, *grid.counts, field])
 
@@ -103,7 +112,7 @@ def gone_kernel(
     position: wp.array(dtype=wp.vec3),
     marks: wp.array(dtype=wp.int32),
 ):
-    """Mark particles that have reached an open side, of all others 0."""
+    """Mark particles that have reached an open side; other marks are 0."""
     gone = int(0)
     for axis in range(axes):
         x = position[i][axis]
@@ -117,11 +126,11 @@ def gone_kernel(
 
 
 def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.array) -> None:
-    """Launch the marking of the particles that have reached an open side, or record it.
+    """Launch or record the marking of particles that have reached an open side.
 
     Args:
         grid: the grid.
-        bits: of `side_bits`.
+        bits: bits of `side_bits`.
         position: [m], shape (n,).
         marks: int32, shape (n,) (written): 1 for those that have left, else 0.
     """
@@ -130,13 +139,13 @@ def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.arra
     launch_list(gone_kernel, len(position), inputs, device=grid.device)
 
 
-# cells from the upper side within which no particle may lie: a tent there would reach beyond what
-# is stored
+# Cells from the upper side within which no particle may lie: a tent there would reach beyond the
+# stored cells.
 END = 0.6 * MARGIN
 
 
 def periodic_sides(axes: Sequence[int]) -> list[str]:
-    """Return the names of the sides of some axes, as `warp_lcp.grid.sides` has them.
+    """Return the names of the sides of some axes, as in `SIDES`.
 
     >>> periodic_sides([2])
     ['back', 'front']
@@ -145,12 +154,12 @@ def periodic_sides(axes: Sequence[int]) -> list[str]:
 
 
 def with_periodic(open_sides: int, sides: "PeriodicSides | None") -> int:
-    """Return the bits of sides that stop nobody: open ones, and those of axes without an end."""
+    """Return the bits of all sides that particles can cross: open and periodic ones."""
     return open_sides if sides is None else open_sides | side_bits(periodic_sides(sides.axes))
 
 
 class PeriodicSides:
-    """Join the sides of axes that have no end.
+    """Periodic sides of the domain.
 
     Of n cells along such an axis, stored with a ring, 0 is cell n again and n + 1 is cell 1; so it
     is with faces. What particles add up in the ring belongs to the cells and faces that it repeats.
@@ -158,10 +167,10 @@ class PeriodicSides:
 
     Args:
         grid: the grid.
-        endless: axes without an end, of 0 and 2.
+        endless: periodic axes, of 0 and 2.
 
     Attributes:
-        axes: those that the grid has from side to side.
+        axes: those periodic axes that the grid spans from side to side.
         bits: bit n is set if axis n is one of them.
     """
 
@@ -171,7 +180,10 @@ class PeriodicSides:
         self.bits = sum(1 << axis for axis in self.axes)
 
     def wrap(self, *fields: wp.array, launch: Launch = launch) -> None:
-        """Fill the ring of fields, in the stored shape or stacked in layers of it, from the other side."""
+        """Fill the ring of fields from the opposite side.
+
+        Fields have the stored shape, or are stacks of such layers.
+        """
         for field in fields:
             layers = field if field.ndim == 4 else field.reshape((1, *self.grid.shape))
             for axis in self.axes:
@@ -184,7 +196,7 @@ class PeriodicSides:
                 )
 
     def add(self, field: wp.array) -> None:
-        """Add what lies in the ring of a sum over particles to the cells that it repeats."""
+        """Add the values in the ring of a sum over particles to the cells that it repeats."""
         for axis in self.axes:
             lines = self._lines(field, axis)
             launch(
@@ -201,11 +213,11 @@ class PeriodicSides:
         weights: Sequence[wp.array],
         saved: Sequence[wp.array] = (),
     ) -> None:
-        """Make means over particles of the means on faces that are the same.
+        """Merge means over particles on faces that are the same.
 
         Args:
-            velocity: of each component [m/s] (updated).
-            weights: of the particles (updated: none in the ring).
+            velocity: velocity of each component [m/s] (updated).
+            weights: weights of the particles (updated: none in the ring).
             saved: more velocities that the weights belong to [m/s] (updated), or empty.
         """
         for number, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
@@ -224,7 +236,10 @@ class PeriodicSides:
             self.wrap(field, *([old] if old is not None else []))
 
     def carry(self, position: wp.array) -> None:
-        """Bring particles [m] that have gone out at a side in at the other; floor and ceiling stay what they are."""
+        """Move particles [m] that have left at a periodic side to the opposite side.
+
+        Floor and ceiling stay unchanged.
+        """
         grid = self.grid
         endless = wp.vec3i(*(int(axis in self.endless) for axis in range(3)))
         size = wp.vec3(*(count * grid.spacing for count in grid.domain_counts))
@@ -232,14 +247,17 @@ class PeriodicSides:
         wp.launch(carry_kernel, len(position), inputs, device=grid.device)
 
     def widen(self, window: Window) -> Window:
-        """Return a window of cells that reaches from ring to ring along the axes without an end."""
+        """Extend a window from ring to ring along the periodic axes."""
         low, high = list(window.low), list(window.high)
         for axis in self.endless:
             low[2 - axis], high[2 - axis] = 0, self.grid.shape[2 - axis]
         return Window.of(low, high, window.device)
 
     def _lines(self, field: wp.array, axis: int) -> wp.array:
-        """Return a view of a field, or of layers of it, whose last index goes along an axis; in 2-D of the plane in use."""
+        """Return a view of a field, or of layers of it, with an axis as its last index.
+
+        In 2-D it is the view of the plane in use.
+        """
         if self.grid.dimension == 2:
             field = field[1:2] if field.ndim == 3 else field[:, 1:2]
         last = field.ndim - 1 - axis
@@ -273,7 +291,10 @@ def add_kernel(count: int, lines: F32):
 @forward_kernel(module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def average_kernel(count: int, weight: F32, field: F32, saved: F32):
-    """Bring the two ends of a line into the faces that they repeat, as means with their weights."""
+    """Merge the two ends of a line into the faces that they repeat.
+
+    The result is the mean weighted by particles.
+    """
     a, b = wp.tid()
     for end in range(2):
         ring = wp.where(end == 0, 0, count + 1)
@@ -294,7 +315,10 @@ def average_kernel(count: int, weight: F32, field: F32, saved: F32):
 def carry_kernel(
     endless: wp.vec3i, axes: int, size: wp.vec3, spacing: float, position: wp.array(dtype=wp.vec3)
 ):
-    """Positions modulo the domain's size, off the very end of it; who has crossed keeps off the walls, which stopped nobody beyond."""
+    """Wrap positions into the domain, at a distance from its very end.
+
+    A particle that has crossed keeps off the walls; beyond the side none stopped it.
+    """
     p = wp.tid()
     x = position[p]
     end = END * spacing

@@ -3,9 +3,9 @@
 Box, sphere, capsule, plane, triangle mesh and unions, for solids and regions of material.
 
 A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with
-two coordinates extend without limit in z, spheres and capsules lie at z = 0 (discs and stadiums
-there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the distance is the one
-to the surface in space, never more than the one to the cut.
+two coordinates are infinite in z, spheres and capsules lie at z = 0 (discs and stadiums there), and
+a mesh is cut by the plane z = 0. For a mesh the sign is that of the cut, and the distance is that
+to the surface in space, never more than that to the cut.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Geometry(Protocol):
 def _rotation_about(axis: int, degrees: float) -> np.ndarray:
     """Return the matrix that turns counterclockwise about a coordinate axis."""
     angle = np.deg2rad(degrees)
-    # whole quarter turns stay exact, so that a turned box keeps its faces on the grid's
+    # Whole quarter turns stay exact, so that the faces of a turned box stay on the grid's faces.
     quarters = degrees / 90.0
     cosine, sine = np.cos(angle), np.sin(angle)
     if quarters == int(quarters):
@@ -154,18 +154,18 @@ class Placement:
 
 @dataclass(frozen=True, kw_only=True)
 class _Shape(ABC):
-    """What the shapes share: their placement, inversion and the launch of their kernel."""
+    """Common parts of shapes: placement, inversion and the launch of the kernel."""
 
     placement: Placement = field(default_factory=Placement)
     invert: bool = False
 
     kernel: ClassVar[Any]
-    cost: ClassVar[int] = 8  # of a point, in cells of a usual pass
+    cost: ClassVar[int] = 8  # work of a point, in cells of a usual pass
 
     def signed_distance(
         self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
     ) -> None:
-        """Write the Euclidean distance to the surface, negative inside (outside when inverted).
+        """Write the distance to the surface, negative inside (outside if inverted).
 
         Args:
             points: [m], shape (m,), on any device; a 2-D caller passes z = 0.
@@ -183,7 +183,7 @@ class _Shape(ABC):
         launch_list(kernel, points.shape[0], inputs, device=points.device, cost=self.cost)
 
     def frame(self) -> ShapeFrame:
-        """Return where the shape stands, as kernels take it."""
+        """Return the placement of the shape, as kernels take it."""
         placement, frame = self.placement, ShapeFrame()
         translation = placement.translation + placement.scale * placement.rotation @ self.origin()
         frame.inverse_rotation, frame.translation = (
@@ -194,7 +194,10 @@ class _Shape(ABC):
         return frame
 
     def bounds(self) -> np.ndarray | None:
-        """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
+        """Return the corners [m] of a box around the region, shape (2, 3).
+
+        Returns None if the region is unlimited or inverted.
+        """
         return None if self._bounds is None else self._bounds.copy()
 
     @cached_property
@@ -209,15 +212,18 @@ class _Shape(ABC):
         return np.stack([placed.min(axis=0) - margin, placed.max(axis=0) + margin])
 
     def moved(self, pose: Pose) -> Self:
-        """Return the shape after a change of place [m]; the surface of a mesh, and what is on the device of it, is shared."""
+        """Return the shape moved by a pose [m].
+
+        The surface of a mesh and its device data are shared.
+        """
         return replace(self, placement=self.placement.moved(pose))
 
     def origin(self) -> np.ndarray:
-        """Return the point, in the shape's coordinates, from which its kernel counts."""
+        """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return np.zeros(3)
 
     def unit_length(self) -> float:
-        """Return the length, in the shape's coordinates, that its kernel counts as 1."""
+        """Return the unit length of the kernel, in the shape's coordinates."""
         return 1.0
 
     @abstractmethod
@@ -226,7 +232,10 @@ class _Shape(ABC):
 
     @abstractmethod
     def hull(self) -> tuple[np.ndarray, float]:
-        """Return points, shape (m, 3), and a margin around them that cover the shape; no points when nothing does."""
+        """Return points, shape (m, 3), and a margin around them that cover the shape.
+
+        There are no points if nothing covers it.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,7 +245,7 @@ class Box(_Shape):
     Args:
         lower: low corner [m], 2 or 3 numbers.
         upper: high corner [m], as many.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the box.
 
     Raises:
@@ -262,7 +271,7 @@ class Box(_Shape):
         object.__setattr__(self, "upper", upper)
 
     def origin(self) -> np.ndarray:
-        """Return the point, in the shape's own coordinates, from which its kernel counts."""
+        """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return 0.5 * (in_space(self.lower) + in_space(self.upper))
 
     def half_extents(self) -> np.ndarray:
@@ -301,7 +310,7 @@ class Sphere(_Shape):
     Args:
         center: [m], 2 or 3 numbers.
         radius: [m], > 0.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the sphere.
 
     Raises:
@@ -319,7 +328,7 @@ class Sphere(_Shape):
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
     def origin(self) -> np.ndarray:
-        """Return the point, in the shape's own coordinates, from which its kernel counts."""
+        """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return in_space(self.center)
 
     def parameters(self, device: wp.Device) -> list[Any]:
@@ -339,7 +348,7 @@ class Capsule(_Shape):
         start: one end of the segment [m], 2 or 3 numbers.
         end: the other end [m], as many.
         radius: [m], > 0.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the capsule.
 
     Raises:
@@ -364,7 +373,7 @@ class Capsule(_Shape):
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
     def origin(self) -> np.ndarray:
-        """Return the point, in the shape's own coordinates, from which its kernel counts."""
+        """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return in_space(self.start)
 
     def axis(self) -> np.ndarray:
@@ -390,7 +399,7 @@ class Plane(_Shape):
     Args:
         point: a point of the plane [m], 2 or 3 numbers.
         normal: direction out of the material, as many numbers, of any length but 0.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: put the material on the normal's side.
 
     Raises:
@@ -413,7 +422,7 @@ class Plane(_Shape):
         object.__setattr__(self, "normal", unit("a plane's normal", normal))
 
     def origin(self) -> np.ndarray:
-        """Return the point, in the shape's own coordinates, from which its kernel counts."""
+        """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return in_space(self.point)
 
     def parameters(self, device: wp.Device) -> list[Any]:
@@ -434,7 +443,7 @@ class TriangleMesh(_Shape):
 
     Args:
         surface: the checked surface, in the mesh's own coordinates.
-        placement: where it stands.
+        placement: placement of the shape.
         invert: make it everything but the inside.
     """
 
@@ -459,7 +468,7 @@ class TriangleMesh(_Shape):
         Args:
             file: path, relative to `folder`, or `builtin:` and a name.
             folder: where relative paths start; the working directory without it.
-            placement: where it stands.
+            placement: placement of the shape.
             invert: make it everything but the inside.
 
         Raises:
@@ -496,11 +505,11 @@ class TriangleMesh(_Shape):
         return self.surface.thin_fraction(thickness / self.placement.scale, device)
 
     def origin(self) -> np.ndarray:
-        """Return the point, in the shape's own coordinates, from which its kernel counts."""
+        """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return self.surface.center
 
     def unit_length(self) -> float:
-        """Return the length, in the shape's own coordinates, that its kernel counts as 1."""
+        """Return the unit length of the kernel, in the shape's coordinates."""
         return self.surface.size
 
     def parameters(self, device: wp.Device) -> list[Any]:

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Signed distances as Warp kernels, one a shape, the points at which they are asked for, and the claim of cells by solids."""
+"""Kernels of signed distances, one a shape, of sample points and of solid cells."""
 
 from typing import Any
 
@@ -10,29 +10,35 @@ from warp_lcp.kernels.compiler import forward_kernel
 
 MODULE = "warp_lcp.solids"
 Points, Distances = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)
-# a mesh query's reach, in half diagonals of the mesh; its square is still finite in float32
+# Reach of a mesh query, in half diagonals of the mesh; its square is still finite in float32.
 FAR = 1.0e10
 
 
 @wp.struct
 class ShapeFrame:
-    """Where a shape stands, whose own coordinates q are counted from its center or another point of it: q = R' (p - t) / s of a point p."""
+    """Placement of a shape: q = R' (p - t) / s are its coordinates of a point p.
+
+    They are counted from the shape's center, or from another point of it.
+    """
 
     inverse_rotation: wp.mat33
     translation: wp.vec3
-    scale: float  # that distances come back times
+    scale: float  # factor on distances
     sign: float  # -1: the shape is inverted
 
 
 @wp.func
 def to_shape(p: wp.vec3, frame: ShapeFrame) -> wp.vec3:
-    """Return q of a point p."""
+    """Return the shape's coordinates q of a point p."""
     return frame.inverse_rotation * (p - frame.translation) / frame.scale
 
 
 @wp.func
 def to_box(p: wp.vec3, frame: ShapeFrame, half: wp.vec3) -> float:
-    """Return the distance of a box of half extents `half` (infinite in z in 2-D) about the origin."""
+    """Return the distance of a box about the origin.
+
+    `half` are its half extents, infinite in z in 2-D.
+    """
     q = to_shape(p, frame)
     x = wp.abs(q[0]) - half[0]
     y = wp.abs(q[1]) - half[1]
@@ -49,7 +55,10 @@ def to_sphere(p: wp.vec3, frame: ShapeFrame, radius: float) -> float:
 
 @wp.func
 def to_capsule(p: wp.vec3, frame: ShapeFrame, axis: wp.vec3, radius: float) -> float:
-    """Return the distance of all within `radius` of the segment from the origin along `axis`."""
+    """Return the distance of a capsule: points within `radius` of a segment.
+
+    The segment goes from the origin along `axis`.
+    """
     q = to_shape(p, frame)
     along = wp.clamp(wp.dot(q, axis) / wp.dot(axis, axis), 0.0, 1.0)
     return frame.sign * frame.scale * (wp.length(q - along * axis) - radius)
@@ -57,16 +66,22 @@ def to_capsule(p: wp.vec3, frame: ShapeFrame, axis: wp.vec3, radius: float) -> f
 
 @wp.func
 def to_plane(p: wp.vec3, frame: ShapeFrame, normal: wp.vec3) -> float:
-    """Return the distance of the half-space below the plane through the origin with a unit `normal`."""
+    """Return the distance of the half-space below the plane through the origin.
+
+    `normal` is the plane's unit normal.
+    """
     return frame.sign * frame.scale * wp.dot(to_shape(p, frame), normal)
 
 
 @wp.func
 def to_mesh(p: wp.vec3, frame: ShapeFrame, mesh: wp.uint64) -> float:
-    """Return the distance of the inside of a closed mesh: that to the closest triangle, with the sign from the winding number."""
+    """Return the signed distance of a closed mesh.
+
+    The size is the distance to the closest triangle; the sign comes from the winding number.
+    """
     q = to_shape(p, frame)
-    # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface
-    # has whole numbers, so 0.5 has room.
+    # 2: groups of triangles farther than twice their radius count as one dipole. A closed surface
+    # has whole winding numbers, so the threshold 0.5 leaves room.
     query = wp.mesh_query_point_sign_winding_number(mesh, q, FAR, 2.0, 0.5)
     distance = FAR
     if query.result:
@@ -76,7 +91,10 @@ def to_mesh(p: wp.vec3, frame: ShapeFrame, mesh: wp.uint64) -> float:
 
 @wp.func
 def to_mesh_surface(p: wp.vec3, frame: ShapeFrame, mesh: wp.uint64) -> float:
-    """Return the distance to the closest triangle, without the sign, which takes most of the time."""
+    """Return the distance to the closest triangle, without sign.
+
+    The sign takes most of the time.
+    """
     q = to_shape(p, frame)
     query = wp.mesh_query_point_no_sign(mesh, q, FAR)
     distance = FAR
@@ -107,7 +125,7 @@ def capsule_distance(
 
 @list_kernel(MODULE)
 def least_distance(i, other: Distances, out: Distances):
-    """Measure what lies in one of two regions."""
+    """Write the distance of the union of two regions."""
     out[i] = wp.min(out[i], other[i])
 
 
@@ -119,19 +137,28 @@ def plane_distance(i, points: Points, frame: ShapeFrame, normal: wp.vec3, out: D
 
 @list_kernel(MODULE)
 def mesh_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
-    """Measure the inside of a closed mesh: distance to the closest triangle, sign from the winding number."""
+    """Measure the inside of a closed mesh.
+
+    The size is the distance to the closest triangle; the sign comes from the winding number.
+    """
     out[i] = to_mesh(points[i], frame, mesh)
 
 
 @list_kernel(MODULE)
 def mesh_surface_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
-    """Measure the distance to the closest triangle, without the sign, which takes most of the time."""
+    """Measure the distance to the closest triangle, without sign.
+
+    The sign takes most of the time.
+    """
     out[i] = to_mesh_surface(points[i], frame, mesh)
 
 
 @forward_kernel(module=MODULE)
 def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32)):
-    """Measure from each triangle's center straight inward to the other side; `reach` when it is farther or another part begins."""
+    """Measure the thickness of a mesh from each triangle's center straight inward.
+
+    It is `reach` if the other side is farther, or if another part begins before it.
+    """
     face = wp.tid()
     a = wp.mesh_get_point(mesh, 3 * face)
     b = wp.mesh_get_point(mesh, 3 * face + 1)
@@ -146,16 +173,19 @@ def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32
 
 @wp.struct
 class Block:
-    """A box of nodes or cells, x fastest, as kernels see it; each item stands for `stride` of them along every axis."""
+    """Box of nodes or cells as kernels see it, x fastest.
+
+    Each item stands for `stride` nodes along every axis.
+    """
 
     low: wp.vec3i
     high: wp.vec3i  # one past the last
-    counts: wp.vec3i  # of items
+    counts: wp.vec3i  # numbers of items
     origin: wp.vec3i  # cells of a larger grid before the first
     stride: int
     flat: bool  # 2-D: z does not count
     spacing: float  # [m]
-    offset: float  # of an item's point from its low node, in cells
+    offset: float  # offset of an item's point from its low node, in cells
 
 
 @wp.func
@@ -170,7 +200,10 @@ def first_node(block: Block, item: int):
 
 @wp.func
 def node_position(block: Block, node: wp.vec3i, offset: float):
-    """Return the place [m] of a node, moved by `offset` cells along each axis; 2-D has z = 0."""
+    """Return the position [m] of a node, moved by `offset` cells along each axis.
+
+    2-D has z = 0.
+    """
     z = (float(block.origin[2] + node[2] - 1) + offset) * block.spacing
     if block.flat:
         z = 0.0
@@ -180,7 +213,10 @@ def node_position(block: Block, node: wp.vec3i, offset: float):
 
 @forward_kernel(module=MODULE)
 def item_points(block: Block, out: Points):
-    """Fill the places [m] of the items of a block: nodes, the middles of groups of nodes, or the centers of cells."""
+    """Fill the positions [m] of the items of a block.
+
+    Items are nodes, the middles of groups of nodes, or the centers of cells.
+    """
     c = wp.tid()
     out[c] = node_position(block, first_node(block, c), block.offset)
 
@@ -193,7 +229,10 @@ def claim_cells(
     index: wp.array3d(dtype=wp.int32),
     covered: wp.array(dtype=wp.int32),
 ):
-    """Give the open cells of a block whose center lies inside to `solid`, and count those that lie inside, claimed or not."""
+    """Assign the open cells of a block whose center lies inside to `solid`.
+
+    Count the cells with their center inside, claimed or not.
+    """
     c = wp.tid()
     if distance[c] < 0.0:
         at = first_node(block, c)
@@ -212,7 +251,10 @@ def block_of(
     stride: int = 1,
     offset: float = 0.0,
 ) -> Any:
-    """Return the nodes or cells low <= (x, y, z) < high in groups of `stride` along each axis, their points moved by `offset` cells."""
+    """Return the block of nodes or cells low <= (x, y, z) < high.
+
+    Items are groups of `stride` nodes along each axis; their points are moved by `offset` cells.
+    """
     block = Block()
     block.low, block.high = wp.vec3i(*(int(v) for v in low)), wp.vec3i(*(int(v) for v in high))
     block.counts = wp.vec3i(*(-(-int(b - a) // stride) for a, b in zip(low, high, strict=True)))

@@ -40,31 +40,31 @@ CLEAR: dict[typing.Any, StencilKernel] = {
     for dtype in (wp.int8, wp.float32, wp.float64)
 }
 COPY = KERNELS["warp_lcp.grid.copy_box.copy"]
-SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
+SEGMENT = 8  # cells of a row that are visited together in an active window
 
 
 @wp.struct
 class CellRange:
     """A box of cells as kernels see it; a thread takes `grain` cells of a row."""
 
-    # of the tasks that a team's thread takes: the first, one past the last; 0: one task a thread
+    # Tasks of a worker thread: the first, and one past the last; 0 if each thread has one task.
     begin: int
     finish: int
     rows: int
-    chunks: int  # of a row
+    chunks: int  # chunks of a row
     k: int
     j: int
     i: int
     end: int  # one past the last i
     grain: int  # 0: a piece
-    # (k, j) and (first, one past the last i) of each piece of a box in part
+    # (k, j) and (first, one past the last i) of each piece of an active window.
     pieces: wp.array2d(dtype=wp.vec2i)
 
 
 @wp.func
 @typing.no_type_check
 def inside(coordinate: float, count: int):
-    """Return a grid coordinate brought into the domain [1, count + 1]; a NaN becomes 1."""
+    """Return a grid coordinate clamped to the domain [1, count + 1]; a NaN becomes 1."""
     x = coordinate
     if not (x > 1.0):
         x = 1.0
@@ -83,7 +83,7 @@ def cell_index(coordinate: float, count: int):
 def _corners(
     choose: typing.Callable[[int, int], int], one: tuple[int, int, int], other: tuple[int, int, int]
 ) -> tuple[int, int, int]:
-    """Return the smaller or the larger of two corners' coordinates, `choose` being min or max."""
+    """Return the smaller or larger coordinates of corners; `choose`: min or max."""
     return choose(one[0], other[0]), choose(one[1], other[1]), choose(one[2], other[2])
 
 
@@ -94,10 +94,10 @@ class Window:
     Args:
         low: first (k, j, i), ring included.
         high: one past the last (k, j, i).
-        device: where kernels run.
-        near: active segments of rows, see `warp_lcp.grid.active_rows`; the rest of the box need not be
-            visited; None: all. Sums over rows visit what lies between the first and the last of a
-            row.
+        device: device on which kernels run.
+        near: active segments of rows, see `warp_lcp.grid.active_rows`; kernels may skip the rest of
+            the box. None for all. Sums over rows visit the range from the first to the last active
+            segment of a row.
     """
 
     low: tuple[int, int, int]
@@ -131,7 +131,7 @@ class Window:
 
     @cached_property
     def _pieces(self) -> wp.array:
-        """The pieces that are visited, see `pieces_of`."""
+        """The pieces to visit, see `pieces_of`."""
         assert self.near is not None
         return wp.array(
             pieces_of(self.near, self.low, self.high), dtype=wp.vec2i, device=self.device
@@ -179,13 +179,13 @@ class Window:
         launch: Launch | None = None,
         **given: typing.Any,
     ) -> None:
-        """Launch a pass over the box, or record it with `Program.launch`.
+        """Launch a pass over the box, or record it with `LaunchGraph.launch`.
 
         Args:
-            passed: with fields of a `box`.
+            passed: the pass, with fields of a `box`.
             structs: with fields and numbers, see `StencilKernel.bind`.
             whole: a thread takes a whole row, for counts of a row.
-            launch: of a program.
+            launch: the launch function of a launch graph.
             given: fields and numbers by name.
         """
         passed.bind_arguments(self._whole if whole else self._shared, structs, given).launch(launch)
@@ -207,7 +207,7 @@ class Window:
 
     @property
     def _visited(self) -> int:
-        """How many cells there are to visit in part, to within the ends of segments."""
+        """Number of cells to visit in an active window, to within the ends of segments."""
         return 0 if self.near is None else SEGMENT * int(np.count_nonzero(self.near))
 
     @cached_property
@@ -259,12 +259,15 @@ class Window:
 
     @property
     def identity(self) -> typing.Hashable:
-        """By what recorded launches tell windows apart; one in part is never the same."""
+        """Key by which recorded launches distinguish windows.
+
+        A window with active segments never equals another.
+        """
         return self.low, self.high, None if self.near is None else object()
 
     @property
     def now(self) -> "Window":
-        """The window itself; of an `ActiveWindow` the one that it stands for."""
+        """The window itself; of an `ActiveWindow` the window of the current step."""
         return self
 
 
@@ -284,20 +287,20 @@ class _RangeMemory:
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
         self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA now
-        self.room: tuple[int, ...] = (1, 1, 1)  # at most so far
+        self.room: tuple[int, ...] = (1, 1, 1)  # largest dimensions so far
 
     def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
-        """Take a CellRange over on CUDA, with the threads that share it."""
+        """Set the CellRange on CUDA, with its threads."""
         self.take(cells, dim[0] * dim[1] * dim[2])
         self.extent, self.room = dim, larger(self.room, dim)
 
     def take(self, cells: typing.Any, tasks: int) -> None:
-        """Take a CellRange over."""
+        """Set the CellRange."""
         ctypes.memmove(self.first[1], ctypes.addressof(cells.__ctype__()), self.first[2])
         self.tasks.value = tasks
 
     def take_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
-        """Take a box of whole rows over, see `CellRange`."""
+        """Set a box of whole rows, see `CellRange`."""
         ctypes.memset(self.first[1], 0, self.first[2])
         BOX_OF_CELLS.pack_into(
             self.range, _native(NO_CELLS).rows.offset, rows, 1, k, j, i, end, end - i
@@ -322,9 +325,9 @@ class ActiveWindow(Window):
     sizes: tuple[Scalar, Scalar]
     pieces: Scalar
     hulls: Slot
-    _rows: tuple[RowsMemory, RowsMemory]  # of passes, of passes that sum
-    _sums: dict[int, DeviceRows]  # of passes that sum over columns of so many planes, on CUDA
-    _ranges: tuple[_RangeMemory, _RangeMemory]  # of kernels for cells, for rows
+    _rows: tuple[RowsMemory, RowsMemory]  # rows of passes, and of passes that sum
+    _sums: dict[int, DeviceRows]  # rows of passes that sum over columns of so many planes, on CUDA
+    _ranges: tuple[_RangeMemory, _RangeMemory]  # ranges of kernels for cells, and for rows
     _now: Window
 
     def __init__(self, window: Window) -> None:
@@ -337,7 +340,7 @@ class ActiveWindow(Window):
         }
         numbers = {"first": (Scalar(), Scalar()), "sizes": (Scalar(), Scalar()), "pieces": Scalar()}
         for name, value in {"device": window.device, **memory, **numbers, "_now": None}.items():
-            # which a dataclass that is frozen does not allow otherwise
+            # The frozen dataclass does not allow assignment otherwise.
             object.__setattr__(self, name, value)
         self.move_to(window)
 
@@ -350,7 +353,7 @@ class ActiveWindow(Window):
     cells = property(lambda self: self._now.cells)
 
     def move_to(self, window: Window) -> None:
-        """Stand for another window."""
+        """Set the window of the current step."""
         window, before = window.now, self._now
         if window is before:
             return
@@ -402,7 +405,7 @@ class ActiveWindow(Window):
 
     @property
     def hull_pieces(self) -> typing.Any:
-        """The pieces that sums over rows visit; None: all rows of the box."""
+        """Pieces that sums over rows visit; None for all rows of the box."""
         return None if self.near is None else self._now._hulls
 
     @property
@@ -468,9 +471,9 @@ class DirtyRegion:
         self._last = self.all
 
     def through(self, window: Window | None) -> Window:
-        """Return the union of the last window and this one, or their parts.
+        """Return the union of the last window and this one, or of their active parts.
 
-        This one becomes the last. None: all cells.
+        This window becomes the last. None stands for all cells.
         """
         now, last = (window and window.now.common(self.all)) or self.all, self._last
         self._last = now
@@ -501,7 +504,7 @@ def pieces_of(
     """
     part = near[low[0] : high[0], low[1] : high[1]]
     planes, rows, segments = part.shape
-    # each row behind an element that is not marked
+    # An unmarked element before each row separates the rows.
     flat = np.zeros(planes * rows * (segments + 1) + 1, dtype=bool)
     flat[:-1].reshape(planes, rows, segments + 1)[..., 1:] = part
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
@@ -524,14 +527,14 @@ class StaggeredGrid:
         dimension: 2 or 3.
         device: a Warp device or its name.
         origin: cells (x, y, z) of a larger grid before the first one of this.
-        whole: cells of the larger grid that this is a part of; None: it is no part.
+        whole: cells of the larger grid of which this is a part; None if it is no part.
         sparse: whether only a small part of its fields will be written, for which memory is taken
             in small pages.
-        part: what this process has of it; all if None.
+        part: the part of the grid that this process has; all of it if None.
 
     Attributes:
-        barriers: solids thinner than its cells, `warp_lcp.grid.barriers.Barriers`, set by who
-            places them; None: there are none.
+        barriers: solids thinner than its cells, `warp_lcp.grid.barriers.Barriers`, set by the code
+            that places them; None if there are none.
 
     Raises:
         ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
@@ -561,7 +564,7 @@ class StaggeredGrid:
         object.__setattr__(self, "part", self.part or GridPart(self))
 
     def divide(self, barriers: typing.Any) -> None:
-        """Have barriers hold apart what lies on their two sides."""
+        """Set the barriers that separate the material on their two sides."""
         object.__setattr__(self, "barriers", barriers)
 
     @property
@@ -617,7 +620,7 @@ class StaggeredGrid:
         )
 
     def coarser(self) -> "StaggeredGrid":
-        """Return the grid of cells of twice the edge that covers this one, in one process."""
+        """Return the grid of twice the spacing that covers this one, in one process."""
         nx, ny, nz = (-(-n // 2) for n in self.counts)
         return StaggeredGrid((nx, ny, nz), 2.0 * self.spacing, self.dimension, self.device)
 
@@ -661,9 +664,8 @@ class StaggeredGrid:
     ) -> Window:
         """Return the window of cells from low to high, moved, grown and clipped.
 
-        (x, y, z), both included; moved by `shift` along each axis.
-
-        Of a box beyond what is stored a layer of what is nearest is left.
+        Cells (x, y, z), both included, are moved by `shift` along each axis. If the box lies
+        outside of the stored cells, the nearest layer of these is returned.
         """
         first, last = [], []
         for axis in (2, 1, 0):

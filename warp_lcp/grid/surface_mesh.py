@@ -24,23 +24,24 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
-# particle distances: standard deviation of the narrowest kernel that has no gaps, the quadratic
-# B-spline
+# Particle distances. Standard deviation of the narrowest kernel without gaps, the quadratic
+# B-spline.
 SHARPEST = 0.5
-EXTENDED = 2  # layers that the distance is continued into solids, and the velocity into air
-# the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles
-# cannot tell it from others
+EXTENDED = 2  # layers to which the distance is extrapolated into solids, and the velocity into air
+# Largest smoothed share that a lone particle is assumed to have. Kernels as narrow as particles
+# cannot distinguish it from others.
 CROWD = 0.1
-# of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
+# Rounds of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume.
 ROUNDS = 3
-SEEN = 2 * ROUNDS + 1  # lattice cells around one that its points depend on by the smoothing
-OUTSIDE = 1.0  # of the surface, in the ring at cuts
-MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9  # a lattice cell, and more where there are solids
-MESH_POINT_BYTES = 80  # a point, its triangles and its velocity included
+SEEN = 2 * ROUNDS + 1  # lattice cells around a cell that its smoothed points depend on
+OUTSIDE = 1.0  # value outside of the surface, in the ring at cuts
+# Bytes of a lattice cell; and more where there are solids.
+MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9
+MESH_POINT_BYTES = 80  # bytes of a point, with its triangles and its velocity
 
 
 def surface_layers(parts: int) -> int:
-    """Return the number of layers of ghost cells that a surface takes.
+    """Return the number of layers of ghost cells that a surface needs.
 
     Args:
         parts: lattice cells along the edge of a cell.
@@ -86,14 +87,14 @@ class Interior:
 class SurfaceMesh:
     """Surface mesh around particles.
 
-    On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle
-    distances and divided by what solids and walls leave of the kernel: the filled share. Where it
-    is 1/2 there is the surface: unbiased for a plane and flat at walls that the plane meets at a
-    right angle; a ball of radius R shrinks by up to smoothing^2 / R [particle distances]. Where
-    particles have few others around them, in drops, filaments and sheets too thin for the kernel, a
-    narrow kernel is added to the share with a weight that grows as the smoothed share falls, so
-    that a drop of one particle is still there. The surface is cut along walls, solids and the
-    domain's sides, those that are open or periodic too.
+    The density of the particles is computed on a lattice finer than the grid, smoothed over
+    `smoothing` particle distances, and divided by the open part of the kernel beside solids and
+    walls: the filled share. The surface is where this share is 1/2. It is unbiased for a plane, and
+    flat at walls that the plane meets at a right angle; a ball of radius R shrinks by up to
+    smoothing^2 / R [particle distances]. Where particles have few others around them, in drops,
+    filaments and sheets too thin for the kernel, a narrow kernel is added to the share. Its weight
+    grows as the smoothed share falls, so that a drop of one particle remains. The surface is cut
+    along walls, solids and the domain's sides, open and periodic ones included.
 
     Args:
         grid: the grid.
@@ -102,7 +103,7 @@ class SurfaceMesh:
             finest useful resolution.
         smoothing: standard deviation of the kernel [particle distances], at least that of the
             narrow one, 1/2.
-        obstacles: solids; None: there are none but the domain's walls.
+        obstacles: solids; None if there are only the domain's walls.
 
     Raises:
         ValueError: an argument is out of range.
@@ -128,14 +129,14 @@ class SurfaceMesh:
             )
         self.grid, self.obstacles, self._parts = grid, obstacles, parts
         self.lattice = grid.refined(parts)
-        distance = parts / per_axis  # of particles at rest, in lattice cells
+        distance = parts / per_axis  # distance of particles at rest, in lattice cells
         self._each = distance**grid.dimension
         self._thin_passes, self._passes = (
             max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing)
         )
         self._spread = math.sqrt(0.25 + 0.5 * self._passes)
-        # A drop of one particle has at least 2^-dimension of its narrow kernel on one lattice node:
-        # that shall be the share 1/2.
+        # A drop of one particle has at least 2^-dimension of its narrow kernel on one lattice node.
+        # That value is scaled to the share 1/2.
         self._most = 2.0 ** (grid.dimension - 1)
         alone = min(
             self._each * (2.0 * math.pi * self._spread**2) ** (-0.5 * grid.dimension), CROWD
@@ -147,7 +148,7 @@ class SurfaceMesh:
         self._known = self.lattice.field(wp.int8) if obstacles else None
         self._cubes = MarchingCubes(self.lattice)
         self._placed = False
-        # whose triangles this rank keeps; None: all
+        # Cells whose triangles this rank keeps; None for all.
         self._kept = self._lattice_cells() if grid.part.shared else None
 
     def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
@@ -220,7 +221,10 @@ class SurfaceMesh:
         return self._mesh(phi, smooth.view(wp.int32))
 
     def _lattice_cells(self) -> Window:
-        """Return the lattice cells that have their low node in this rank's box, or in the ring beyond the domain's low sides."""
+        """Return the lattice cells that have their low node in this rank's box.
+
+        Cells with their low node in the ring beyond the domain's low sides are included.
+        """
         lattice, part = self.lattice, self.grid.part
         each = np.array([self._parts] * 2 + [self._parts if lattice.dimension == 3 else 1])[::-1]
         low, high = (
@@ -231,7 +235,10 @@ class SurfaceMesh:
         return Window.of(low.tolist(), high.tolist(), lattice.device)
 
     def _mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
-        """Return the smoothed surface phi = 0, on ranks the triangles of this one's cells; `number` is scratch memory."""
+        """Return the smoothed surface phi = 0, on ranks that of this rank's cells.
+
+        `number` is scratch memory.
+        """
         if self._kept is None:
             return self._whole_mesh(phi, number)
         part, lattice = self.grid.part, self.lattice
@@ -264,7 +271,10 @@ class SurfaceMesh:
         return mesh
 
     def _fit(self, mesh: DeviceMesh, held: np.ndarray, shapes: Sequence[Geometry]) -> None:
-        """Move the points on solids onto their shapes, along the domain's sides where they lie on one."""
+        """Move the points on solids onto the solids' shapes.
+
+        Points on a side of the domain move along that side.
+        """
         spacing, lattice = self.grid.spacing, self.lattice
         points = mesh.points.numpy() / spacing
         place = points * (spacing / lattice.spacing)
@@ -273,12 +283,12 @@ class SurfaceMesh:
         walls = MeshWalls(shapes, spacing, lattice.dimension, lattice.device)
         on_solid = (held & ON_SOLID) > 0
         fitted = fit_to_walls(points, mesh.corners.numpy(), on_solid, fixed, walls)
-        # along a side a point could leave the domain beyond a corner
+        # Along a side a point could leave the domain beyond a corner.
         size = np.asarray(lattice.extent)
         mesh.points.assign(np.clip(fitted * spacing, 0.0, size).astype(np.float32))
 
     def _place(self, obstacles: Obstacles) -> None:
-        """Find what the solids leave of each kernel."""
+        """Compute the open share of each kernel beside the solids."""
         lattice, domain = self.lattice, self.lattice.domain
         room, capacity = self._room, self._capacity
         if obstacles.distance is not None:
@@ -302,7 +312,10 @@ class SurfaceMesh:
     def _smoothed(
         self, source: wp.array, first: wp.array, second: wp.array, passes: int
     ) -> wp.array:
-        """Return the source after binomial passes (1, 2, 1)/4, mirrored at the domain's sides; in one of the two other fields."""
+        """Return the source after binomial passes (1, 2, 1)/4.
+
+        The field is mirrored at the domain's sides. The result is in one of the two scratch fields.
+        """
         for _ in range(passes):
             self.lattice.everywhere.run(
                 BINOMIAL, planes=self.lattice.planes, source=source, out=first
@@ -312,7 +325,10 @@ class SurfaceMesh:
         return source
 
     def _mirror(self, field: wp.array, *, fold: bool = False) -> None:
-        """Continue a field beyond the domain's sides as in a mirror; `fold`: after folding in what has been added there."""
+        """Extend a field beyond the domain's sides by mirroring.
+
+        With `fold`, values in the ring are first added to the cells beside it.
+        """
         for axis in range(self.lattice.dimension):
             lines = field.transpose((*(n for n in range(3) if n != 2 - axis), 2 - axis))
             wp.launch(
@@ -356,7 +372,7 @@ def sample(grid: StaggeredGrid, fields: list[wp.array], points: wp.array) -> wp.
         points: [m], shape (m,), vectors.
     """
     sampled, within = (wp.zeros(len(points), dtype=wp.vec3, device=grid.device) for _ in range(2))
-    # as near to the far sides as particles may come
+    # Particles may come as near to the far sides as this.
     size = wp.vec3(*((n - MARGIN) * grid.spacing for n in grid.domain_counts))
     wp.launch(kernels.clamp_kernel, len(points), [points, size, within], device=grid.device)
     faces_to_particles(grid, fields, within, sampled, [])

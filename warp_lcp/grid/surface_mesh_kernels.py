@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the surface that a picture shows: its field on a lattice, what solids take away of it, and how fast it moves."""
+"""Kernels of the surface mesh: its field on a lattice, solids, and velocity."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import SOLID
 
-FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
-# of a kernel: where less of it is open the distance is continued from outside the solid
+FAR = 2.0  # lattice cells: beyond this distance a solid does not reduce the liquid
+# Share of a kernel. Where less is open, the distance is extrapolated from outside the solid.
 LEAST_OPEN = 0.25
-# A particle is boosted by gain ((THIN / share)^POWER - 1) where the smoothed share is below THIN:
-# by nothing at a plane surface, where the outermost particles have about 0.63, by most in a drop of
-# one particle, by about 1/2 in a sheet of one layer, which keeps its thickness.
+# A particle is amplified by gain ((THIN / share)^POWER - 1) where the smoothed share is below THIN:
+# not at a plane surface, where the outermost particles have about 0.63; most in a drop of one
+# particle; by about 1/2 in a sheet of one layer, which keeps its thickness.
 THIN, POWER = 0.6, 0.4
 
 
@@ -34,7 +34,10 @@ BOOST = KERNELS["warp_lcp.grid.surface_mesh.boost"]
 
 @forward_kernel(**_options)
 def mirror_kernel(fold: bool, lines: F32):
-    """Give the ring at both ends of a line the values beside it, after adding to those what the ring holds; a thread a line."""
+    """Copy the values beside both ends of a line to the ring.
+
+    With `fold`, the ring's values are first added to those beside it. One thread takes a line.
+    """
     a, b = wp.tid()
     last = lines.shape[2] - 1
     for end in range(2):
@@ -47,14 +50,17 @@ def mirror_kernel(fold: bool, lines: F32):
 
 @wp.func
 def is_solid(base: I8, planes: int, parts: int, k: int, j: int, i: int):
-    """Tell whether a lattice cell lies in a cell that is SOLID; cells of the ring are not."""
+    """Return whether a lattice cell lies in a SOLID cell; cells of the ring do not."""
     c = wp.where(planes == 2, (k - 1) // parts + 1, 1)
     return base[c, (j - 1) // parts + 1, (i - 1) // parts + 1] == wp.int8(SOLID)
 
 
 @cell_kernel("warp_lcp.grid.surface_mesh")
 def whole_cell_room_kernel(k, j, i, planes: int, parts: int, base: I8, out: F32):
-    """Say half a lattice cell on both sides of the faces of whole solid cells, far elsewhere."""
+    """Write the distance to whole solid cells: half a lattice cell beside their faces.
+
+    Elsewhere it is a large number.
+    """
     d = float(FAR)
     if is_solid(base, planes, parts, k, j, i):
         d = float(-0.5)
@@ -74,7 +80,7 @@ def whole_cell_room_kernel(k, j, i, planes: int, parts: int, base: I8, out: F32)
 
 @cell_kernel("warp_lcp.grid.surface_mesh")
 def fill_kernel(k, j, i, planes: int, parts: int, least: float, depth: F32, base: I8, density: F32):
-    """Make lattice cells full that lie in open cells deeper than `least`."""
+    """Fill lattice cells that lie in open cells deeper than `least`."""
     c = wp.where(planes == 2, (k - 1) // parts + 1, 1)
     b = (j - 1) // parts + 1
     a = (i - 1) // parts + 1
@@ -84,12 +90,12 @@ def fill_kernel(k, j, i, planes: int, parts: int, least: float, depth: F32, base
 
 @cell_kernel("warp_lcp.grid.surface_mesh")
 def open_share_kernel(k, j, i, room: F32, out: F32):
-    """Estimate which share of each lattice cell is open."""
+    """Estimate the open share of each lattice cell."""
     out[k, j, i] = wp.clamp(room[k, j, i] + 0.5, 0.0, 1.0)
 
 
 @forward_kernel(**_options)
 def clamp_kernel(points: wp.array(dtype=wp.vec3), size: wp.vec3, out: wp.array(dtype=wp.vec3)):
-    """Bring points that are beyond the far sides back to them."""
+    """Move points that are beyond the far sides back to these sides."""
     p = wp.tid()
     out[p] = wp.min(points[p], size)

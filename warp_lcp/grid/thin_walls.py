@@ -1,9 +1,10 @@
-"""Thin solids: those that a grid's cells cannot hold apart, met by particles as the exact shapes that they are.
+"""Thin solids, which particles meet as exact shapes.
 
-Distances at the nodes of a grid do not see a wall that lies between them, and a particle that a
-step takes to the other side of one finds itself in the open. So the path of each particle within a
-step is looked at in the frame of each solid, from where that was to where it is: what crosses the
-surface stops there and slides on, at the true surface and on its own side.
+A grid's cells cannot separate the two sides of such a solid. Distances at the nodes of a grid do
+not see a wall between the nodes, and a particle that a step takes to the other side of it is in the
+open. Therefore the path of each particle within a step is traced in the frame of each solid, from
+the solid's old place to its new one. Where the path crosses the surface the particle stops and
+slides on, at the true surface and on its own side.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import copy
 
-THIN = 3.0  # cells: what is thinner is met as its exact shape
-SHEET = 1.0  # cells: rigid bodies of at least that cut cells
-STRIDE_ROOM = 0.5  # cells that a moving solid must be thicker than what it may go in a step
-# cells by which shapes are larger than they are, so that there is no crack between those that touch
+THIN = 3.0  # cells: particles meet thinner solids as exact shapes
+SHEET = 1.0  # cells: rigid bodies of at least this thickness cut cells
+STRIDE_ROOM = 0.5  # cells by which a moving solid must be thicker than its largest step
+# Cells by which shapes are enlarged, so that there is no crack between shapes that touch.
 SKIN = 1e-4
-THIN_SHARE = 1e-3  # of a mesh's surface that must be thin for that
-COST = 32  # of a particle, in cells of a usual pass
+THIN_SHARE = 1e-3  # least share of a mesh's surface that is thin, for the mesh to be thin
+COST = 32  # work of a particle, in cells of a usual pass
 Simple = Box | Sphere | Capsule | TriangleMesh
 
 
 def parts_of(geometry: Geometry) -> list[Geometry]:
-    """Return the shapes that a region is the union of."""
+    """Return the shapes of which a region is the union."""
     return (
         [part for of in geometry.parts for part in parts_of(of)]
         if isinstance(geometry, Union)
@@ -44,7 +45,10 @@ def parts_of(geometry: Geometry) -> list[Geometry]:
 
 
 def is_thin(geometry: Geometry, thickness: float, device: wp.Device) -> bool:
-    """Return whether a part of a solid is thinner than `thickness` [m]; half spaces and inverted shapes are not."""
+    """Return whether a part of a solid is thinner than `thickness` [m].
+
+    Half spaces and inverted shapes are not thin.
+    """
     return any(_is_thin(part, thickness, device) for part in parts_of(geometry))
 
 
@@ -58,7 +62,10 @@ def _is_thin(shape: Geometry, thickness: float, device: wp.Device) -> bool:
 
 
 def is_sheet(geometry: Geometry, thickness: float, dimension: int) -> bool:
-    """Return whether all parts of a solid are meshes, or boxes thinner than `thickness` [m] along one axis only."""
+    """Return whether all parts of a solid are sheets.
+
+    Meshes are sheets, and boxes thinner than `thickness` [m] along one axis only.
+    """
     return all(_is_sheet(part, thickness, dimension) for part in parts_of(geometry))
 
 
@@ -70,7 +77,10 @@ def _is_sheet(shape: Geometry, thickness: float, dimension: int) -> bool:
 
 
 def fills_cells(geometry: Geometry, grid: StaggeredGrid, error: float) -> bool:
-    """Return whether a solid is made of boxes whose sides lie on those of cells, but for an `error` [cells]."""
+    """Return whether a solid consists of boxes whose sides lie on faces of cells.
+
+    The sides may be off by `error` [cells].
+    """
     return all(_fills_cells(part, grid, error) for part in parts_of(geometry))
 
 
@@ -90,14 +100,14 @@ class ThinWalls:
 
     Args:
         grid: the grid; any part of the domain's.
-        solids: of the scene; numbers of walls are 1 + s.
-        thin: which of them these are.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there, for
-            good or to the other end of an axis.
-        endless: axes whose sides are the same: solids near one stand beyond the other, too.
+        solids: solids of the scene; numbers of walls are 1 + s.
+        thin: numbers of the thin ones.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there,
+            for good or to the other end of an axis.
+        endless: periodic axes; solids near one side have images beyond the other.
 
     Attributes:
-        numbers: of these solids.
+        numbers: numbers of these solids.
         moves: whether one of them moves.
         least: smallest coordinates of particles [m], -inf where they may leave.
         most: largest coordinates, likewise.
@@ -128,7 +138,7 @@ class ThinWalls:
             for _, of in groups
             for number, part in of
         ]
-        # whose meshes are on the device
+        # Parts of the solids, which own the meshes on the device.
         self._geometries = [part for _, of in groups for _, part in of]
         ends = np.cumsum([0, *(len(of) for _, of in groups)])
         self._groups = list[kernels.ThinGroup]()
@@ -163,7 +173,10 @@ class ThinWalls:
         self.place(0.0)
 
     def place(self, time: float) -> None:
-        """Move the solids to a time [s]; where they were until now is where a step's particles start among them."""
+        """Move the solids to a time [s].
+
+        Their old places are the start of the next step's particle paths.
+        """
         if not self._moving:
             return
         rotations, translations = self._motions.poses([time])
@@ -175,7 +188,10 @@ class ThinWalls:
         self.groups.assign(self._groups)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low and the high corner of a box around the solids where they are [m], shape (3,) each."""
+        """Return the corners of a box around the solids at their current places.
+
+        Low and high corner [m], shape (3,) each.
+        """
         lows, highs = [], []
         for group in self._groups:
             turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
@@ -189,9 +205,9 @@ class ThinWalls:
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def remember(self, position: wp.array) -> None:
-        """Keep the places of particles [m], shape (n,), from which they are about to be moved."""
+        """Store the positions of particles [m], shape (n,), before they move."""
         count = len(position)
-        if count == 0:  # of a rank without material
+        if count == 0:  # a rank without material
             return
         if len(self._start) < count:
             room = count + count // 4
@@ -199,11 +215,13 @@ class ThinWalls:
         copy(self._start[:count], position)
 
     def start_of(self, position: wp.array) -> wp.array:
-        """Return where particles were when they were remembered [m], shape (n,)."""
+        """Return the stored positions of particles [m], shape (n,)."""
         return self._start[: len(position)] if len(position) else position
 
     def stop(self, position: wp.array, *, still: bool) -> None:
-        """Put particles that have passed a thin solid since `remember` back to its surface, and on along it.
+        """Move particles that have crossed a thin solid back to its surface, and along it.
+
+        The paths start at the positions stored by `remember`.
 
         Args:
             position: [m], shape (n,) (updated).
@@ -229,7 +247,10 @@ class ThinWalls:
         )
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Return which points [m], shape (n, 3), keep the distance from these solids; a particle may start there."""
+        """Return a mask of points [m], shape (n, 3), that keep their distance.
+
+        A particle may start there.
+        """
         at = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=self.grid.device)
         room = wp.empty(len(points), dtype=wp.float64, device=self.grid.device)
         reach = wp.float64(2.0 * float(self._margin))
@@ -257,13 +278,13 @@ class ThinWalls:
 
 
 def _images(grid: StaggeredGrid, endless: Sequence[int]) -> list[np.ndarray]:
-    """Return where a solid of a domain stands again along axes without an end [m], (3,) each."""
+    """Return the shifts of a solid's periodic images [m], (3,) each."""
     steps = [(0, -1, 1) if axis in endless else (0,) for axis in range(3)]
     return [grid.extent * np.array(step) for step in product(*steps)]
 
 
 def _alike(one: Motion | None, other: Motion | None) -> bool:
-    """Return whether two motions are the same: those of rigid bodies never are."""
+    """Return whether two motions are the same; those of rigid bodies never are."""
     if one is other or one is None or other is None:
         return one is other
     try:
@@ -273,7 +294,10 @@ def _alike(one: Motion | None, other: Motion | None) -> bool:
 
 
 def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> Any:
-    """Return a shape as kernels take it, larger by a `skin` [m]; a mesh as it is."""
+    """Return a shape as kernels take it, enlarged by a `skin` [m].
+
+    A mesh is not enlarged.
+    """
     assert isinstance(geometry, Simple), "half spaces are not thin"
     result, place, bounds = kernels.ThinShape(), geometry.placement, geometry.bounds()
     assert bounds is not None, "an inverted shape is not thin"

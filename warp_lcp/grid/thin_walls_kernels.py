@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""Exact geometry of thin solids: where a straight path meets them, and kernels that stop particles there.
+"""Exact geometry of thin solids: intersect paths, and stop particles.
 
 All of it is float64: a particle keeps a distance of a thousandth of a cell from a wall, and that
-must survive the way from the domain's coordinates into those of a shape and back.
+must survive the transformation from the domain's coordinates into those of a shape and back.
 """
 
 import warp as wp
@@ -11,13 +11,13 @@ from warp_lcp.grid.cell_kernel import POINTS, list_kernel
 
 MODULE = "warp_lcp.grid.thin_walls"
 BOX, SPHERE, CAPSULE, MESH = 0, 1, 2, 3
-PUSHES = 4  # times that a particle is put off the solids that it starts in, each of them in turn
-SLIDES = 12  # walls that a particle slides along in a step, one after another
-ROUNDS = 8  # how often a path is looked at again among solids of different motions
-ROOM = 0.25  # of the distance that particles keep, that they have in corners at least
-HALVINGS = 6  # of a way into a corner, until there is that room
-MISS = 2.0  # a parameter of a path beyond its end
-ENDLESS = 1.0e30  # half extent [m] of a box without ends
+PUSHES = 4  # most times that a particle is moved off the solids that it starts in, each in turn
+SLIDES = 12  # most walls along which a particle slides in a step
+ROUNDS = 8  # most traces of a path among solids of different motions
+ROOM = 0.25  # least distance in corners, as a fraction of the distance that particles keep
+HALVINGS = 6  # most halvings of a path into a corner, until there is that room
+MISS = 2.0  # parameter of a path beyond its end
+ENDLESS = 1.0e30  # half extent [m] of an unbounded box
 
 _ONE, _ZERO, _MISS = (
     wp.constant(wp.float64(1.0)),
@@ -29,14 +29,17 @@ _TINY = wp.constant(wp.float64(1.0e-300))
 
 @wp.struct
 class ThinShape:
-    """A shape in the frame of its group: q = turn (p - shift) are its own coordinates [m] of a point p."""
+    """Shape in the frame of its group.
+
+    q = turn (p - shift) are the shape's own coordinates [m] of a point p of the group.
+    """
 
     kind: int
     solid: int  # its solid's number
     turn: wp.mat33d
     shift: wp.vec3d
     half: wp.vec3d  # half extents of a box, axis of a capsule from its start [m]
-    radius: wp.float64  # of a sphere or capsule; of a mesh: its unit of length [m]
+    radius: wp.float64  # radius of a sphere or capsule; unit of length of a mesh [m]
     mesh: wp.uint64
     low: wp.vec3d  # corners of a box around it, in the group's frame [m]
     high: wp.vec3d
@@ -44,9 +47,12 @@ class ThinShape:
 
 @wp.struct
 class ThinGroup:
-    """Shapes with one motion: x = turn p + shift of a point p of the group, before and after a step."""
+    """Shapes with one motion.
 
-    first: int  # of its shapes
+    A point p of the group is at x = turn p + shift, before and after a step.
+    """
+
+    first: int  # first of its shapes
     end: int
     turn_before: wp.mat33d
     shift_before: wp.vec3d
@@ -59,7 +65,7 @@ SHAPES, GROUPS = wp.array(dtype=ThinShape), wp.array(dtype=ThinGroup)
 
 @wp.func
 def hit_box(a: wp.vec3d, d: wp.vec3d, half: wp.vec3d):
-    """Return where a path a + t d enters a box, and the normal there."""
+    """Intersect a path a + t d with a box; return t and the normal of the entry."""
     enter = -_MISS
     leave = _MISS
     axis = int(0)
@@ -85,7 +91,7 @@ def hit_box(a: wp.vec3d, d: wp.vec3d, half: wp.vec3d):
 
 @wp.func
 def hit_ball(a: wp.vec3d, d: wp.vec3d, radius: wp.float64):
-    """Return where a path enters a ball about the origin."""
+    """Intersect a path with a ball about the origin."""
     t = _MISS
     dd = wp.dot(d, d)
     ad = wp.dot(a, d)
@@ -99,11 +105,14 @@ def hit_ball(a: wp.vec3d, d: wp.vec3d, radius: wp.float64):
 
 @wp.func
 def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
-    """Return where a path enters a capsule from the origin along an axis, and the normal there."""
+    """Intersect a path with a capsule from the origin along an axis.
+
+    Returns the place on the path, and the normal there.
+    """
     t = hit_ball(a, d, radius)
     t = wp.min(t, hit_ball(a - axis, d, radius))
     size = wp.dot(axis, axis)
-    # the cylinder between: the parts of path and start across the axis
+    # The cylinder between the ends: the components of path and start across the axis.
     across = d - (wp.dot(d, axis) / size) * axis
     start = a - (wp.dot(a, axis) / size) * axis
     s = hit_ball(start, across, radius)
@@ -118,7 +127,10 @@ def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
 
 @wp.func
 def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
-    """Return where a path meets a mesh from either side, and the normal there, against the path."""
+    """Intersect a path with a mesh, from either side.
+
+    Returns the place on the path, and the normal there, against the path.
+    """
     t = _MISS
     n = wp.vec3d()
     length = wp.length(d)
@@ -135,7 +147,11 @@ def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
 
 @wp.func
 def hit(shape: ThinShape, a: wp.vec3d, b: wp.vec3d):
-    """Return where the path from a to b enters a shape, from 0 to 1, `MISS` if it does not, and the normal there; of a group's frame."""
+    """Intersect the path from a to b with a shape.
+
+    Returns the place of the entry on the path, and the normal there. The place is from 0 to 1,
+    `MISS` if the path does not enter. Points are in the group's frame.
+    """
     t = _MISS
     n = wp.vec3d()
     near = bool(True)
@@ -162,9 +178,9 @@ def hit(shape: ThinShape, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
-    """Return the distance of a point [m], and the direction away from the shape, if it is less than `reach`; else `reach`.
+    """Return the distance [m] of a point from a shape, and the direction away from it.
 
-    Of a mesh, which has no inside here, the distance is that to its surface.
+    The distance is at most `reach`. A mesh has no inside here: its distance is that to its surface.
     """
     n = wp.vec3d()
     distance = reach
@@ -218,7 +234,7 @@ def away(shape: ThinShape, p: wp.vec3d, reach: wp.float64):
 
 @wp.func
 def in_plane(n: wp.vec3d, planes: int):
-    """Return a direction within the plane of a 2-D scene; 0 if it has none there."""
+    """Project a normal onto the plane of a 2-D scene, at unit length or 0."""
     result = n
     if planes == 1:
         result = wp.normalize(wp.vec3d(n[0], n[1], _ZERO))
@@ -227,7 +243,10 @@ def in_plane(n: wp.vec3d, planes: int):
 
 @wp.func
 def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, but: int):
-    """Return where the path from a to b first enters one of some shapes, but for one of them, the normal there and the shape."""
+    """Find the first of some shapes that the path from a to b enters.
+
+    Returns the place, the normal there and the shape. The shape `but` is left out.
+    """
     t = _MISS
     n = wp.vec3d()
     which = int(-1)
@@ -245,7 +264,10 @@ def first_hit(shapes: SHAPES, first: int, end: int, a: wp.vec3d, b: wp.vec3d, bu
 def clear_of(
     shapes: SHAPES, first: int, end: int, p: wp.vec3d, margin: wp.float64, planes: int, inside: bool
 ):
-    """Return a point moved off the shapes that it is nearer to than `margin`, or only off those that it lies in; and whether it was."""
+    """Move a point off the shapes that are nearer than `margin`.
+
+    With `inside`, only off those that it lies in. Returns the point, and whether it has moved.
+    """
     x = p
     moved = bool(False)
     for s in range(first, end):
@@ -280,13 +302,13 @@ def free_way(
     margin: wp.float64,
     planes: int,
 ):
-    """Return where a particle ends that goes from `start` towards `aim` among shapes that rest, and whether one was in its way.
+    """Return the end of a path from `start` towards `aim` among shapes at rest.
 
-    It slides on along the surface of what it meets, at a distance of `margin` [m]. Each piece of
-    its way is looked at; where no more can be done it stops at the end of the last one that was
-    free.
+    Also returns whether a shape was in its way. The particle slides along the surface of each shape
+    that it meets, at a distance of `margin` [m]. Each piece of its path is checked. If no further
+    piece is free, it stops at the end of the last free one.
     """
-    # loops whose counts are variables are not unrolled: a twelfth of the code
+    # Loops with variable counts are not unrolled: a twelfth of the code.
     pushes = int(PUSHES)
     slides = int(SLIDES)
     halvings = int(HALVINGS)
@@ -313,8 +335,8 @@ def free_way(
                     or not has_room(shapes, first, end, p, room)
                     or wp.dot(n, n) < wp.float64(0.5)
                 ):
-                    # the corner of two walls: as far as a place that rounding does not take into
-                    # one of them
+                    # Corner of two walls: go as far as rounding does not take the place into one of
+                    # the walls.
                     s = wp.max(t - margin / wp.max(wp.length(way), _TINY), _ZERO)
                     for half in range(halvings):
                         if not has_room(shapes, first, end, x + s * way, room):
@@ -337,7 +359,7 @@ def free_way(
 
 @wp.func
 def into_group(turn: wp.mat33d, shift: wp.vec3d, x: wp.vec3d):
-    """Return the place of a point in the frame of a group."""
+    """Return the position of a point in the frame of a group."""
     return wp.transpose(turn) * (x - shift)
 
 
@@ -354,12 +376,12 @@ def stop_kernel(
     low: wp.vec3d,
     high: wp.vec3d,
 ):
-    """Let no particle on its way from `start` to `position` pass a thin solid.
+    """Stop particles at thin solids on their way from `start` to `position`.
 
-    Within the frame of a group, from where its solids were to where they are, a straight way is
-    looked at. It is exact for translations; that of a particle beside a solid that turns differs by
-    its bend from the true one, and its ends do not. With `still` the solids have not moved. `low`
-    and `high` are corners of what particles may not leave.
+    A straight path is traced in the frame of each group, from the old place of its solids to the
+    new one. This is exact for translations. Beside a solid that turns, the path differs from the
+    true one by its bend, while its ends are exact. With `still` the solids have not moved. `low`
+    and `high` are the corners of the box that particles may not leave.
     """
     x = wp.vec3d(start[i])
     y = wp.vec3d(position[i])
@@ -404,7 +426,10 @@ def room_kernel(
     reach: wp.float64,
     room: wp.array(dtype=wp.float64),
 ):
-    """Measure the distance of points from the nearest thin solid [m], at most `reach`; from a mesh's surface on either side."""
+    """Measure the distance of points from the nearest thin solid [m].
+
+    It is at most `reach`; from a mesh it is measured to the surface on either side.
+    """
     x = wp.vec3d(points[i])
     least = reach
     for g in range(groups.shape[0]):

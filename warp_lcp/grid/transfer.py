@@ -31,9 +31,9 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.memory import Scalar, value_of
 
-TINY_WEIGHT = 1e-9  # below it a face counts as untouched
-# A particle that lies exactly on the boundary between cells would leave one face of its own cell
-# without weight, hence without gravity.
+TINY_WEIGHT = 1e-9  # least weight of a face that particles touch
+# A particle exactly on the boundary between cells would leave one face of its own cell without
+# weight, hence without gravity.
 EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}
 KERNELS = KernelFile(Path(__file__).parent / "headers/transfer.h")
 
@@ -93,7 +93,7 @@ def particles_to_faces(
         offsets: first particle of each stored cell, int32, shape (cells + 1,), of particles that
             are sorted by cell: faces gather. None: particles scatter, in any order; on CUDA the
             last bits then differ from run to run.
-        runs: of `Particles`.
+        runs: `runs` of `Particles`.
     """
     passes = transfer_passes(fields[0].dtype)
     window = window or grid.everywhere
@@ -199,9 +199,9 @@ def accelerate(
     Args:
         window: faces that particles can reach.
         velocity: each component [m/s] (updated).
-        weights: of the particles on each component's faces.
-        change: of each component [m/s], shape (3,); a recorded launch has one for those that are
-            not 0 then.
+        weights: weights of the particles on each component's faces.
+        change: change of each component [m/s], shape (3,); a recorded launch has one for those that
+            are not 0 then.
     """
     for axis, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
         if value_of(change[axis]) != 0.0:

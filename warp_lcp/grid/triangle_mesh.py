@@ -29,8 +29,8 @@ def tube(
         curve: points along the curve, shape (n, 3); the last is joined to the first.
         normals: unit vectors across the curve, shape (n, 3).
         binormals: tangent x normal, shape (n, 3).
-        radius: of the tube, less than the curve's radius of curvature and half the distance of its
-            strands.
+        radius: radius of the tube, less than the curve's radius of curvature and half the distance
+            of its strands.
         sides: number of vertices around the tube.
 
     Returns:
@@ -77,7 +77,7 @@ def knot() -> Triangles:
     second = np.stack(
         [-np.sin(t) - 8 * np.sin(2 * t), -np.cos(t) + 8 * np.cos(2 * t), 9 * np.sin(3 * t)], axis=-1
     )
-    # never zero on this curve, so Frenet's frame closes without a seam
+    # Never zero on this curve, so Frenet's frame closes without a seam.
     binormals = np.cross(first, second)
     binormals /= np.linalg.norm(binormals, axis=1, keepdims=True)
     tangents = first / np.linalg.norm(first, axis=1, keepdims=True)
@@ -92,12 +92,13 @@ BUILTIN: dict[str, Callable[[], Triangles]] = {"torus": torus, "knot": knot}
 
 
 BUILTIN_PREFIX = "builtin:"
-WELD = 1e-6  # of the mesh's diagonal: coarser than float32 coordinates, far finer than a cell
-FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has none
-NO_VOLUME = 1e-9  # of the mesh's diagonal cubed
-LARGEST = 1e18  # of a coordinate, as of a scene's numbers
-# to merge with each, on the average, at most: more are a mesh that shrank to a point beside a
-# vertex astray
+# Fraction of the mesh's diagonal: coarser than float32 coordinates, far finer than a cell.
+WELD = 1e-6
+FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has no area
+NO_VOLUME = 1e-9  # least volume, as a fraction of the mesh's diagonal cubed
+LARGEST = 1e18  # largest coordinate, as for numbers of a scene
+# Vertices to merge with each, at most on average. With more, the mesh has shrunk to a point beside
+# a stray vertex.
 CLOSE_VERTICES = 64
 
 
@@ -110,10 +111,10 @@ class ClosedSurface:
     Build one with `read_mesh`, `builtin_mesh` or `close_surface`, which check that.
 
     Args:
-        name: what messages call it.
+        name: name of the mesh in messages.
         vertices: in the mesh's own units, float64 of shape (n, 3).
         triangles: vertex indices, int32 of shape (m, 3), counterclockwise seen from outside.
-        warnings: what had to be repaired, a line each.
+        warnings: repairs, a line each.
     """
 
     name: str
@@ -233,7 +234,7 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     Args:
         vertices: shape (n, 3), in any unit.
         triangles: vertex indices, shape (m, 3).
-        name: what messages call the mesh.
+        name: name of the mesh in messages.
 
     Raises:
         ValueError: not finite, without triangles, not closed, not orientable, or without volume.
@@ -275,8 +276,7 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     _check_closed(vertices, triangles, name)
     triangles, flipped = _orient(vertices, triangles, name)
     warnings += flipped
-    # Only now: a triangle without area may be what closes the seam between a long edge and the
-    # halves that meet it.
+    # Only now: a triangle without area may close the seam between a long edge and its halves.
     flat = _flat(vertices, triangles)
     degenerate += int(flat.sum())
     if degenerate:
@@ -333,7 +333,7 @@ def _diagonal(vertices: np.ndarray) -> float:
 
 
 def _double_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the normals of the triangles, twice their area long, shape (m, 3)."""
+    """Return the normals of the triangles, of length twice their area, shape (m, 3)."""
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a)
 
@@ -346,16 +346,19 @@ def _flat(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cone_volumes(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the signed volumes of the tetrahedra between the origin and each triangle, shape (m,)."""
+    """Return the signed volumes of the tetrahedra of the origin and each triangle.
+
+    The shape is (m,).
+    """
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
 
 
 def _without_repeated(triangles: np.ndarray) -> np.ndarray:
-    """Return the numbers of triangles without those that there are before with the same corners.
+    """Return the indices of triangles without duplicates of an earlier one.
 
-    Of triangles that are there in both orientations one is left where that closes the surface;
-    where it does not, as in a fin without thickness, they belong there.
+    Duplicates have the same corners. Of triangles that exist in both orientations one is left where
+    that closes the surface. Where it does not, as in a fin without thickness, both stay.
     """
     first = triangles.argmin(axis=1)[:, None]
     turned = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
@@ -370,12 +373,19 @@ def _point(point: np.ndarray) -> str:
 
 
 def _first(corners: np.ndarray) -> str:
-    """Return where the first of some triangles is, `corners` of shape (m, 3, 3), in the mesh's units."""
+    """Return the place of the first of some triangles, as text.
+
+    `corners` has the shape (m, 3, 3), in the mesh's units.
+    """
     return f"the first at {_point(corners[0].mean(axis=0))}"
 
 
 def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each side's edge number and direction, shape (3 m,) with side s of triangle t at 3 t + s, and each edge's number of sides."""
+    """Return the edges of triangles.
+
+    Returns each side's edge number and direction, shape (3 m,), with side s of triangle t at 3 t +
+    s, and each edge's number of sides.
+    """
     sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
     forward = sides[:, 0] < sides[:, 1]
     _, edge, uses = np.unique(
@@ -399,7 +409,10 @@ def _check_closed(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Non
 
 
 def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
-    """Turn triangles until neighbors agree and every part faces outward (an inner wall of a hollow part: into the hollow)."""
+    """Turn triangles until neighbors agree and every part faces outward.
+
+    The inner wall of a hollow part faces into the hollow.
+    """
     warnings = []
     edge, forward, uses = _edges(triangles)
     balance = np.bincount(edge, weights=np.where(forward, 1.0, -1.0))
@@ -428,7 +441,7 @@ def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.
     if volume.sum() < 0.0:
         turn[:] = True
     outward = np.where(turn, -volume, volume)
-    # a hollow is one only where there is something around it
+    # A hollow is one only inside another part.
     for p in np.flatnonzero(outward < 0.0):
         others = part != p
         corners = vertices[
@@ -448,7 +461,10 @@ def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.
 
 
 def _parts(edge: np.ndarray, forward: np.ndarray, uses: np.ndarray) -> tuple[int, np.ndarray]:
-    """Number the closed parts of a balanced surface: their number and each triangle's part, shape (m,)."""
+    """Number the closed parts of a balanced surface.
+
+    Returns the number of parts and each triangle's part, shape (m,).
+    """
     owner = np.arange(edge.size) // 3
     order = np.argsort(edge, kind="stable")
 
@@ -461,8 +477,8 @@ def _parts(edge: np.ndarray, forward: np.ndarray, uses: np.ndarray) -> tuple[int
         return connected_components(links, directed=False)
 
     parts, part = components(uses == 2)
-    # Where more than two triangles meet, parts are one only if none is balanced there by itself
-    # (they do more than touch).
+    # Where more than two triangles meet, parts are joined only if none of them is balanced there by
+    # itself (they do more than touch).
     meetings, meeting = np.unique(edge * parts + part[owner], return_inverse=True)
     unbalanced = (
         meetings[np.bincount(meeting.ravel(), weights=np.where(forward, 1.0, -1.0)) != 0.0] // parts
@@ -473,11 +489,12 @@ def _parts(edge: np.ndarray, forward: np.ndarray, uses: np.ndarray) -> tuple[int
 def _disagreeing(
     triangles: np.ndarray, edge: np.ndarray, forward: np.ndarray, uses: np.ndarray, name: str
 ) -> np.ndarray:
-    """Mark the fewest triangles, shape (m,), whose turning makes all neighbors across edges of two triangles agree.
+    """Mark the fewest triangles to turn so that all neighbors agree, shape (m,).
 
-    Every triangle t appears as t (kept) and t + m (turned). Neighbors that agree are linked like
-    with like, others crosswise: the connected parts of this double cover are the consistent
-    choices, and a triangle linked with its own turned self lies on a one-sided surface.
+    Neighbors are two triangles at an edge of two. Every triangle t appears as t (kept) and t + m
+    (turned). Neighbors that agree are linked like with like, others crosswise. The connected parts
+    of this double cover are the consistent choices, and a triangle linked with its own turned self
+    lies on a one-sided surface.
     """
     m = len(triangles)
     order = np.argsort(edge, kind="stable")

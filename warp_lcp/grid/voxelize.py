@@ -20,10 +20,10 @@ from warp_lcp.grid.staggered import StaggeredGrid
 
 OPEN = -1
 DOMAIN_WALL = 0
-STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
-THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
-# of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be
-# missing
+STRAY = 0.5  # cells by which a mesh may reach out of the domain without a warning
+THIN_SHARE = 0.01  # share of a mesh's surface above which thin parts cause a warning
+# Share of a mesh's surface. More area that is inside out is no blemish: its inside would be
+# missing.
 INVERTED_SHARE = 0.01
 
 
@@ -34,9 +34,9 @@ class PlacedSolid:
     Args:
         geometry: the region it fills.
         separating: whether liquid may leave its wall (otherwise it slides along it only).
-        name: what messages call it, for example `solid[2] (sphere)`.
-        motion: takes the geometry from where it is placed to where it is; None: it stands still.
-        among: what messages call the material around it.
+        name: name of the solid in messages, for example `solid[2] (sphere)`.
+        motion: motion from the initial place of the geometry; None if it stands still.
+        among: name of the surrounding material in messages.
     """
 
     geometry: Geometry
@@ -55,10 +55,10 @@ class VoxelSolids:
             (the ring, but for what lies beyond open sides), 1 + s in cells of solid s.
         separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets
             liquid leave.
-        names: of those indices, the first "domain".
-        covered: number of cells whose center lies in each solid (whichever claimed it), without the
-            domain; shape (solids,).
-        notes: warnings worth a line at the start of a run.
+        names: names by index, the first "domain".
+        covered: number of cells whose center lies in each solid, including cells assigned to
+            another; shape (solids,), without the domain.
+        notes: warnings for the start of a run.
     """
 
     index: wp.array3d(dtype=wp.int32)
@@ -81,10 +81,10 @@ def voxelize(
 
     Args:
         grid: the grid.
-        solids: in the order of their claims.
+        solids: the solids, in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
-        remarks: make notes and refuse errors at the start of a run; False: solids have moved since.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
+        remarks: write notes and refuse errors at the start of a run; False once solids have moved.
         counts: fill `covered`, which waits for the device; needed for remarks.
 
     Raises:
@@ -132,12 +132,12 @@ def voxelize(
 def inside(
     geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str
 ) -> np.ndarray:
-    """Return which points lie inside any of the geometries.
+    """Return a mask of the points that lie inside any of the geometries.
 
     Args:
         geometries: the regions; none contain nothing.
         points: [m], shape (m, 3); z = 0 in 2-D.
-        device: where distances are evaluated.
+        device: device on which distances are evaluated.
 
     Returns:
         bool of shape (m,).
@@ -218,7 +218,7 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
 
     Args:
         geometry: a solid, or the liquid's start.
-        name: what messages call it.
+        name: name of the region in messages.
         grid: the grid, or a part of one.
 
     Raises:
@@ -282,7 +282,10 @@ def repair_notes(geometry: Geometry, name: str) -> list[str]:
 
 
 def _thin_notes(solid: PlacedSolid, grid: StaggeredGrid) -> list[str]:
-    """Return a warning when a mesh has walls that the cells may miss, so that what it is among may pass."""
+    """Return a warning if a mesh has walls that the cells may miss.
+
+    Material may then pass through them.
+    """
     geometry = solid.geometry
     if not isinstance(geometry, TriangleMesh) or geometry.invert:
         return []

@@ -1,4 +1,4 @@
-"""What passes find in the cells of a window: sums, and the largest of something."""
+"""Deterministic sums and maxima over the cells of a window."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from warp_lcp.kernels.vectors import Tally
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-# columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
+# Columns of cells, one a thread, into which a GPU cuts a grid: some waves of the largest GPUs.
 CUDA_SUMS = 1 << 20
-CUDA_PLANES = 16  # of one of them, at least
+CUDA_PLANES = 16  # least planes of a column
 
 ADD_ROWS = KERNELS["warp_lcp.grid.window_reduction.add_rows"]
 
 
 class WindowTally:
-    """A tally over windows of a grid; on the CPU rows are added up as they lie in the grid.
+    """Reduction over windows of a grid; the CPU sums rows in the order of the grid.
 
     Args:
-        declared: a pass over a box, with what it finds.
+        declared: a pass over a box, and the values that it reduces.
         grid: the grid.
-        counted: cells whose rows the CPU adds up; None: those of the window.
+        counted: cells whose rows the CPU sums up; None for those of the window.
     """
 
     def __init__(
@@ -85,31 +85,34 @@ class WindowTally:
         self._reading.changed()
 
     def changed(self) -> None:
-        """Say that a recorded `take` has run."""
+        """Mark the result as changed after a recorded `take` has run."""
         if self._tally is None:
             self._reading.changed()
         else:
             self._tally.changed()
 
     def on_device(self) -> Any:
-        """Return what is found, a number a column, where kernels find it."""
+        """Return the results on the device, a number a column."""
         return self._reading.array if self._tally is None else self._tally.found
 
     def read(self) -> list[float]:
-        """Return what the last launch found."""
+        """Return the results of the last launch."""
         found = self._reading.numpy() if self._tally is None else self._tally.read()
         return [float(v) for v in found]
 
 
 def _numbers(window: Window) -> tuple[Any, ...]:
-    """Return the first plane and row of a window, and how many it has."""
+    """Return the first plane and row of a window, and the number of planes and rows."""
     if isinstance(window, ActiveWindow):
         return *window.first, *window.sizes
     return *window.low[:2], *window.rows
 
 
 def _hulls(window: Window) -> tuple[Any, Any]:
-    """Return how many pieces of rows a window in part has, and those; 0 and None: all of its box."""
+    """Return the pieces of rows of an active window, and their number.
+
+    0 and None stand for the whole box.
+    """
     if isinstance(window, ActiveWindow):
         return window.pieces, window.hull_pieces
     return (0, None) if window.near is None else (len(window._hulls), window._hulls)

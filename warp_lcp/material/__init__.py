@@ -1,1 +1,4 @@
-"""What liquid and sand share: solids and walls as they meet them, gravity, where material comes in and leaves, and how it is evened out."""
+"""Common parts of liquids and sand, on a grid with particles.
+
+Walls and solids, gravity, sources and outlets, airborne material, reseeding and density correction.
+"""

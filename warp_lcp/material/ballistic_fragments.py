@@ -1,4 +1,7 @@
-"""Bodies of material in flight: what touches no wall keeps its momentum and its angular momentum, and goes along its parabola."""
+"""Conserve momentum and angular momentum of airborne material.
+
+Material that no wall touches moves along its parabola.
+"""
 
 from __future__ import annotations
 
@@ -19,45 +22,44 @@ from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material import flight_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
-# [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid
-# resolves
+# [cells^2] Least second moment about an axis, per particle, of a body whose rotation the grid
+# resolves.
 NARROW = 1.0
-ROOM, LEAST = 2, 64  # of bodies that memory is for, over those there are; at least
-VECTORS = 5  # of a body that kernels need
-Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
+ROOM, LEAST = 2, 64  # allocated bodies: a factor on their number, and a minimum
+VECTORS = 5  # vectors of a body that kernels read
+Sums = np.ndarray  # results of `kernels.add_up`, float64, shape (bodies, COLUMNS)
 NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 
 
 class BallisticFragments:
-    """Find the bodies of material that no wall touches in a step, and keep their momenta.
+    """Find bodies of material that no wall touches, and keep their momenta.
 
-    The pressure's impulses on a body in flight add up to nothing, but not what particles take of
-    them: they are not spread as evenly as the volume that the pressure is solved for, and those
-    outside the surface take the velocity of liquid beside them. And a particle that goes along with
-    a flow that turns by an angle a in a step keeps a velocity that does not: a rigid rotation loses
-    a^2 / 2 of its angular momentum. So a body's particles are moved anew once it is known where the
-    step brings them:
+    The pressure's impulses on an airborne body add up to zero, but not the impulses that its
+    particles get from them. They are not spread as evenly as the volume for which the pressure is
+    solved, and particles outside the surface take the velocity of liquid beside them. Moreover, a
+    particle that moves with a flow that turns by an angle a in a step keeps a velocity that does
+    not turn: a rigid rotation loses a^2 / 2 of its angular momentum. Therefore a body's particles
+    are moved again, once the end of the step is known:
 
-    - through a velocity that goes along with the body: in one that stays where it is the middle of
-      a spinning drop moves aside by a / 2 of its way;
-    - what they have of the body's rigid rotation turns with it, which is what the pressure that
-      keeps it together does;
-    - a rigid motion, by which nothing is strained, gives the body back the momentum and the angular
-      momentum, of the particles' x and v, that it had before the transfer to the grid, and
-      gravity's;
-    - where it then moved faster within itself than before, what is not rigid slows down until it
-      does not.
+    - They move through a velocity field that translates with the body. In a field at rest the
+      middle of a spinning drop would move aside by a / 2 of its path.
+    - Their part of the body's rigid rotation turns with the body. This is the effect of the
+      pressure that keeps the body together.
+    - A rigid motion, which causes no strain, restores the momentum and the angular momentum (of the
+      particles' x and v) that the body had before the transfer to the grid, plus those of gravity.
+    - If the body then moves faster within itself than before, its non-rigid velocity is scaled down
+      until it does not.
 
-    Bodies are made of cells with faces between them that particles gave weight; a lone particle is
-    one.
+    Bodies are sets of cells that are connected by faces with particle weight; a lone particle is a
+    body.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
-        coheres: whether a pressure below that of the air keeps a body that turns together; else its
-            particles go straight on.
-        settles: whether what is packed too densely is pushed apart in flight, and so may move
-            faster within itself.
+        coheres: whether a pressure below that of the air keeps a rotating body together; if not,
+            its particles go straight on.
+        settles: whether overfull material is pushed apart in flight, and may so move faster within
+            itself.
     """
 
     def __init__(
@@ -81,12 +83,12 @@ class BallisticFragments:
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._flight.origin = wp.vec3i(*grid.origin)
         self._before: Sums = NOTHING
-        # of the last search; None: nothing near this process's cells
+        # Window of the last search; None if it has no cells of this process.
         self._seen: Window | None = None
         self._numbers = BodyNumbers(0)
         self._growing = LaunchGraph(grid.device, self._launch_growth)
         self._rate, self._quanta = Scalar(), Scalar()  # see `flight_kernels.add_up`
-        self._list = ListMemory(grid.device)  # of the bodies' particles
+        self._list = ListMemory(grid.device)  # list of the bodies' particles
         self._vectors, self._start = (
             np.zeros((0, VECTORS, 3), dtype=np.float32),
             wp.zeros(0, dtype=wp.vec3, device=grid.device),
@@ -102,10 +104,10 @@ class BallisticFragments:
         )
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
-        """Find bodies in flight, without waiting for their number; arguments as of `begin`.
+        """Find airborne bodies, without waiting for their number; arguments as of `begin`.
 
-        Grow the trees of the window's cells and of those below it whose faces they are: of a part
-        of the grid beside its own cells.
+        Grow the trees of the window's cells, and of the cells below it whose faces are in it: on a
+        part of the grid those beside its own cells.
         """
         part, self._found = self.grid.part, True
         self._seen, around = part.near(window, 1), part.near(window, 2)
@@ -118,7 +120,7 @@ class BallisticFragments:
     def _launch_growth(
         self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array
     ) -> None:
-        """Launch what grows the trees, and numbers the bodies."""
+        """Launch the growth of the trees, and the numbering of the bodies."""
         parent, held, several = self._parent, self._held, self._several
         u, v, w = three_components(weights)
         around.run(kernels.ALONE, kind=kind, parent=parent, held=held, several=several)
@@ -151,15 +153,15 @@ class BallisticFragments:
         dt: float,
         change: np.ndarray,
     ) -> int:
-        """Find the bodies before particles take their new velocities, and return how many there are.
+        """Find bodies, before particles get new velocities; return their number.
 
         Args:
             particles: the material; `key` holds its cells.
             window: cells that it can touch.
-            weights: of the particles on each component's faces.
+            weights: weights of the particles on each component's faces.
             kind: int8 of AIR, FLUID, SOLID, of the step's solve.
             dt: time step [s].
-            change: of the velocity by gravity in this step [m/s], shape (3,).
+            change: change of the velocity by gravity in this step [m/s], shape (3,).
         """
         if not self._found:
             self.find(window, weights, kind)
@@ -174,8 +176,8 @@ class BallisticFragments:
         self._reserve(particles, bodies)
         self._list.resize(self._board(particles))
         self._rate.value = dt / self.grid.spacing
-        # no sum of products of positions and velocities, which are of fewer cells than the domain
-        # has along its longest side, overflows
+        # No sum of products of positions and velocities may overflow; these are of fewer cells than
+        # the domain has along its longest side.
         longest = max(self.grid.domain_counts)
         self._quanta.value = 2.0 ** math.floor(
             60.0 - math.log2(sum(particles.exchange.counts) * longest**2)
@@ -186,7 +188,7 @@ class BallisticFragments:
         return bodies
 
     def _reserve(self, particles: Particles, bodies: int) -> None:
-        """Have room for so many bodies of some of these particles."""
+        """Allocate memory for a number of bodies with some of these particles."""
         flight, device, most = self._flight, self.grid.device, particles.capacity
         if bodies <= len(self._vectors) and most <= len(self._start):
             return
@@ -205,7 +207,7 @@ class BallisticFragments:
             graph.forget()
 
     def _launch_boarding(self, particles: Particles) -> None:
-        """Launch the list of the particles of bodies."""
+        """Launch the listing of the bodies' particles."""
         inputs = [
             particles.key,
             self._parent,
@@ -219,12 +221,12 @@ class BallisticFragments:
         )
 
     def _launch_lift(self, particles: Particles) -> None:
-        """Launch the sums over the bodies' particles where they are."""
+        """Launch the sums over the bodies' particles at their places before the step."""
         clear(self._flight.sums)
         self._add(kernels.lift_kernel, particles, [particles.position, self._start])
 
     def _launch_flight(self, particles: Particles, velocity: list[wp.array]) -> None:
-        """Launch the way of the bodies' particles, and the sums over them where they come to."""
+        """Launch the advection of the bodies' particles, and sums at the new places."""
         clear(self._flight.sums)
         wall, arrived = self.boundary, [self._x, self._near]
         inputs = [
@@ -240,17 +242,17 @@ class BallisticFragments:
         self._add(kernels.arrive_kernel, particles, arrived)
 
     def _launch_landing(self, particles: Particles) -> None:
-        """Launch what gives the bodies' particles their places and velocities."""
+        """Launch the update of the bodies' particles: places and velocities."""
         moved = [particles.velocity, *three_components(particles.affine)]
         self._carry(kernels.land_kernel, [*moved, self._motion, self._end, particles.position])
 
     def end(self, particles: Particles, velocity: Sequence[wp.array]) -> None:
-        """Move the bodies' particles anew, after all have moved, and give them what they lack.
+        """Move the bodies' particles again, and correct their momenta.
 
         Args:
             particles: those of `begin`, in their order, with new velocities (updated: position,
                 velocity, gradients).
-            velocity: of each component on the faces [m/s].
+            velocity: velocity of each component on the faces [m/s].
         """
         if len(self._before) == 0:
             return
@@ -275,13 +277,13 @@ class BallisticFragments:
         if self._settles:
             share[:] = 1.0
         push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
-        share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
+        share[after[:, kernels.LEAVES] > 0.0] = -1.0  # the body meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift
         self._tell(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
         self._landing.run(particles)
 
     def _board(self, particles: Particles) -> int:
-        """List the bodies' particles, and the body of each; return how many there are."""
+        """List the bodies' particles, and the body of each; return their number."""
         self._boarding.run(particles)
         self._count.changed()
         count, body_of_tree = int(self._count.numpy()[1]), self._numbers.of_tree
@@ -297,7 +299,10 @@ class BallisticFragments:
         return len(flying)
 
     def _sums(self, bodies: int) -> Sums:
-        """Return the sums over each body of the last launch, of all processes' particles: whole numbers, in quanta."""
+        """Return the sums over each body of the last launch, as integers in quanta.
+
+        They include the particles of all processes.
+        """
         whole, several = self._flight.sums.numpy()[:bodies], self._numbers.several
         if several:  # the same on all ranks
             whole = np.concatenate([self.grid.part.ranks.sum(whole[:several]), whole[several:]])
@@ -306,14 +311,14 @@ class BallisticFragments:
         return sums
 
     def _tell(self, *vectors: np.ndarray) -> None:
-        """Tell kernels vectors of each body, shape (bodies, 3) each."""
+        """Copy vectors of each body, shape (bodies, 3) each, to the kernels' memory."""
         for number, values in enumerate(vectors):
             self._vectors[: len(values), number] = values
         if self.grid.device.is_cuda:
             self._motion.assign(self._vectors)
 
     def _add(self, kernel: wp.Kernel, particles: Particles, inputs: Sequence[object]) -> None:
-        """Launch a kernel that adds up the bodies' particles."""
+        """Launch a kernel that sums over the bodies' particles."""
         flight = self._flight
         given = [self._who, flight, self._rate, self._quanta, particles.velocity, *inputs]
         launch_list(
@@ -334,12 +339,18 @@ def _about_center(sums: Sums) -> np.ndarray:
 
 
 def _about_mean(sums: Sums) -> np.ndarray:
-    """Return the sums of the squares of velocities relative to the bodies' own, shape (bodies,)."""
+    """Return the sums of squared velocities relative to the bodies' means.
+
+    The shape is (bodies,).
+    """
     return sums[:, 16] - (sums[:, 4:7] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
 
 
 def _turning(sums: Sums, *momenta: np.ndarray) -> list[np.ndarray]:
-    """Return the rigid rotations that have angular momenta about the bodies' centers, in cells and steps, shape (bodies, 3) each."""
+    """Return the rigid rotations with given angular momenta about the bodies' centers.
+
+    The unit is that of cells and steps; the shape is (bodies, 3) each.
+    """
     least, center = (
         NARROW * np.maximum(sums[:, :1], 1.0),
         sums[:, 1:4] / np.maximum(sums[:, :1], 1.0),

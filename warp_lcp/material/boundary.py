@@ -1,7 +1,7 @@
 """Walls and solids: open fractions and velocity of faces, admitted positions.
 
-Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBoundary`, whose faces
-are open in part, whose particles keep their distance, and whose solids may move.
+Two classes have the same interface: `WholeCells`, whose cells are solid or open, and `CutBoundary`,
+whose faces are open in part, whose particles keep their distance, and whose solids may move.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ class Boundary(Protocol):
     """Solids and the domain's walls.
 
     Attributes:
-        sides: of axes without an end; None: there are none.
-        open_sides: of the domain, see `warp_lcp.grid.sides`; those of axes without an end are among
-            them.
+        sides: the periodic sides; None if there are none.
+        open_sides: open sides of the domain, see `warp_lcp.grid.sides`; they include the sides of
+            periodic axes.
         base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open
             sides.
         touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face
             separates.
         open: float32 open fraction a_f of each component's lower faces; empty: a face is closed
             where a cell beside it is SOLID.
-        velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand
-            still.
-        capacity: float32 share of a cell's quadratic kernel that is open.
-        distance: float32 distance to the solids at the cells' low corners [cells]; None: whole
-            cells, no distance.
+        velocity: float32 velocity of the solids on each component's faces [m/s]; empty if they
+            stand still.
+        capacity: float32 open fraction of a cell's quadratic kernel.
+        distance: float32 distance to the solids at the cells' low corners [cells]; None for whole
+            cells.
         kinks: times [s] at which the velocity of a solid jumps.
-        thin: solids that particles meet as exact shapes; None: none is thin.
+        thin: solids that particles meet as exact shapes; None if none is thin.
     """
 
     moves: bool  # whether a solid moves
@@ -117,11 +117,11 @@ class Boundary(Protocol):
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Return at which points [m], shape (n, 3), a particle may start.
 
-        Beyond what open cells imply.
+        This restricts positions further than open cells do.
         """
 
     def shapes(self) -> Sequence[Geometry]:
-        """Return the solids' shapes where they are, if walls are where these have them."""
+        """Return the solids' current shapes, if the walls coincide with them."""
 
 
 class WholeCells:
@@ -129,12 +129,12 @@ class WholeCells:
 
     Args:
         grid: the grid.
-        solids: which cells are solid, and whose walls separate.
+        solids: the solid cells, and the walls that separate.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
-            constant; the cells stay where they are. None: all stand still.
-        open_sides: those that `solids` was made with, but for the next.
-        sides: of axes without an end; `solids` has them open.
-        shapes: of the solids, if they fill whole cells exactly.
+            constant; the cells stay fixed. None if all are at rest.
+        open_sides: the open sides for which `solids` was made, except periodic ones.
+        sides: the periodic sides, which are open in `solids`; None if there are none.
+        shapes: shapes of the solids, if they fill whole cells exactly.
 
     Raises:
         ValueError: `wall_velocity` has another shape.
@@ -276,19 +276,20 @@ ALIKE = 1e-2  # cells by which solids may differ at the two sides of a periodic 
 class CutBoundary:
     """Solids as cut cells with a distance; implements `Boundary`.
 
-    In a step that starts at time t the pressure meets the solids where they are at t, moving as
-    they will until t + dt. Then they move, and the particles with them: a particle may go where it
-    is open before or after, and what is then inside a solid is pushed out. So a wall that advances
-    pushes what its own velocity has not carried away, and one that retreats can be followed. On
-    ranks making it is collective, and so are `place` and `top_speed` where solids move.
+    In a step that starts at time t the pressure uses the solids' places at t and their velocity
+    from t to t + dt. Then the solids move, and the particles with them: a particle may move where
+    space is open before or after the step, and particles that are then inside a solid are pushed
+    out. So an advancing wall pushes particles that its own velocity has not carried away, and
+    particles can follow a retreating wall. On ranks, making this object is collective, and so are
+    `place` and `top_speed` where solids move.
 
     Args:
         grid: the grid.
         cut: the solids, with their capacity.
-        sides: of axes without an end, if there are any; `cut` has walls there.
-        thin: those of the solids that particles meet as exact shapes; None: none is thin.
-        barriers: those of them that do not cut cells but hold apart what is on their two sides;
-            None: there are none.
+        sides: the periodic sides, if there are any; `cut` has walls there.
+        thin: the solids that particles meet as exact shapes; None if none is thin.
+        barriers: the thin solids that do not cut cells but separate their two sides; None if there
+            are none.
 
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
@@ -325,13 +326,13 @@ class CutBoundary:
         self.velocity: Faces = cut.velocity or []
         self.touch = grid.field(wp.uint8)
         self._scratch = grid.faces()
-        # distance where particles may go within a step
+        # Distance that decides where particles may move within a step.
         self._reachable = grid.field() if cut.moves else cut.distance
         self._counts, self._dt = DeviceScalar(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
         ranks = grid.part.ranks
-        # of the solids, whose speeds this process looks at
+        # Solids whose speeds this process evaluates.
         share = slice(ranks.rank, None, ranks.size)
         self._motions = Motions(cut.motions.motions[share])
         self._bounds = boxes_of(
@@ -406,21 +407,27 @@ class CutBoundary:
         self._counts.changed()
 
     def _look_around(self, fields: Faces, dt: float, position: wp.array) -> None:
-        """Find where particles go by what they see of the velocity among thin solids, before those move."""
+        """Advect particles near thin solids by the velocity that they see.
+
+        The solids have not moved yet.
+        """
         if self.thin is not None:
             self.thin.remember(position)
             if self.barriers is not None:
                 self.barriers.carry(fields, dt, self.thin.start_of(position))
 
     def _stop_at_thin_walls(self, position: wp.array, *, still: bool) -> None:
-        """Have particles go where that was, and stop them at thin solids, which have moved unless `still`."""
+        """Move particles as `_look_around` has found, and stop them at thin solids.
+
+        The solids have moved unless `still`.
+        """
         if self.thin is not None:
             if self.barriers is not None:
                 self.barriers.bring(self.thin.start_of(position), position)
             self.thin.stop(position, still=still)
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
-        """Move the particles where the solids are or have been, then out of the solids."""
+        """Move the particles among the solids' old and new places, then out of the solids."""
         counts, distance = self._counts.array, self.cut.distance
         clear(counts)
         if self.moves:
@@ -475,7 +482,7 @@ class CutBoundary:
         ]
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Return which points [m], shape (n, 3), keep the distance from walls."""
+        """Return a mask of points [m], shape (n, 3), that keep the distance from walls."""
         coordinates = self.grid.to_grid(points)
         if self.grid.dimension == 2:
             coordinates[:, 2] = 1.0
@@ -502,7 +509,10 @@ class CutBoundary:
         return result if self.thin is None else result & self.thin.admits(points)
 
     def _join_sides(self) -> None:
-        """Add to the capacity of cells what their kernels reach beyond sides that are the same; refuse solids that differ there."""
+        """Complete the capacity of cells whose kernels reach beyond periodic sides.
+
+        Solids that differ at the two sides are refused.
+        """
         if self.sides is None:
             return
         if self.capacity is not None:
@@ -515,7 +525,10 @@ class CutBoundary:
                 )
 
     def _keep_distance(self) -> None:
-        """Launch the copy of the distance before the solids move: particles may go where it is open before or after."""
+        """Launch the copy of the distance before the solids move.
+
+        Particles may move where space is open before or after the step.
+        """
         copy(self._reachable, self.cut.distance)
 
     def _cross(self) -> None:
@@ -525,7 +538,7 @@ class CutBoundary:
             self._find_walls()
 
     def _find_walls(self) -> None:
-        walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third
+        walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # 2-D does not use the third
         self.grid.domain.launch(
             kernels.touch_cut_kernel, [self.grid.planes, *walls, self.cut.separating, self.touch]
         )

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels that say what solids mean to the cells and faces beside them; they run when solids are placed."""
+"""Kernels of cells and faces beside solids; they run when solids are placed."""
 
 import typing
 
@@ -10,8 +10,8 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 TOUCHES_NOTHING = 0  # no solid face
-HELD = 1  # a wall cell whose material stays on its walls
-RELEASED = 2  # a wall cell whose material is leaving
+HELD = 1  # a wall cell whose material stays at its walls
+RELEASED = 2  # a wall cell whose material separates
 
 TOUCHES = 1  # bits of `touch`: a face of the cell is not open,
 LETS_GO = 2  # and one of those belongs to a wall that separates
@@ -26,13 +26,13 @@ options: dict[str, typing.Any] = {"module": "warp_lcp.material.boundary"}
 
 @cell_kernel("warp_lcp.material.boundary")
 def base_kernel(k, j, i, index: I32, base: I8):
-    """Cells without material: SOLID where there is a wall, AIR elsewhere."""
+    """Mark cells with a wall as SOLID, others as AIR."""
     base[k, j, i] = wp.where(index[k, j, i] >= 0, _SOLID, _AIR)
 
 
 @wp.func
 def touch_of(separates: wp.uint8):
-    """Return what a wall adds to the touch of the cells beside it."""
+    """Return the bits that a wall adds to the touch of cells beside it."""
     return wp.where(separates != wp.uint8(0), TOUCHES | LETS_GO, TOUCHES)
 
 
@@ -57,7 +57,7 @@ def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), plan
 def touch_cut_kernel(
     k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating: wp.array(dtype=wp.uint8), touch: U8
 ):
-    """Find the walls on the faces of each cell; -1 is a face that is open."""
+    """Find the walls on the faces of each cell; -1 marks an open face."""
     found = int(0)
     for side in range(2):
         x = int(wx[k, j, i + side])
@@ -87,7 +87,10 @@ def wall_velocity_kernel(
     shift: wp.array(dtype=wp.vec3),
     field: F32,
 ):
-    """Velocity turn x + shift [m/s] of the wall on the faces of one component that it closes, 0 elsewhere."""
+    """Set the velocity turn x + shift [m/s] of the wall on the faces that it closes.
+
+    Other faces of the component get 0.
+    """
     c, b, a = cell_below(axis, k, j, i)
     wall = wp.max(index[k, j, i], index[c, b, a])
     u = float(0.0)

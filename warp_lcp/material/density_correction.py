@@ -1,6 +1,6 @@
 """Density correction: LCP for a displacement that removes overfull cells.
 
-Also a monitor of the density ([Book] 1.3.3).
+The module also has a monitor of the density ([Book] 1.3.3).
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
-    # that displacements are divided by: thin spray need not carry off what a full cell has too much
+    # Least density by which displacements are divided: thin spray need not take up the excess of a
+    # full cell.
     "LEAST_DENSITY": 0.5,
-    "LEAST_CAPACITY": 0.1,  # that densities are divided by there
-    "HALF": 0.5,  # of what a cell holds: with less it is at the surface
+    "LEAST_CAPACITY": 0.1,  # least capacity by which densities are divided there
+    "HALF": 0.5,  # share of what a cell can hold; a cell with less is at the surface
 }
 
 
@@ -44,7 +45,7 @@ CROWD = KERNELS["warp_lcp.material.crowding.crowd"]
 
 @functools.cache
 def displacement_pass(cut: bool) -> StencilKernel:
-    """Return the kernel of the displacement; `cut`: faces have open fractions."""
+    """Return the kernel of the displacement; with `cut`, faces have open fractions."""
     name = "warp_lcp.material.density_correction"
     return KERNELS.kernel(f"{name}.displace", module=name + "_cut" * cut, constants={"CUT": cut})
 
@@ -57,10 +58,11 @@ def add_kernel(
     sum[0] = a[0] + b[0]
 
 
-LONGEST = 0.5  # cells that a correction moves a particle at most
-EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
-# of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells
-# deep
+LONGEST = 0.5  # cells by which a correction moves a particle at most
+# Root mean square excess of overfull cells that is not worth a solve, relative to a cell.
+EXCESS = 1e-3
+# Fraction of the diagonal. It gives closed pockets a solution, and leaves 0.5 % of the excess 45
+# cells deep.
 SHIFT = 1e-5
 
 
@@ -72,8 +74,8 @@ class DensityMonitor:
     Args:
         grid: the grid.
         boundary: solids and walls.
-        particles_a_cell: of material at rest.
-        max_density: of a cell, in units of the density at rest.
+        particles_a_cell: number of particles in a cell of material at rest.
+        max_density: largest density of a cell, in units of the density at rest.
     """
 
     def __init__(
@@ -87,7 +89,8 @@ class DensityMonitor:
         )
         self._crowd = WindowTally(CROWD, grid, grid.part.owned)
         self._density: wp.array | None = None
-        self._known: tuple[float, float] | None = None  # what was found since the last `measure`
+        # Result of the last `measure`, once it has been read.
+        self._known: tuple[float, float] | None = None
         self._trail, self._cells = DirtyRegion(grid.part.owned), ActiveWindow(grid.domain)
         self._measuring = LaunchGraph(grid.device, self._launch)
 
@@ -95,9 +98,10 @@ class DensityMonitor:
         """Measure the density; `found` then returns the result.
 
         Args:
-            density: of the particles, in units of that at rest, float32; None: it is found here.
-            particles: the material; where the density is found here they must not have moved since
-                they were sorted.
+            density: density of the particles, in units of that at rest, float32; computed here if
+                None.
+            particles: the material; where the density is computed here they must not have moved
+                since they were sorted.
             window: cells that hold all particles, with two to spare on each side.
         """
         if density is None:
@@ -120,7 +124,7 @@ class DensityMonitor:
         The density at rest is 1.
         """
         if self._known is None:
-            # what is beyond what cells may hold, what there is, the largest density
+            # Excess over the limits, total amount, largest density.
             everyone = self.grid.part.ranks.gather(self._crowd.read())
             above, held = everyone[:, :2].sum(axis=0).tolist()
             self._known = above / held if held > 0.0 else 0.0, float(everyone[:, 2].max())
@@ -134,7 +138,7 @@ def density_of_all(
     particles_a_cell: int,
     density: wp.array,
 ) -> None:
-    """Find the density of all processes' particles; collective.
+    """Compute the density of all processes' particles; collective.
 
     Arguments as of `particle_density`.
     """
@@ -152,9 +156,9 @@ class DensityFields:
         kind: int8 cell types of the problem (written).
         b: right-hand side (written).
         x: solution of the last problem, the start of this one.
-        density: of the material, in units of that at rest, float32.
-        capacity: open share of each cell's kernel, float32; None: 1.
-        inside: cells deep inside, which may lack material; None: none.
+        density: density of the material, in units of that at rest, float32.
+        capacity: open fraction of each cell's kernel, float32; None for 1.
+        inside: cells deep inside, which may lack material; None if there are none.
     """
 
     kind: wp.array
@@ -170,7 +174,7 @@ class Correction:
     """Result of a density correction.
 
     Attributes:
-        result: of the solve; None: no cell was overfull, and nothing has moved.
+        result: result of the solve; None if no cell was overfull and nothing has moved.
         over_full: cells above the largest density, and cells deep inside below the least.
         max_density: before the correction, in units of the density at rest: 1 and the most by which
             a cell exceeds what fits beside walls.
@@ -195,17 +199,17 @@ class DensityCorrection:
         0 <= x_i complementary to y_i = sum over faces of a_f (x_i - x_neighbor) + rho_max
         capacity_i - rho_i >= 0,
 
-    a_f the open fraction of a face. Every open cell that a particle's kernel reaches is an unknown,
-    those at the surface too, x = 0 in the others: nothing pulls, the surface needs no condition.
-    Particles go d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell, along walls
-    where they meet one. Their velocities stay as they are, so momentum is conserved.
+    with a_f the open fraction of a face. Every open cell that a particle's kernel reaches is an
+    unknown, also at the surface; x = 0 in the others. There is no suction, so the surface needs no
+    condition. Particles move by d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell,
+    and along walls that they meet. Their velocities stay unchanged, so momentum is conserved.
 
-    With `even` a cell is an equation where it and all cells around it are more than half full:
-    inside a liquid that keeps its volume. y_i = 0 then moves what is beyond rho_max, or below 2 -
-    rho_max, to or from the surface, and leaves the density of other cells as it is; x may have
-    either sign. Without it nothing closes the voids that a flow draws, every cell is truncated at
-    rho_max from above alone, and the liquid grows: a thin pool by 5 %. Where a wall lets go there
-    is a surface too, and nothing is drawn to it.
+    With `even` a cell has the equation y_i = 0 instead, if it and all cells around it are more than
+    half full: inside a liquid that keeps its volume. The equation moves the excess over rho_max, or
+    the deficit below 2 - rho_max, to or from the surface, and leaves the density of other cells
+    unchanged; x may have either sign. Without `even` the voids that a flow creates are not closed,
+    every cell is truncated at rho_max from above alone, and the liquid grows: a thin pool by 5 %. A
+    wall that separates has a surface as well, and nothing is drawn to it.
 
     The operator, the method and its hierarchy are the pressure's. Where solids cut cells, pockets
     between them may be closed and count particles beyond a thin wall; SHIFT keeps their problem
@@ -215,7 +219,7 @@ class DensityCorrection:
         grid: the grid.
         boundary: solids and walls.
         solver: settings of the method.
-        particles_a_cell: of material at rest.
+        particles_a_cell: number of particles in a cell of material at rest.
         max_density: rho_max, > 0. A material at rest whose particles lie at random would grow with
             1.
         gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives
@@ -223,12 +227,12 @@ class DensityCorrection:
         even: whether cells inside the material are to hold neither too much nor too little.
         every: steps from one correction to the next.
         tolerance: relative residual at which a solve is done.
-        max_iterations: of the method; the best iterate is taken then.
+        max_iterations: limit of iterations of the method; the best iterate is taken then.
 
     Attributes:
         x: the last solution [cells^2], float64, the guess of the next.
-        density: of the particles before the last correction, float32.
-        displacement: of the last correction on the faces of each axis [m], float32.
+        density: density of the particles before the last correction, float32.
+        displacement: displacement of the last correction on the faces of each axis [m], float32.
     """
 
     def __init__(
@@ -274,14 +278,14 @@ class DensityCorrection:
             if boundary.open or even
             else None
         )
-        # built when there is material: an empty problem is refused
+        # Made when there is material, since an empty problem is refused.
         self._problem: wl.LCP | None = None
         self._solved = grid.part.owned  # the cells of the problem
-        # fields of a rank's part, and those of its problem
+        # Fields of a rank's part, and those of its problem.
         self._copied: list[tuple[wp.array, wp.array]] = []
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
-        self._way = Scalar()  # by which the displacement is multiplied [m]
+        self._way = Scalar()  # factor on the displacement [m]
         launches = (
             self._launch_preparation,
             self._launch_displacement,
@@ -306,12 +310,13 @@ class DensityCorrection:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
             fill: adds the density of liquid without particles in a window.
-            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`;
-                None: they do not.
-            share: of the displacement that particles go.
+            contact: uint8, RELEASED where walls separate, see `warp_lcp.material.boundary_kernels`;
+                None if no wall separates.
+            share: fraction of the displacement by which particles move.
         """
         if particles.offsets is not None:
-            # they have moved: gathering needs the order, and gives the same bits on every run
+            # The particles have moved. Gathering needs the order, and gives the same bits on every
+            # run.
             particles.sort()
         particles.look_around()
         variant = window.near is None, contact is None, particles.runs is None
@@ -326,7 +331,7 @@ class DensityCorrection:
             self.x.zero_()
             return Correction(None, 0, most)
         result = self._solve(over_full) if result is None else result
-        # a closed room is too full: there is no way out
+        # A closed room is too full: the excess has no way out.
         if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):
             self.x.zero_()
             return Correction(result, over_full, most)
@@ -368,13 +373,13 @@ class DensityCorrection:
         self.boundary.displace(self.displacement, particles.position)
 
     def _take(self, x: wp.array) -> None:
-        """Take the solution of the problem."""
+        """Store the solution of the problem."""
         part = self.grid.part
         part.store(x, self.x, self._guess)
         part.fill(self._kind)
 
     def _prepare(self, contact: wp.array | None) -> None:
-        """Set up the problem, and count over-full cells."""
+        """Set up the problem, and count overfull cells."""
         b, most = self.boundary, self.max_density
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
         self._over.take(
@@ -393,7 +398,10 @@ class DensityCorrection:
                 )
 
     def _found(self) -> tuple[int, float]:
-        """Return how many cells are over-full or lack material deep inside, and the largest density; collective."""
+        """Count the cells that are overfull or lack material deep inside; collective.
+
+        Returns their number, and the largest density.
+        """
         lacking = 0.0
         if self._inside is not None:
             (lacking,) = self._lacking.read()
@@ -412,7 +420,7 @@ class DensityCorrection:
         return self._solved_to(criteria)
 
     def _begins_ahead(self) -> bool:
-        """Return whether a GPU begins the solve before the host knows of over-full cells."""
+        """Return whether a GPU starts the solve before the host knows of overfull cells."""
         return (
             self._problem is not None
             and not self.grid.part.shared
@@ -420,7 +428,10 @@ class DensityCorrection:
         )
 
     def _solve_counting(self) -> wl.SolveResult:
-        """Solve while the cells are counted: one readback has the count, too; without such cells nothing is solved."""
+        """Solve while the cells are counted, with one readback for both.
+
+        If the count is 0, nothing is solved.
+        """
         self._take_cells()
         counted = self._over.on_device() if self._inside is None else self._counted
         criteria = MeanCriteria(
@@ -439,7 +450,7 @@ class DensityCorrection:
         )
 
     def _take_cells(self) -> None:
-        """Give the problem the cells, and where solids meet them."""
+        """Copy the cells, and solids beside them, to the problem."""
         self._copying.run()
         if self.boundary.moves:
             self._copying_faces.run()
@@ -469,12 +480,12 @@ class DensityCorrection:
         return wl.LCP(self._operator, b, 0.0 if lower is None else lower, np.inf)
 
     def _copy_cells(self) -> None:
-        """Give a rank's problem what the fields of its part hold."""
+        """Copy the fields of a rank's part to its problem."""
         for field, box in self._copied:
             self.grid.part.copy_to_box(field, box)
 
     def _copy_faces(self) -> None:
-        """Give it the faces' open fractions."""
+        """Copy the faces' open fractions to a rank's problem."""
         for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
 

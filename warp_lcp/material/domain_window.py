@@ -1,4 +1,4 @@
-"""The part of a domain that a simulation's grid covers: as large as its material, not as its box."""
+"""Grid window that follows the material through the domain."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ from warp_lcp.grid.staggered import StaggeredGrid
 if TYPE_CHECKING:
     from warp_lcp.material.particle_scene import ParticleScene
 
-# cells, of which a part's ends are multiples: its coarse levels then have the cells that those of
-# the domain have
+# Cells. The ends of a part are multiples of this number, so that its coarse levels have the cells
+# of the domain's coarse levels.
 ALIGNED = 8
-# of a domain whose grid need not cover all of it: a smaller one costs less than laying grids
+# Least cells of a domain whose grid may cover a part of it. For a smaller one the full grid costs
+# less than new grids.
 LEAST_CELLS = 1 << 18
-# cells at most that a grid has to spare on a side when it is laid, an eighth of what it covers if
-# that is more
+# Cells, at most, of a new grid beyond the required ones on each side; or an eighth of the required
+# cells, if that is more.
 SPARE = 8
-AHEAD = 16  # steps that it is laid for, as the material moves now
-START = 10  # cells around a material at the start that its first steps reach
-MOST = 0.5  # of the domain's cells that a part may have; else the grid covers all of it
-LARGE_CELLS, MOST_OF_LARGE = 1 << 26, 0.9  # of a domain whose cells, all of them, are much memory
-SPARSE = 32.0  # times as many cells as a material fills: a grid that has more is hardly written to
-LOOSE = 3.0  # times the cells of a grid that would be laid now: one that has more is laid anew
+AHEAD = 16  # steps for which a new grid suffices at the material's current speed
+START = 10  # cells around the initial material that its first steps reach
+MOST = 0.5  # largest share of the domain's cells in a part; else the grid covers the whole domain
+# Cells from which a domain needs much memory, and that share for it.
+LARGE_CELLS, MOST_OF_LARGE = 1 << 26, 0.9
+# Multiple of the cells that a material fills: most memory of a larger grid stays unwritten.
+SPARSE = 32.0
+LOOSE = 3.0  # multiple of the cells of a new grid: a larger grid is rebuilt
 
 FAR = 1 << 30  # cells: beyond any domain
 
@@ -38,17 +41,17 @@ Corner = Sequence[int] | np.ndarray  # cell (x, y, z), counted from 0
 
 @dataclass(frozen=True)
 class DomainWindow:
-    """Lay grids around a material.
+    """Choose the grid window around a material.
 
-    A grid that still covers what it must stays, unless it has become `LOOSE`: where grids are laid
-    is a function of the grid there was and of what it must cover.
+    The grid is kept while it covers the required cells and has at most `LOOSE` times as many cells
+    as a new one. The choice is a function of the current grid and of the required cells only.
 
     Args:
         domain: the grid of the whole domain.
         follows: whether a grid may cover a part of it.
-        always: cells that are covered whatever the material does, as low and high corners (both
-            included), shape (n, 2, 3).
-        endless: axes without an end, along which all cells are covered.
+        always: cells that are always covered, as low and high corners (both included), shape (n, 2,
+            3).
+        endless: periodic axes, along which all cells are covered.
     """
 
     domain: StaggeredGrid
@@ -73,13 +76,13 @@ class DomainWindow:
         """Return a grid that covers a box of cells.
 
         Args:
-            low: first cell (x, y, z) of the domain, counted from 0; what lies outside the domain
-                does not count.
+            low: first cell (x, y, z) of the domain, counted from 0; cells outside the domain are
+                ignored.
             high: last cell.
-            now: the grid there is, which is returned if it will do.
-            pace: cells a step that the box's low and high sides may move outward, shape (3,) each,
-                see `pace_of`.
-            filled: how many cells the material would fill.
+            now: the current grid, which is returned if it is suitable.
+            pace: cells per step by which the box's low and high sides may move outward, shape (3,)
+                each, see `pace_of`.
+            filled: number of cells that the material would fill.
         """
         if not self.active:
             return self.domain
@@ -95,7 +98,10 @@ class DomainWindow:
         return replace(laid, sparse=True) if laid.size > SPARSE * filled else laid
 
     def beyond(self, high: np.ndarray) -> str:
-        """Say along which axis a box of cells that ends with this one reaches beyond the domain; "" if it does not."""
+        """Return an error message if a box of cells reaches beyond the domain, else "".
+
+        `high` is its last cell. The message names the axes.
+        """
         axes = [
             axis for axis in range(self.domain.dimension) if high[axis] >= self.domain.counts[axis]
         ]
@@ -109,7 +115,7 @@ class DomainWindow:
         )
 
     def at(self, box: np.ndarray | None) -> StaggeredGrid:
-        """Return the grid of a state's `box`, the domain's if it has none.
+        """Return the grid of a state's `box`; without a box, that of the domain.
 
         Raises:
             ValueError: the box is none of the domain's.
@@ -155,7 +161,10 @@ class DomainWindow:
 
 
 def start_of(scene: ParticleScene, device: Any) -> tuple[DomainWindow, StaggeredGrid]:
-    """Return what lays a scene's grids, and the first one, around its materials at the start and its sources."""
+    """Return the grid window of a scene, and its first grid.
+
+    The grid covers the materials at the start and the sources.
+    """
     whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
     boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
     corners = [
@@ -173,7 +182,10 @@ def carry_over(
     now: StaggeredGrid,
     fresh: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Return a state of one grid for another: fields where both cover the domain, those of `fresh` elsewhere, all else as it is.
+    """Return the state of one grid for another grid.
+
+    Fields have the old values where both grids cover the domain, and those of `fresh` elsewhere.
+    All other entries stay unchanged.
 
     Args:
         state: arrays; the fields' last three axes have the stored shape.
@@ -190,7 +202,10 @@ def carry_over(
 
 
 def _common(grid: StaggeredGrid, other: StaggeredGrid) -> tuple[slice, slice, slice]:
-    """Return where the stored cells lie in a grid's fields that both know: their rings too where that is the domain's."""
+    """Return the slices of a grid's fields that another grid stores as well.
+
+    They include the rings where these are the domain's.
+    """
 
     def along(axis: int) -> slice:
         ends = []
@@ -206,7 +221,10 @@ def _common(grid: StaggeredGrid, other: StaggeredGrid) -> tuple[slice, slice, sl
 def cells_between(
     low: np.ndarray, high: np.ndarray, spacing: float, grow: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and the last cell of a box between two corners [m], with some more on each side."""
+    """Return the first and the last cell of a box, enlarged by `grow` on each side.
+
+    The corners `low` and `high` are in [m].
+    """
     first, last = (
         np.clip(np.nan_to_num(np.floor(np.asarray(corner) / spacing)), -FAR, FAR)
         for corner in (low, high)
@@ -215,13 +233,20 @@ def cells_between(
 
 
 def pace_of(totals: ParticleTotals, dt: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many cells a step the low and high sides of the box around particles may move outward: with all of them, and apart."""
+    """Return the cells per step by which a box around particles may grow at its sides.
+
+    For the low and the high sides. It is the sum of the mean velocity and of the largest velocity
+    relative to it.
+    """
     drift = totals.velocity * dt / spacing
     apart = max(totals.max_speed * dt / spacing - float(np.linalg.norm(drift)), 0.0)
     return np.maximum(-drift, 0.0) + apart, np.maximum(drift, 0.0) + apart
 
 
 def travel(speed: float, acceleration: float, dt: float, spacing: float) -> int:
-    """Return how many cells something may move in a time step [s], given its speed [m/s] and an acceleration [m/s^2]."""
+    """Return the most cells that something can move in a time step [s].
+
+    It has a speed [m/s] and an acceleration [m/s^2].
+    """
     way = (speed + abs(acceleration) * dt) * dt / spacing
     return math.ceil(min(way, 1e6)) if math.isfinite(way) else 0

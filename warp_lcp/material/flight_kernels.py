@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""Kernels that find bodies of material in flight, add up their momenta and move them.
+"""Kernels of airborne bodies of material: find them, sum their momenta, move them.
 
-Sums are of int64, in fixed point: whole numbers add up to the same in any order, so that a GPU
-gives the same bits on every run.
+Sums are int64 in fixed point. Integers have the same sum in any order, so that a GPU gives the same
+bits on every run.
 """
 
 from pathlib import Path
@@ -15,9 +15,10 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
 
-COLUMNS = 18  # of a body's sums, see `add_up`
-LEAVES = 17  # of them, the particles that come near a wall or an open side
-MOST_STRIDES = 1024  # of a way, a cell each, as far as particles go in a step
+COLUMNS = 18  # columns of a body's sums, see `add_up`
+LEAVES = 17  # column: number of particles that come near a wall or an open side
+# Most strides of a path, one cell each: the longest move of a particle in a step.
+MOST_STRIDES = 1024
 
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -38,7 +39,7 @@ class Flight:
     inverse_dx: float  # [1/m]
     origin: wp.vec3i  # cells of a larger grid before the first one of this
     who: Integers  # the particles of all bodies
-    body: Integers  # of each of them
+    body: Integers  # body of each particle
     sums: wp.array2d(dtype=wp.int64)
 
 
@@ -100,7 +101,10 @@ def board_kernel(
     body: Integers,
     count: Integers,
 ):
-    """List the particles of bodies; count[1] becomes their number. All others take no more than this look."""
+    """List the particles of bodies; count[1] becomes their number.
+
+    All other particles cost only this test.
+    """
     b = number[root_of(parent, key[i])]
     if b >= 0:
         n = wp.atomic_add(count, 1, 1)
@@ -119,7 +123,7 @@ def lift_kernel(
     position: Vectors,
     start: Vectors,
 ):
-    """Note where particles are, and add them up."""
+    """Store the places of particles, and sum them up."""
     x = position[who[i]]
     start[i] = x
     add_up(flight, rate, quanta, velocity, i, x * flight.inverse_dx)
@@ -127,7 +131,7 @@ def lift_kernel(
 
 @wp.func
 def velocity_at(u: Field, v: Field, w: Field, planes: int, origin: wp.vec3i, x: wp.vec3):
-    """Return the velocity of the faces at x [cells]."""
+    """Return the velocity of the grid at x [cells], from the faces."""
     a = x[0] + 1.0 - float(origin[0])
     b = x[1] + 1.0 - float(origin[1])
     c = x[2] + 1.0 - float(origin[2])
@@ -143,7 +147,7 @@ def velocity_at(u: Field, v: Field, w: Field, planes: int, origin: wp.vec3i, x: 
 
 @wp.func
 def turned(angle: wp.vec3, a: wp.vec3):
-    """Return a vector turned about an axis by its length [radians]."""
+    """Return a vector turned about an axis whose length is the angle [radians]."""
     size = wp.length(angle)
     if size == 0.0:
         return a
@@ -155,7 +159,7 @@ def turned(angle: wp.vec3, a: wp.vec3):
 
 @wp.func
 def is_near(base: Kinds, touch: U8, planes: int, origin: wp.vec3i, x: wp.vec3):
-    """Tell whether x [cells] is in a cell that a wall touches, or near the grid's end."""
+    """Return whether x [cells] is in a cell beside a wall, or near the grid's end."""
     i = int(wp.floor(x[0])) + 1 - origin[0]
     j = int(wp.floor(x[1])) + 1 - origin[1]
     k = int(1)
@@ -192,10 +196,11 @@ def fly_kernel(
     x: Vectors,
     near: Bytes,
 ):
-    """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, to x [cells].
+    """Advect particles in the frame of their body to x [cells].
 
-    What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin,
-    [2] center.
+    This is one third-order Runge-Kutta step. Its stages are at positions that move by the velocity
+    minus the body's mean velocity. The particles' part of the body's rigid rotation turns with the
+    body. A motion is the body's [0] velocity, [1] spin, [2] center.
     """
     p = who[i]
     b = flight.body[i]
@@ -235,7 +240,10 @@ def arrive_kernel(
     x: Vectors,
     near: Bytes,
 ):
-    """Add up the particles where they have come to [cells], and those that came near a wall or an open side."""
+    """Sum up the particles at their new places [cells].
+
+    Count those that came near a wall or an open side.
+    """
     add_up(flight, rate, quanta, velocity, i, x[i])
     if near[i] != wp.uint8(0):
         wp.atomic_add(flight.sums, flight.body[i], LEAVES, wp.int64(1))
@@ -254,10 +262,10 @@ def land_kernel(
     end: Vectors,
     position: Vectors,
 ):
-    """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are.
+    """Set the particles' places and velocities: a scaled velocity plus a rigid motion.
 
-    A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three
-    times.
+    Bodies with a negative share stay unchanged. A motion is [0] the shift, [1] the velocity, [2]
+    the spin, [3] the center, [4] the share, three times.
     """
     p = who[i]
     b = flight.body[i]

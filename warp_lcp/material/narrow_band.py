@@ -4,31 +4,31 @@ After narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. Deep in
 particles carry no information: their density is that at rest, and their velocity is that of the
 grid. Let d(x) be the depth, the distance to the surface [cells], and W the band's width.
 
-1. Where. A step starts with the depth d* that the last one has carried along, so {d* > W} is where
-   no particle is: it is liquid that was deeper than W and moved with the flow. Cells with d* >= D =
-   min(2, W / 2) count as full, all others as full as their particles say, which reach beyond any
-   kernel around these. So the surface is the particles' alone, and no error of d* builds up: after
-   the solve d is measured again as a chamfer distance from air cells, with the fraction of a cell
-   from their level set; solids do not count.
-2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a
-   semi-Lagrangian step of third order (`warp_lcp.grid.advection`); on those above W - 2 it is the
-   particles' mean, in between it goes over linearly. Gravity and pressure act on both alike.
-3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W
-   - 1} and is now shallower (a wall has let go of it, say), gets fresh particles in each step: a
-   reservoir of even density, out of which the flow takes exactly what it carries away. Their
-   lattice moves on through the cell by irrational steps, so that in the mean over steps every place
-   is as likely: on a lattice that stays no particle ever is where a slow flow could take it along,
-   and cells filled up to a count lose 10 % to the same bias. They take their velocity and its
-   gradient from the grid, as all others do at that time.
-4. Mass. H counts the particles that the interior stands for: those that went in less those that
-   came out. What the fresh layer holds and what the density correction sees there is H by the
-   particles that {d* > W} would hold at rest, within a tenth of 1: particles and H are as many as
-   without a band, so that liquid lost to one side is pushed back by the correction as it would be
-   without.
+1. Where. A step starts with the depth d* that the last step has advected, so {d* > W} is the region
+   without particles: liquid that was deeper than W and moved with the flow. Cells with d* >= D =
+   min(2, W / 2) count as full; the density of all others is that of their particles, which extend
+   beyond any kernel around these cells. So the surface depends on the particles alone, and errors
+   of d* do not accumulate: after the solve d is measured again as a chamfer distance from air
+   cells, with the fraction of a cell from their level set; solids do not count.
+2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, advected by a
+   semi-Lagrangian step of third order (`warp_lcp.grid.advection`). On faces above W - 2 it is the
+   particles' mean; in between it is interpolated linearly. Gravity and pressure act on both alike.
+3. Exchange. Particles deeper than W are removed. The band's last layer, W - 1 < d <= W, and cells
+   of {d* > W - 1} that are now shallower (because a wall has separated, say) get fresh particles in
+   each step. They are a reservoir of even density, from which the flow takes exactly the amount
+   that it carries away. Their lattice moves on through the cell by irrational steps, so that in the
+   mean over steps every place is equally likely. (With a fixed lattice no particle is ever where a
+   slow flow could carry it away, and cells filled up to a count lose 10 % to the same bias.) Fresh
+   particles take their velocity and its gradient from the grid, as all others do at that time.
+4. Mass. H is the number of particles that the interior represents: those that entered it less those
+   that left it. The density of the fresh layer, and of the interior in the density correction, is H
+   divided by the particles that {d* > W} would hold at rest, limited to within a tenth of 1. The
+   numbers of particles and H together are those without a band, so that the correction pushes back
+   liquid lost to one side as it would without one.
 
 In sums the interior counts by whole cells, so that a log's center of mass may be off by a part of a
-cell, and its potential energy by as much. Particles also stay within W of where liquid leaves a
-wall, where solids cut cells or move, and of sources, drains and open sides.
+cell, and its potential energy accordingly. Particles also stay within W of places where liquid
+leaves a wall, where solids cut cells or move, and of sources, drains and open sides.
 """
 
 from __future__ import annotations
@@ -54,33 +54,35 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.resample import PLASTIC
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
-# cells below the band that depths are told apart: what is carried into it must have a slope
+# Cells below the band in which depths are resolved: a depth that is advected into the band must
+# have a slope.
 BEYOND = 3.0
-DEEP = 2.0  # cells below the surface from which on a cell counts as full whatever particles say
-REACH = 1.5  # of a cell's kernel, in cells
-FALLS = 2  # passes over rows, back and forth, after which most depths are found
-UNEVEN = 0.1  # how far the interior's density may differ from that at rest
+DEEP = 2.0  # depth in cells from which a cell counts as full, whatever its particles
+REACH = 1.5  # half the width of a cell's kernel [cells]
+FALLS = 2  # passes over rows, forth and back, after which most depths are final
+UNEVEN = 0.1  # largest difference of the interior's density from that at rest
 
 
 class NarrowBand:
     """Narrow band of particles; the grid carries the liquid below it.
 
-    A step calls `blend` when the particles' velocity is on the faces, `fill` where their density is
-    taken, `exchange` between the solve and the way back to the particles, and `carry` when they
-    have moved.
+    A step calls `blend` when the particles' velocity is on the faces, `fill` when their density is
+    computed, `exchange` between the solve and the transfer to the particles, and `carry` when the
+    particles have moved.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
-        width: of the band [cells], >= 3.
+        width: width of the band [cells], >= 3.
         per_axis: particles along the edge of a cell.
         jitter: width of fresh particles' random displacement, a fraction of their distance.
-        random_seed: of the displacements.
-        keep: which cells hold particles whatever their depth, bool of the stored shape; None: none.
+        random_seed: seed of the displacements.
+        keep: cells that hold particles whatever their depth, bool of the stored shape; None if
+            there are none.
 
     Attributes:
         depth: d* [cells], float32; 0 in air. More than `width` where there are no particles.
-        velocity: of each component's faces, carried along with it [m/s].
+        velocity: velocity on each component's faces, advected with the depth [m/s].
         held: H, particles that the interior stands for; negative if the band has got more than
             there was.
         interior: sums over the cells without particles, at their centers; its count is theirs.
@@ -136,7 +138,7 @@ class NarrowBand:
         )
         self._last = Scalar(), Scalar()  # plane and row of the window
         self._each, self._at_rest, self._way, self._behind = (Scalar() for _ in range(4))
-        self._shift = Scalar(), Scalar(), Scalar()  # of fresh particles' lattice
+        self._shift = Scalar(), Scalar(), Scalar()  # shift of fresh particles' lattice
         launches = (
             self._launch_depth,
             self._fall,
@@ -147,7 +149,7 @@ class NarrowBand:
         self._depths, self._falling, self._quota, self._carrying, self._seeding = (
             LaunchGraph(grid.device, launch, at_once=grid.part.at_once) for launch in launches
         )
-        # a scan of Warp's
+        # On a GPU it uses Warp's scan.
         self._leaving = LaunchGraph(grid.device, self._launch_leaving, at_once=grid.device.is_cuda)
         self._move_to(grid.everywhere)
         self.interior = self._summed(grid.everywhere)
@@ -175,7 +177,7 @@ class NarrowBand:
 
         Args:
             owner: number of the liquid in each cell, -1: none, shape (nz, ny, nx).
-            velocities: of the liquids [m/s], shape (n, 3).
+            velocities: velocities of the liquids [m/s], shape (n, 3).
 
         Returns:
             bool, shape (nz, ny, nx).
@@ -212,8 +214,8 @@ class NarrowBand:
 
         Args:
             window: faces that material can reach.
-            velocity: of each component [m/s] (updated).
-            weights: of the particles on each component's faces (updated).
+            velocity: velocity of each component [m/s] (updated).
+            weights: weights of the particles on each component's faces (updated).
         """
         start, full = self.width - 2.0, float(self.particles_a_cell)
         for axis, (carried, field, weight) in enumerate(
@@ -229,7 +231,7 @@ class NarrowBand:
 
         Args:
             window: cells that material can reach.
-            density: of the particles, in units of that at rest (updated).
+            density: density of the particles, in units of that at rest (updated).
         """
         window.launch(
             kernels.fill_kernel, [self.full, 1.0, self.depth, self.boundary.capacity, density]
@@ -240,7 +242,7 @@ class NarrowBand:
 
         Args:
             window: cells that material can reach.
-            density: of the particles, in units of that at rest (updated).
+            density: density of the particles, in units of that at rest (updated).
         """
         least = max(self.width - REACH, self.full)
         if not is_recording():
@@ -268,7 +270,7 @@ class NarrowBand:
             particles: the liquid (updated); `key` holds its cells.
             window: cells that material can touch.
             kind: int8 of AIR, FLUID, SOLID.
-            phi: float32 distance to the surface [cells]; None: it lies on the cells' faces.
+            phi: float32 distance to the surface [cells]; None if it lies on the cells' faces.
             contact: uint8, RELEASED where liquid leaves a wall.
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
@@ -299,7 +301,7 @@ class NarrowBand:
         In the window of the last exchange.
 
         Args:
-            velocity: of each component on the faces [m/s].
+            velocity: velocity of each component on the faces [m/s].
             dt: time step [s].
         """
         self._way.value = dt / self.grid.spacing
@@ -308,7 +310,7 @@ class NarrowBand:
         self._at_rest.value = self.density
 
     def _launch_carry(self, velocity: list[wp.array]) -> None:
-        """Launch the advection, and the sums over the cells without particles."""
+        """Launch the advection, and the sums over cells without particles."""
         more: dict[str, Any] = {"level": self._now, "least": 0.0, "before": self._before}
         more |= {"grid": self.grid, "window": self._inner, "velocity": velocity, "way": self._way}
         for axis, field, out in [
@@ -322,7 +324,7 @@ class NarrowBand:
             self._launch_sums(self._owned)
 
     def _launch_quota(self) -> None:
-        """Launch what finds how many fresh particles each cell gets."""
+        """Launch the count of fresh particles of each cell."""
         clear(self._total)
         where = [self.boundary.base, self._now, self.depth, self._total.reshape(self.grid.shape)]
         if self._here:
@@ -333,7 +335,7 @@ class NarrowBand:
         scan(self._total, self._total, inclusive=True)
 
     def _launch_leaving(self, particles: Particles, marks: wp.array) -> None:
-        """Launch the removal of the particles of deep cells, and of those that get fresh ones."""
+        """Launch the removal of particles of deep cells, and of cells that get fresh ones."""
         inputs = [self.width, particles.key, self._now.flatten(), self.depth.flatten(), marks]
         launch_list(kernels.leave_kernel, particles.count, inputs, device=self.grid.device)
         particles.launch_removal(marks)
@@ -341,9 +343,9 @@ class NarrowBand:
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
         """Return sums over the particles and the interior.
 
-        They are counted as H, and weighted as at rest: what H differs by is spread over all the
-        liquid. Its center would otherwise move with every particle that the band has more or less
-        than its share.
+        The interior counts as H particles, and is weighted as at rest: the difference of H from
+        rest is spread over all the liquid. Otherwise the center would move with every particle that
+        the band has more or less than its share.
         """
         inside, count = self.interior, totals.count + self.held
         if inside.count == 0 or count <= 0:
@@ -363,14 +365,15 @@ class NarrowBand:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state of the band; unused values are 0, for compression."""
+        """Return the state of the band; unused values are 0, for better compression."""
         depth = self.depth.numpy()
         wanted = depth > min(self.width - BEYOND, self.full - 1.0)
         faces = {}
         for axis, field in enumerate(self.velocity):
             near = wanted | np.roll(wanted, 1, axis=2 - axis)
             faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
-        # all but the bad ones; over where solids were, in an order that windows set
+        # All sums but the counts of bad values. They include cells where solids were, in an order
+        # that depends on windows.
         inside = list(vars(self.interior).values())[:7]
         sums = np.hstack([self.held, self.width, *inside])
         return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
@@ -402,10 +405,10 @@ class NarrowBand:
         self.interior = self._summed(self.grid.everywhere)
 
     def _move_to(self, window: Window) -> None:
-        """Have launches visit a window."""
+        """Set the window that launches visit."""
         self._window.move_to(window)
-        # something is carried to the domain and the ring's upper layer: faces below the first cell
-        # lie in the wall
+        # Only the domain and the ring's upper layer are advected; faces below the first cell lie in
+        # the wall.
         self._inner.move_to(
             Window.of([max(start, 1) for start in window.low], window.high, window.device)
         )
@@ -419,13 +422,13 @@ class NarrowBand:
     def _measure(
         self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array
     ) -> None:
-        """Find how deep a window's cells lie, up to `BEYOND` below the band."""
+        """Compute the depth of a window's cells, up to `BEYOND` below the band."""
         self._move_to(window)
         self._shore(kind, phi, contact)
         self._relax()
 
     def _shore(self, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
-        """Launch the depth of what is no deeper than a cell, from which `_relax` finds that of others."""
+        """Launch the depth of cells at most one cell deep, the start of `_relax`."""
         planes, most = self.grid.planes, self.width + BEYOND
         thin = self.grid.barriers.near if self.grid.barriers is not None else None
         fields = [phi, contact, self._keep, self.boundary.distance, thin, self._now]
@@ -433,13 +436,13 @@ class NarrowBand:
         self.grid.everywhere.launch(kernels.shore_kernel, inputs)
 
     def _launch_depth(self, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
-        """Launch the depth, but for falls after the first ones."""
+        """Launch the depth, without the passes after the first `FALLS`."""
         self._shore(kind, phi, contact)
         for number in range(FALLS):
             self._fall(number % 2 == 1)
 
     def _fall(self, forth: bool) -> None:
-        """Launch a pass in which the depth of the window's cells falls to what their neighbors allow."""
+        """Launch a pass that lowers the depth of cells to their neighbors' limit."""
         if self.grid.device.is_cpu:
             clear(self._changed)
         plane, row = (0, 0) if forth else self._last
@@ -453,7 +456,10 @@ class NarrowBand:
         )
 
     def _relax(self, fallen: int = 0) -> None:
-        """Let the depth fall until it is what neighbors allow, after so many passes; a way to the shore may lead over several ranks."""
+        """Lower the depth until it agrees with the neighbors on all ranks.
+
+        `fallen` passes have been made. The shortest path to the surface may cross several ranks.
+        """
         self._relax_here(fallen)
         part, falls = self.grid.part, self.grid.part.across is not None
         while falls:
@@ -466,19 +472,19 @@ class NarrowBand:
                 self._relax_here(0)
 
     def _relax_here(self, fallen: int) -> None:
-        """Let the depth of this process's cells fall."""
+        """Lower the depth of this process's cells until it agrees with the neighbors."""
         for number in range(fallen, math.ceil(self.width + BEYOND) + 1):
-            # rows one after the other: three passes or so
+            # Rows are visited in sequence, so three passes or so suffice.
             if number and self.grid.device.is_cpu and self._changed.numpy()[0] == 0:
                 break
             self._falling.run(number % 2 == 1, variant=number % 2 == 1)
 
     def _sum_over_ranks(self, count: int) -> int:
-        """Return how many there are on all processes of what this one has so many of."""
+        """Return the sum of a count over all processes."""
         return int(self.grid.part.ranks.sum(count))
 
     def _add_places(self, particles: Any, behind: int) -> None:
-        """Tell a rank's fresh particles their places, in the order of the whole domain's cells."""
+        """Set the places of a rank's fresh particles in the order of the domain's cells."""
         counts = np.diff(self._total.numpy(), prepend=0)
         stored = np.flatnonzero(counts)
         counts = counts[stored]
@@ -491,7 +497,7 @@ class NarrowBand:
         particles.exchange.add_places(behind + np.repeat(first, counts) + np.arange(counts.sum()))
 
     def _seed(self, particles: Particles, saved: Sequence[wp.array], behind: int) -> None:
-        """Put fresh particles behind the others; `behind`: their first place, on ranks."""
+        """Add fresh particles after the others; on ranks `behind` is their first place."""
         first = particles.make_room(self.fresh)
         self._behind.value = first
         self._seeding.run(particles)
@@ -502,7 +508,7 @@ class NarrowBand:
             self._add_places(particles, behind)
 
     def _launch_seeds(self, particles: Particles) -> None:
-        """Launch what puts fresh particles on their sites."""
+        """Launch the placing of fresh particles on their sites."""
         grid, sites = self.grid, kernels.Sites()
         sites.planes, sites.per_axis, sites.jitter, sites.seed = (
             grid.planes,
@@ -525,14 +531,17 @@ class NarrowBand:
         )
 
     def _summed(self, window: Window, *, launched: bool = False) -> ParticleTotals:
-        """Add up the cells of all processes without particles, once the sums over rows are launched."""
+        """Sum up the cells without particles of all processes.
+
+        `launched`: the sums over rows have been launched already.
+        """
         return reduce(
             ParticleTotals.joined,
             self.grid.part.ranks.collect(self._summed_here(window, launched=launched)),
         )
 
     def _summed_here(self, window: Window, *, launched: bool) -> ParticleTotals:
-        """Add up those of this process."""
+        """Sum up the cells without particles of this process."""
         box = window.common(self._own)
         if box is None:
             return ParticleTotals()
@@ -570,8 +579,8 @@ def without_band(
 
     Args:
         state: arrays of the particles and, if there was a band, of `NarrowBand.state`.
-        spacing: of its grid [m].
-        random_seed: of the places.
+        spacing: spacing of its grid [m].
+        random_seed: seed of the places.
     """
     if "interior" not in state or state["interior"][0] <= 0:
         return state

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the narrow band: how deep cells lie, which of them hold particles, and what the others stand for."""
+"""Kernels of the narrow band: depth of cells, exchange of particles, sums."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
-INSET = 1e-3  # of a cell: particles are put no nearer to its faces
-COLUMNS = 15  # of a row's sums, see `sum_kernel`
+INSET = 1e-3  # least distance of new particles from a cell's faces [cells]
+COLUMNS = 15  # columns of a row's sums, see `sum_kernel`
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -24,7 +24,10 @@ RELAX = KERNELS["warp_lcp.material.narrow_band.relax_depth"]
 
 @wp.func
 def solid_inside(distance: F32, k: int, j: int, i: int, planes: int):
-    """Tell whether a solid is near one of a cell's corners; the domain's walls are not in the distance."""
+    """Return whether a solid is near one of a cell's corners.
+
+    The domain's walls are not in the distance.
+    """
     result = bool(False)
     for c in range(planes):
         for b in range(2):
@@ -49,7 +52,11 @@ def shore_kernel(
     thin: U8,
     depth: F32,
 ):
-    """Depth is -phi in air, 0 where particles stay for another reason, and yet unknown elsewhere, solids included."""
+    """Initialize the depth of a cell.
+
+    It is -phi in air, 0 where particles stay for another reason, and unknown elsewhere, solids
+    included.
+    """
     value = most
     if kind[k, j, i] == _FLUID:
         if contact[k, j, i] == _RELEASED:
@@ -72,7 +79,7 @@ def shore_kernel(
 
 @cell_kernel("warp_lcp.material.narrow_band")
 def fill_kernel(k, j, i, least: float, filled: float, depth: F32, capacity: F32, density: F32):
-    """Give cells deeper than `least` the density `filled` as far as walls leave room."""
+    """Set the density of cells deeper than `least` to `filled` times their open share."""
     if depth[k, j, i] >= least:
         room = float(1.0)
         if capacity:
@@ -95,14 +102,14 @@ def blend_kernel(
     field: F32,
     weight: F32,
 ):
-    """Go over from the particles' velocity to the carried one within a cell from depth `start` on."""
+    """Blend the carried velocity into the faces, over one cell from depth `start` on."""
     c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
     b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
     for i in range(wp.max(first, 1), end):
         a = i - wp.where(axis == 0, 1, 0)
         here = base[k, j, i] != _SOLID
         below = base[c, b, a] != _SOLID
-        mean = float(-1.0)  # of the open cells beside the face
+        mean = float(-1.0)  # mean over the open cells beside the face
         if here and below:
             mean = 0.5 * (depth[k, j, i] + depth[c, b, a])
         elif here:
@@ -120,13 +127,17 @@ def blend_kernel(
 
 @wp.func
 def renewed(now: float, before: float, width: float):
-    """Tell whether a cell gets fresh particles: at the band's inner edge, or where it was without, however near a new surface is."""
+    """Return whether a cell gets fresh particles.
+
+    These are cells at the band's inner edge, and cells that were below it and are now shallower,
+    however near a new surface is.
+    """
     return now <= width and (now > width - 1.0 or (now >= 0.0 and before > width - 1.0))
 
 
 @wp.struct
 class Numbered:
-    """How cells are numbered, the same in all parts of a grid."""
+    """Numbering of cells that is the same in all parts of a grid."""
 
     origin: wp.vec3i  # cells (x, y, z) of a larger grid before the first one of this
     across: wp.vec2i  # stored cells of the larger grid along x and y
@@ -134,7 +145,7 @@ class Numbered:
 
 @wp.func
 def number_of(where: Numbered, k: int, j: int, i: int):
-    """Return the number that a stored cell has in the larger grid."""
+    """Return the number of a stored cell in the larger grid."""
     return (
         ((k + where.origin[2]) * where.across[1] + j + where.origin[1]) * where.across[0]
         + i
@@ -157,7 +168,11 @@ def quota_kernel(
     before: F32,
     quota: I32,
 ):
-    """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
+    """Set the number of fresh particles of each cell.
+
+    It is `particles` on average: over the cells by a random offset and, as `shift` advances, over
+    the steps.
+    """
     count = int(0)
     if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
         cell = number_of(where, k, j, i)
@@ -174,7 +189,7 @@ def leave_kernel(
     before: wp.array(dtype=wp.float32),
     marks: INTS,
 ):
-    """Mark the particles of cells deeper than the band, and of those that get fresh ones."""
+    """Mark the particles of cells below the band, and of cells that get fresh ones."""
     cell = key[i]
     now = depth[cell]
     marks[i] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
@@ -182,7 +197,7 @@ def leave_kernel(
 
 @wp.struct
 class Sites:
-    """A jittered lattice of so many places along each axis of a cell."""
+    """A jittered lattice of sites in a cell, with a number of sites along each axis."""
 
     planes: int
     per_axis: int
@@ -207,7 +222,10 @@ def seed_kernel(
     total: INTS,
     position: POINTS,
 ):
-    """Put a cell's particles on their sites, that a shift moves through the cell; `total` counts up to and with each cell."""
+    """Put a cell's fresh particles on its sites, moved through the cell by a shift.
+
+    `total` is the inclusive prefix sum of the particles of cells.
+    """
     planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, wp.vec3(shift_x, shift_y, shift_z)
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
     here = (k * ny + j) * nx + i
@@ -217,7 +235,7 @@ def seed_kernel(
     if count > 0:
         own = wp.rand_init(seed, cell)
         way = shift + wp.vec3(wp.randf(own), wp.randf(own), wp.randf(own))
-        # where it is left out, or begins again
+        # First site of the cell.
         skip = int(wp.randf(own) * float(sites)) + int(shift[0] * float(sites))
         for n in range(count):
             site = (skip + n) % sites
@@ -253,7 +271,7 @@ def sum_kernel(
     w: F32,
     sums: F64,
 ):
-    """Add up a row's cells deeper than the band.
+    """Sum up a row's cells that are deeper than the band.
 
     [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest
     indices, [12-14] u.

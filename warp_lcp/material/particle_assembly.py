@@ -1,4 +1,7 @@
-"""What a scene of particles asks for, made: walls, the first particles, where material comes in and goes out, what evens it out."""
+"""Make the parts of a particle simulation from its scene.
+
+Walls, the first particles, sources and outlets, reseeding and density correction.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,9 @@ from warp_lcp.scene.shapes import SolidProperties
 
 
 def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
-    """Return the scene's solids, rigid bodies with the motion of a body each; files that it names are relative to `folder`.
+    """Return the scene's solids; rigid bodies have the motion of a body each.
+
+    Files named in the scene are relative to `folder`.
 
     Raises:
         ValueError: a file cannot be read, or a rigid body has no mass of its own.
@@ -79,12 +84,14 @@ def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
 def make_bodies(
     scene: Scene, placed: Sequence[PlacedSolid], make: Callable[..., RigidBodies] = RigidBodies
 ) -> RigidBodies | None:
-    """Return the rigid bodies among a scene's solids, if there are any, among its walls and the other solids.
+    """Return the rigid bodies among a scene's solids; None if there are none.
+
+    The bodies meet the scene's walls and its other solids.
 
     Args:
         scene: the scene.
-        placed: its solids, of `placed_solids`: the boundary must be of the same.
-        make: makes them of what `RigidBodies` takes.
+        placed: its solids, of `placed_solids`; the boundary must have the same.
+        make: constructor with the arguments of `RigidBodies`.
 
     Raises:
         ValueError: a body overlaps a wall, a solid or another body, or its center lies outside the
@@ -136,15 +143,15 @@ def make_boundary(
     *,
     solids: Sequence[PlacedSolid] | None = None,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Return solids and walls as the scene asks for them, and warnings; collective.
+    """Return the scene's boundary (solids and walls) and warnings; collective.
 
     Args:
         scene: the scene.
         grid: its grid.
-        folder: where the files are that it names.
+        folder: folder of the files that it names.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3),
-            constant; None: all stand still, or have their own motion.
-        solids: of `placed_solids`; made anew if None.
+            constant; None if all are at rest, or have their own motion.
+        solids: solids of `placed_solids`; made here if None.
 
     Raises:
         ValueError: solids cut cells and there is a `wall_velocity`.
@@ -175,7 +182,7 @@ def make_boundary(
             remarks=not covered,
             left_out=numbers,
         )
-        # solids may cut cells elsewhere
+        # On other ranks solids may cut cells.
         if not cut.whole_cells or (covered and placed) or thin is not None:
             barriers = Barriers(grid, crossing, cut) if crossing is not None else None
             grid.divide(barriers)
@@ -187,7 +194,8 @@ def make_boundary(
         grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered
     )
     if wall_velocity is None and scene.source:
-        wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
+        # Memory for the velocities of sources' faces.
+        wall_velocity = np.zeros((1 + len(placed), 3))
     return WholeCells(
         grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes
     ), voxels.notes
@@ -201,7 +209,9 @@ def make_thin_walls(
     *,
     crossing: bool,
 ) -> ThinWalls | None:
-    """Return the solids that are too thin for the grid, which particles meet as exact shapes; None: there are none.
+    """Return the solids that are too thin for the grid; None if there are none.
+
+    Particles meet them as exact shapes.
 
     One that moves must be thicker than what it may go in a step.
 
@@ -209,11 +219,12 @@ def make_thin_walls(
         scene: the scene.
         grid: its grid.
         placed: its solids.
-        open_sides: of `warp_lcp.grid.sides.side_bits`; those of periodic axes are added.
-        crossing: only those that are too thin to cut cells; of rigid bodies those that are sheets:
-            the pressure pushes others by the cells that they cut.
+        open_sides: bits of `warp_lcp.grid.sides.side_bits`; those of periodic axes are added.
+        crossing: only those that are too thin to cut cells; of rigid bodies only sheets, since
+            other bodies are pushed by the pressure through the cells that they cut.
     """
-    walls = {False: THIN, True: max(THIN, scene.time.cfl + STRIDE_ROOM)}  # by whether they move
+    # Thickness limit by whether solids move.
+    walls = {False: THIN, True: max(THIN, scene.time.cfl + STRIDE_ROOM)}
 
     def suits(solid: PlacedSolid) -> bool:
         shape, dx, is_body = solid.geometry, grid.spacing, isinstance(solid.motion, BodyMotion)
@@ -234,13 +245,13 @@ def make_thin_walls(
 
 @dataclass(frozen=True)
 class Parts:
-    """What of a simulation belongs to its grid, made anew for another one.
+    """Parts of a simulation that belong to one grid, and are made again for another.
 
     Attributes:
         boundary: solids and the domain's walls.
-        sources: where material comes in.
-        band: where its particles are, if not everywhere.
-        solids: as the material's own solver sees them, if it does so in another way.
+        sources: inflow of material.
+        band: the narrow band of particles; None if they are everywhere.
+        solids: the solids as the material's own solver uses them, if it uses another form.
     """
 
     boundary: Boundary
@@ -252,7 +263,10 @@ class Parts:
 def make_spray(
     scene: ParticleScene, coverage: DomainWindow | None, placed: Sequence[PlacedSolid]
 ) -> Spray | None:
-    """Return what carries particles that are alone, if they need no grid: where one follows the material, and no surface is wrapped."""
+    """Return the spray for lone particles without a grid; None if not possible.
+
+    The scene needs a grid that follows the material, and no surface mesh.
+    """
     if (
         coverage is None
         or not (coverage.active and scene.flies)
@@ -268,7 +282,7 @@ def make_spray(
 def make_flights(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
 ) -> BallisticFragments | None:
-    """Return what gives bodies in flight their momenta back, if any can be told."""
+    """Return the airborne bodies, which conserve momenta; None if the scene has none."""
     return (
         BallisticFragments(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up)
         if scene.flies
@@ -279,7 +293,7 @@ def make_flights(
 def make_surface_mesh(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
 ) -> SurfaceMesh | None:
-    """Return what wraps the particles in a surface, if the scene's output has one."""
+    """Return the surface mesh of the particles, if the scene's output has one."""
     if not scene.output.surface:
         return None
     return SurfaceMesh(
@@ -296,7 +310,7 @@ def make_surface_mesh(
 def make_particle_volume(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
 ) -> ParticleVolume | None:
-    """Return what measures the material's volume, if the scene's output has it."""
+    """Return the measurement of the material's volume, if the scene's output has it."""
     if not scene.output.volume:
         return None
     return ParticleVolume(grid, boundary, particles_a_cell=scene.particles.per_axis**grid.dimension)
@@ -309,13 +323,13 @@ def seed_materials(
     folder: Path,
     without: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Fill the scene's materials with points, where this process's cells are; collective.
+    """Fill the scene's materials with points in this process's cells; collective.
 
     Args:
         scene: the scene.
         grid: its grid.
         boundary: its solids.
-        folder: where the files are that it names.
+        folder: folder of the files that it names.
         without: cells that get no points, bool of shape (nz, ny, nx).
 
     Returns:
@@ -334,7 +348,7 @@ def seed_materials(
         notes += placement_notes(geometry, name, grid)
     settings = scene.particles
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
-    # a cell whose center lies in a thin solid may have room beside it
+    # A cell whose center lies in a thin solid may have room beside it.
     if grid.barriers is not None:
         open_cells |= grid.interior(grid.barriers.near.numpy()) > 0
     if without is not None:
@@ -366,26 +380,34 @@ def make_particles(
     folder: Path,
     without: np.ndarray | None = None,
 ) -> tuple[Particles, list[str]]:
-    """Return the particles of all materials, in the order of `seed_materials`, and warnings; arguments as there.
+    """Return the particles of all materials, as of `seed_materials`, and warnings.
+
+    Arguments as of `seed_materials`.
 
     Raises:
         ValueError: a material has no particle.
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    indexed = True if grid.barriers is not None else None  # what is near those gathers
+    indexed = True if grid.barriers is not None else None  # transfers near barriers gather
     affine, kept = scene.particles.transfer == "apic", kept_by(scene, owner)
     return Particles(grid, position, velocity, affine=affine, kept=kept, indexed=indexed), notes
 
 
 def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:
-    """Return what particles of these materials take along, shape (n,); None: nothing."""
+    """Return the number that particles carry, shape (n,), by material.
+
+    Returns None if they carry none.
+    """
     kept = scene.kept(scene.materials()[1])
     return None if kept is None else np.array([*kept, 1.0], dtype=np.float32)[owner]
 
 
 def start_velocities(scene: ParticleScene) -> np.ndarray:
-    """Return the velocity of each material at the start [m/s], shape (materials, 3); one of rest if there is none."""
+    """Return the velocity of each material at the start [m/s], shape (materials, 3).
+
+    One material at rest if there is none.
+    """
     return np.array(
         [_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]]
         or [_vector([0.0, 0.0])]
@@ -443,7 +465,7 @@ def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Out
 def make_narrow_band(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path
 ) -> NarrowBand | None:
-    """Return what carries the material deeper than a band; None: nothing does. Collective."""
+    """Return the narrow band of deep material, None if it is off; collective."""
     settings, particles = scene.particles.narrow_band, scene.particles
     if settings is None:
         return None
@@ -465,7 +487,10 @@ def start_band(
     folder: Path,
     band: NarrowBand | None,
 ) -> np.ndarray | None:
-    """Put the material that particles need not carry into a band, and return its cells, bool of shape (nz, ny, nx); None: no band."""
+    """Put the deep material into a narrow band, and return its cells.
+
+    bool of shape (nz, ny, nx); None without a band.
+    """
     if band is None:
         return None
     regions = [
@@ -481,7 +506,7 @@ def start_band(
 
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
-    """Return which stored cells are near a source or a drain; None: there is none."""
+    """Return a mask of stored cells near a source or a drain; None without both."""
     regions = [*scene.source, *scene.drain]
     if not regions:
         return None
@@ -503,7 +528,7 @@ def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> 
 def make_reseeding(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
 ) -> Reseeding | None:
-    """Return what evens out the particles, if a scene asks for it."""
+    """Return the reseeding of particles; None if the scene has none."""
     settings = scene.particles.reseed
     if settings is None:
         return None
@@ -517,7 +542,7 @@ def make_reseeding(
 def make_density_correction(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
 ) -> DensityCorrection:
-    """Return what moves the particles of a scene apart.
+    """Return the density correction of a scene.
 
     Raises:
         ValueError: the scene has none.
@@ -542,7 +567,9 @@ def make_density_correction(
 def make_density_monitor(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
 ) -> DensityMonitor | None:
-    """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are.
+    """Return the monitor that decides when to correct the density.
+
+    None if the scene sets the steps, or if there is no correction.
 
     Args:
         scene: the scene.
@@ -561,7 +588,7 @@ def make_density_monitor(
 def _body(
     solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int
 ) -> RigidBody:
-    """Return the rigid body that a solid is."""
+    """Return the rigid body of a solid."""
     try:
         properties = mass_properties(geometry, dimension, mass=solid.mass, density=solid.density)
     except ValueError as error:
@@ -578,19 +605,19 @@ def _body(
 
 
 def _vector(entries: list[float]) -> list[float]:
-    """Return a vector of two or three entries as one of three."""
+    """Return a vector of two or three entries as one of three entries."""
     return [*entries, 0.0][:3]
 
 
 def _inside(geometry: Geometry, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that tells which points lie in a geometry."""
+    """Return a function that tests which points lie in a geometry."""
     return lambda points: inside([geometry], points, device=device)
 
 
 def region_of(
     geometry: Geometry, boundary: Boundary, device: wp.Device
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that tells which points lie in a geometry and outside solids."""
+    """Return a function that tests which points lie in a geometry and outside solids."""
 
     def holds(points: np.ndarray) -> np.ndarray:
         result = inside([geometry], points, device=device)

@@ -1,4 +1,4 @@
-"""How a material that particles carry is kept, and goes on from what was kept: on its grid, on another, on any number of ranks."""
+"""Checkpoints of particle simulations, for any grid and number of ranks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ from warp_lcp.material.spray import Spray
 
 
 class ParticleCheckpoints(ParticleFrames):
-    """State of a simulation, for a checkpoint, a finer grid or a program that adds particles; attributes as of `ParticleSimulation`."""
+    """Save, restore and resample the state of a simulation, and add particles.
+
+    Attributes as of `ParticleSimulation`.
+    """
 
     scene: ParticleScene
     spray: Spray
@@ -37,34 +40,43 @@ class ParticleCheckpoints(ParticleFrames):
 
     @abstractmethod
     def mark(self) -> None:
-        """Find the material's cells from the sorted particles, as frames show them before the first step."""
+        """Find the material's cells from the sorted particles.
+
+        Frames show them before the first step.
+        """
 
     @abstractmethod
     def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
-        """Go on on another grid of the same domain."""
+        """Continue on another grid of the same domain."""
 
     @abstractmethod
     def _lay_anew(self, grid: StaggeredGrid) -> None:
-        """Allocate another grid, whose fields then hold nothing yet."""
+        """Allocate another grid; its fields have no values yet."""
 
     @abstractmethod
     def rebalance(self) -> None:
-        """Go on in better boxes of ranks, if there are any; collective."""
+        """Continue in better boxes of ranks, if there are any; collective."""
 
     @abstractmethod
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points [m], shape (n, 3), a particle may be at."""
+        """Return at which points [m], shape (n, 3), a particle may be."""
 
     @abstractmethod
     def own_state(self) -> dict[str, np.ndarray]:
-        """Return copies of what the next solve starts from and a frame shows; `cells`, int8 of AIR, FLUID, SOLID, must be among them."""
+        """Return copies of the arrays for the next solve and for frames.
+
+        They must have `cells`, int8 of AIR, FLUID, SOLID.
+        """
 
     @abstractmethod
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the arrays of `own_state`, whose shapes, types and values have been checked."""
+        """Continue from the arrays of `own_state`, which have been checked.
+
+        Shapes, types and values are correct.
+        """
 
     def _fields(self) -> dict[str, np.ndarray]:
-        """Return copies of what of the state lies on the grid, with the numbers that belong to it."""
+        """Return copies of the state's fields, and of the numbers that belong to them."""
         band = self.band.state() if self.band is not None else {}
         return self.own_state() | band | self.rearrangement.state()
 
@@ -76,14 +88,14 @@ class ParticleCheckpoints(ParticleFrames):
             self.band.restore(state)
 
     def _particle_arrays(self) -> dict[str, np.ndarray]:
-        """Return copies of the particles' arrays by name, those of the spray at the end."""
+        """Return copies of the particles' arrays by name, with spray particles at the end."""
         return {
             name: self.spray.behind(name, array.numpy())
             for name, array in self.particles.arrays().items()
         }
 
     def _assign(self, arrays: Mapping[str, np.ndarray], flying: int = 0) -> None:
-        """Take other particles, of which the last ones fly."""
+        """Replace the particles; the last `flying` of them are spray."""
         on_grid = len(arrays["position"]) - (flying if self.spray.active else 0)
         self.particles.assign({name: arrays[name][:on_grid] for name in self.particles.arrays()})
         self.spray.particles.assign(
@@ -92,7 +104,9 @@ class ParticleCheckpoints(ParticleFrames):
         self._faces_know = False
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too.
+        """Return the arrays that `restore` needs to continue, bit for bit on the CPU.
+
+        If the grid covers a part of the domain, its `box` is included.
 
         On several ranks it is this rank's piece of the state, in the whole domain's coordinates,
         without pickles. Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x,
@@ -115,7 +129,7 @@ class ParticleCheckpoints(ParticleFrames):
         return clock | known | particles | part.kept(self._fields()) | bodies | part.where()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`, which on several ranks is that of one process; collective.
+        """Continue from `state`, on ranks that of one process; collective.
 
         Raises:
             ValueError: the arrays do not belong to this scene; on all ranks.
@@ -125,7 +139,7 @@ class ParticleCheckpoints(ParticleFrames):
             return
         state = self._on_this_grid(state)
         self.rearrangement.expect(state)
-        # older states have velocities of their own time
+        # Velocities of older states belong to the time of the state itself.
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}
         self.added = int(state.get("added", 0))
         varies = bool(self.sources or self.outlets or self.band or self.added)
@@ -140,7 +154,7 @@ class ParticleCheckpoints(ParticleFrames):
         self._take_clock(state)
 
     def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on at the time of a state, with its bodies, and solids where they are then."""
+        """Set time, bodies and places of solids to those of a state."""
         self.time, self.step_count, self.last_dt = (
             float(state["time"]),
             int(state["step_count"]),
@@ -151,11 +165,13 @@ class ParticleCheckpoints(ParticleFrames):
         self.boundary.place(self.time)
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
-        """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
+        """Continue from the pieces of all ranks of a run; collective.
+
+        The run may have had any number of ranks. Each rank takes the data in its box.
 
         Args:
-            pieces: of `state`, of all ranks, in any order. Of a piece that has nothing in this
-                rank's box grown by some cells the arrays of particles and cells are not read.
+            pieces: pieces of `state`, of all ranks, in any order. Of a piece that has nothing in
+                this rank's box grown by some cells the arrays of particles and cells are not read.
 
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
@@ -171,33 +187,36 @@ class ParticleCheckpoints(ParticleFrames):
         if found is not None and found is not part:
             self._work_on(found)
         self._take_pieces(pieces, expected)
-        if found is None:  # in boxes that were laid for the start
+        if found is None:  # the boxes are those of the start
             self.particles.totals()
             self.rebalance()
 
     def repartition(self, part: Any) -> None:
-        """Go on in other boxes of the same ranks; collective."""
+        """Continue in other boxes of the same ranks; collective."""
         before, piece, expected = self.grid.part, self.state(), self._everyone()
         self._work_on(part)
         self._take_pieces([part.migrate(piece, list(self.particles.arrays()), before)], expected)
 
     def _everyone(self) -> int:
-        """Return how many particles all ranks have, with those that a narrow band stands for."""
+        """Return the number of particles on all ranks, narrow band interior included."""
         return sum(self.particles.exchange.counts) + (
             self.band.held if self.band is not None else 0
         )
 
     def _work_on(self, part: Any) -> None:
-        """Allocate what belongs to another part of the grid; its particles and fields are still to come."""
+        """Allocate the arrays of another part of the grid.
+
+        Its particles and fields have no values yet.
+        """
         self._lay_anew(part.grid)
         part.ranks.free_ended()
 
     def _take_pieces(self, pieces: Sequence[Piece], expected: int) -> None:
-        """Continue from what pieces have in this rank's box; collective.
+        """Continue from the data of pieces in this rank's box; collective.
 
         Args:
-            pieces: of all ranks, or that of this box.
-            expected: how many particles they must have if none come in or leave.
+            pieces: pieces of all ranks, or that of this box.
+            expected: number of particles of all pieces if none enter or leave.
         """
         part: Any = self.grid.part
         names, bodies = (
@@ -224,7 +243,7 @@ class ParticleCheckpoints(ParticleFrames):
         self._take_clock(numbers)
 
     def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """Lay the grid of a state if the scene allows that, else bring the state to this one's.
+        """Use the grid of a state if the scene allows that, else convert the state.
 
         Raises:
             ValueError: its box is not in this domain.
@@ -243,7 +262,9 @@ class ParticleCheckpoints(ParticleFrames):
         return carry_over(state, grid, self.grid, self._fields())
 
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
-        """Continue from the state of the same scene on another grid: with other particles, and without a solution to start from.
+        """Continue from the state of the same scene on another grid.
+
+        The particles are resampled, and the next solve starts without a guess.
 
         Raises:
             ValueError: the state differs in more than the grid, or no particle is left.
@@ -272,7 +293,11 @@ class ParticleCheckpoints(ParticleFrames):
         )
 
     def add(self, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Add particles between two steps; positions [m] and velocities [m/s] of shape (n, 3), where the material may be."""
+        """Add particles between two steps.
+
+        Positions [m] and velocities [m/s] have the shape (n, 3). Positions must be where the
+        material may be.
+        """
         self.particles.append(position, velocity)
         self.added += len(position)
         self._faces_know = False

@@ -1,4 +1,4 @@
-"""What frames show of a material that particles carry."""
+"""Frames of a particle simulation: points, surfaces, volumes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from warp_lcp.simulation import Points, Surface, Volume
 
 
 class ParticleFrames(ABC):
-    """The parts of a frame that all materials have; attributes as of `ParticleSimulation`."""
+    """Parts of a frame that all materials have; attributes as of `ParticleSimulation`."""
 
     grid: StaggeredGrid
     boundary: Boundary
@@ -39,11 +39,14 @@ class ParticleFrames(ABC):
 
     @property
     def image_counts(self) -> tuple[int, int, int] | None:
-        """Return the cells of the image that a frame of cells is; None: of a grid that follows the material those that hold some."""
+        """Return the number of cells of a frame's image, (x, y, z); None for all.
+
+        On a grid that follows the material these are the cells that hold some.
+        """
         return self.grid.domain_counts if self.grid.part.shared or self.grid.whole is None else None
 
     def points(self) -> Points:
-        """Return the particles as a frame shows them, with velocity and speed [m/s]."""
+        """Return the particles for a frame, with velocity and speed [m/s]."""
         position, velocity = (self._particle_arrays()[name] for name in ("position", "velocity"))
         return Points(
             "particles",
@@ -52,9 +55,10 @@ class ParticleFrames(ABC):
         )
 
     def surfaces(self) -> list[Surface]:
-        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it.
+        """Return the material's surface for a frame, if the scene asks for it; collective.
 
-        Of ranks in their boxes; collective.
+        It has the velocity [m/s] of the particles around it. Each rank returns the surface in its
+        box.
         """
         if self.surface_mesh is None:
             return []
@@ -82,9 +86,10 @@ class ParticleFrames(ABC):
         )
 
     def volumes(self) -> list[Volume]:
-        """Return the material's level set and density as a frame shows them, if the scene wants them; of all ranks on the root.
+        """Return the material's level set and density for a frame; collective.
 
-        No reader makes one volume of several. Collective.
+        Empty unless the scene asks for them. The root returns the volumes of all ranks, since no
+        reader merges several volumes.
         """
         if self.particle_volume is None:
             return []
@@ -100,7 +105,10 @@ class ParticleFrames(ABC):
         ]
 
     def _fill_density(self) -> Fill | None:
-        """Return what adds to the particles' density in a window what none of them stands for, as a surface sees it; None: nothing does."""
+        """Return a function that adds the density of material without particles.
+
+        It acts in a window, for surfaces. None if there is no such material.
+        """
         own, part = self.band.fill if self.band is not None else None, self.grid.part
         if not part.shared:
             return own
@@ -113,7 +121,10 @@ class ParticleFrames(ABC):
         return fill
 
     def body_surfaces(self) -> list[Surface]:
-        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]; of the root."""
+        """Return the rigid bodies for a frame, on the root.
+
+        Data: `body`, the number of the body, and velocity [m/s].
+        """
         if self.bodies is None or not self.grid.part.ranks.is_root:
             return []
         surface = self.bodies.surfaces()

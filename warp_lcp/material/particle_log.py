@@ -1,4 +1,4 @@
-"""What a run's log says of a material that particles carry."""
+"""Log columns of a particle simulation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.grid.particles import ParticleTotals
 
-Row = dict[str, float | int | str | None]  # of the log
+Row = dict[str, float | int | str | None]  # a row of the log
 
 COLUMNS = (
     "particles",
@@ -31,34 +31,39 @@ COLUMNS = (
 def columns(own: Sequence[str], told: Mapping[str, bool], bodies: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the log's columns.
 
-    SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own;
-    potential_energy is 0 at the origin. Velocities, in frames too, are those of the step's middle,
-    which move things through it; kinetic_energy is that of its end. With a narrow band mass,
-    energies and center count the interior, particles does not; interior_density is that of the
-    interior, in units of that at rest, if the mass is to be what it was. solve_residual is relative
-    to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may
-    then be up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept
-    along; stuck: those inside solids that found no way out, between solids that close, say.
-    max_density: before the density correction of the step, of material at rest 1, or at the start
-    of a step that none was due in; density_status and density_iterations: of that correction, empty
-    where none was due; reseeded: particles that went to a neighboring cell; emitted, drained,
-    departed: those that sources have added in the step, that drains have swallowed, and that have
-    left through open sides; spray: those that fly off the grid, see `warp_lcp.material.spray`.
-    Rigid bodies, numbered from 0 in the order of the scene's solids, have body0_x, body0_y, body0_z
-    [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far
-    it has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy, body0_wz [degrees/s], the
-    angular velocity. contacts: points where bodies touch walls or each other, or nearly do.
+    Units are SI; in 2-D mass and energies are per meter of depth. Energies are the particles' own;
+    potential_energy is 0 at the origin. Velocities, in frames too, are those of the middle of the
+    step, which move things through it; kinetic_energy is that of its end. With a narrow band, mass,
+    energies and center include the interior, particles does not. interior_density is the density of
+    the interior, relative to rest, that conserves the mass.
+
+    solve_residual is relative to the residual of the right-hand side. In free fall that is rounding
+    noise, on which no iterations are spent, and solve_residual may be up to 1.
+
+    stopped: particles that met a wall. pushed: particles that a moving solid swept along. stuck:
+    particles inside solids without a way out, as between closing solids. max_density: largest
+    density, relative to rest, before the density correction of the step, or at the start of a step
+    without one. density_status and density_iterations: those of that correction, empty without one.
+    reseeded: particles that were moved to a neighboring cell. emitted, drained, departed: particles
+    that sources have added in the step, that drains have removed, and that have left through open
+    sides. spray: particles off the grid, see `warp_lcp.material.spray`.
+
+    Rigid bodies are numbered from 0 in the order of the scene's solids. They have body0_x, body0_y,
+    body0_z [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; in 2-D body0_angle
+    [degrees], the angle of rotation, and body0_spin [degrees/s]; in 3-D body0_wx, body0_wy,
+    body0_wz [degrees/s], the angular velocity. contacts: points where bodies touch walls or each
+    other, or nearly do.
 
     Args:
-        own: of the material's own models.
-        told: names of more, and whether a scene has them.
-        bodies: of the rigid bodies.
+        own: columns of the material's own models.
+        told: names of further columns, and whether a scene has them.
+        bodies: columns of the rigid bodies.
     """
     return (*COLUMNS, *own, *(name for name, wanted in told.items() if wanted), *bodies)
 
 
 class Moved(NamedTuple):
-    """A step that has been taken.
+    """Data of a step that has been taken.
 
     Attributes:
         particle_mass: [kg]; 2-D: [kg/m].
@@ -76,7 +81,7 @@ class Moved(NamedTuple):
 
 
 def solve_row(result: wl.SolveResult) -> Row:
-    """Return what the log says of a solve."""
+    """Return the log entries of a solve."""
     return {
         "solve_status": result.status.name,
         "solve_iterations": result.iterations,
@@ -86,7 +91,10 @@ def solve_row(result: wl.SolveResult) -> Row:
 
 
 def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: float) -> Row:
-    """Return what the log says of the particles at the end of a step, in cells of `spacing` [m]."""
+    """Return the log entries of the particles at the end of a step.
+
+    Cells have the width `spacing` [m].
+    """
     mass = totals.count * moved.particle_mass
     return {
         "particles": particles,
@@ -100,10 +108,11 @@ def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: fl
 
 
 def _kinetic_energy(totals: ParticleTotals, moved: Moved) -> float:
-    """Return the energy of motion at the end of a step over mass [m^2/s^2]; the particles' velocities are those of its middle.
+    """Return the kinetic energy per mass at the end of a step [m^2/s^2].
 
-    For half a step more gravity works on what moves, V, and by what it has changed V in this one:
-    nothing where solids bear it.
+    The particles' velocities are those of the middle of the step. Gravity acts for half a step more
+    on the mean velocity V, in proportion to the part of gravity that has changed V in this step:
+    not at all where solids carry the material.
     """
     g, dt = moved.gravity, moved.dt
     gained = float(g @ (totals.velocity - moved.velocity_before)) / moved.kick_dt

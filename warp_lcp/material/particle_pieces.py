@@ -1,4 +1,4 @@
-"""The state of particles and cells in pieces, one of each rank of a run on several, and as a whole."""
+"""State of a simulation as a whole and in pieces, one piece a rank."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 
 from warp_lcp.material.particle_redistribution import STATE
 
-# what one rank has of a simulation's state; the last axes of what lies in cells are z, y, x
+# One rank's piece of a simulation's state. The last axes of fields of cells are z, y, x.
 Piece = Mapping[str, np.ndarray]
 
-ALIKE = ("bodies", "body_contacts")  # tables of what all ranks have
-LATER = {STATE: np.float64}  # there once particles have been moved apart
+ALIKE = ("bodies", "body_contacts")  # tables that are the same on all ranks
+LATER = {STATE: np.float64}  # arrays that exist after the first density correction
 
 
 def fields_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the entries of a state that lie in cells."""
+    """Return the entries of a state that are fields of cells."""
     return {name: values for name, values in state.items() if np.ndim(values) >= 3}
 
 
 def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the state of a simulation in one process as the piece of a rank that has everything.
+    """Return the state of a one-process simulation as the piece of a single rank.
 
     Raises:
         ValueError: it is not the state of particles.
@@ -45,10 +45,10 @@ def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the pieces of all ranks as the state of a simulation in one process.
+    """Merge the pieces of all ranks to the state of a one-process simulation.
 
     Args:
-        pieces: of all ranks.
+        pieces: pieces of all ranks.
         like: a state of the same scene in one process, which gives names, types and what lies
             around the domain.
 

@@ -1,4 +1,4 @@
-"""What moves particles apart from the flow: they are evened out where a scene asks for it, and moved apart where they crowd."""
+"""Particle redistribution: density correction and reseeding."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from warp_lcp.simulation import Stopwatch
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 STATE = "density_correction"
-PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes out what crowds
+PACE = 2.0  # factor on sqrt(dx / g): time in which an automatic correction removes the excess
 
 
 class ParticleRedistribution:
@@ -33,24 +33,24 @@ class ParticleRedistribution:
     fraction `ParticleScene.most_crowded` of the material in excess of what cells may hold. It
     removes the excess over a time `PACE` sqrt(dx / g), so that a short step lifts little material.
     The density is that at the start of the step, which the liquid's surface and the sand's packing
-    have computed already: whether a step acts depends on the particles' positions only, so that a
+    have computed already. Whether a step acts depends on the particles' positions only, so that a
     checkpoint needs no more state. The fields of the correction are allocated when it first acts.
 
     Args:
-        scene: what asks for it.
+        scene: the scene, with its settings.
         grid: its grid.
         boundary: its solids.
 
     Attributes:
-        reseeding: the reseeding; None: the scene does not ask for it.
-        density_monitor: decides when to correct; None: the scene decides, or there is no
+        reseeding: the reseeding; None if the scene has none.
+        density_monitor: decides when to correct; None if the scene decides, or if there is no
             correction.
-        correction: the density correction; None: it has not acted yet, or never does.
+        correction: the density correction; None if it has not acted yet, or never does.
         moved: whether the last `apply` may have moved particles.
     """
 
     def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> None:
-        """Make what the scene asks for."""
+        """Make the parts that the scene asks for."""
         self._scene, self._grid, self._boundary = scene, grid, boundary
         self.reseeding = make_reseeding(scene, grid, boundary)
         self.density_monitor = make_density_monitor(scene, grid, boundary)
@@ -62,18 +62,21 @@ class ParticleRedistribution:
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
         self.moved = False
-        # whether a step has measured the density_monitor, and which one has been looked at
+        # Whether a step has measured the density monitor, and the number of the last step that
+        # called `look`.
         self._looked, self._step = False, -1
 
     def look(
         self, step: int, density: wp.array | None, particles: Particles, window: Window
     ) -> None:
-        """Measure the density_monitor at the start of a step, before anything moves, if that is what decides.
+        """Measure the density at the start of a step, if a density monitor decides.
+
+        Nothing has moved yet.
 
         Args:
             step: its number.
-            density: of the particles, in units of that at rest, float32; None: nobody has found it
-                yet.
+            density: density of the particles, in units of that at rest, float32; None if it is not
+                known yet.
             particles: the material.
             window: cells that hold all of it, with two to spare on each side.
         """
@@ -98,11 +101,11 @@ class ParticleRedistribution:
         )
 
     def due(self, step: int) -> bool:
-        """Return whether a step moves anything."""
+        """Return whether a step moves particles by reseeding or correction."""
         return self._evens(step) or self._parts(step)
 
     def corrects_alone(self, step: int) -> bool:
-        """Return whether a step's only rearrangement is a density correction."""
+        """Return whether the only redistribution of a step is a density correction."""
         return not self._evens(step) and self._parts(step)
 
     def apply(
@@ -115,19 +118,20 @@ class ParticleRedistribution:
         fill: Fill | None,
         contact: wp.array | None,
     ) -> dict[str, float | int | str]:
-        """Even out the particles and move them apart, if it is time.
+        """Reseed the particles and correct their density, if it is due.
 
         Args:
             particles: the material (moved).
             window: cells that hold all particles, with two to spare on each side.
             step: its number.
             dt: its length [s].
-            watch: what the stages are measured with.
-            fill: adds to the density in a window what no particle stands for.
-            contact: uint8, RELEASED where walls have let go in the step; None: it is not known.
+            watch: stopwatch of the stages.
+            fill: adds the density of material without particles, in a window.
+            contact: uint8, RELEASED where walls have separated in the step; None if it is not
+                known.
 
         Returns:
-            What the log says of it.
+            The log entries.
         """
         row: dict[str, float | int | str] = {}
         self.moved = self._evens(step)
@@ -163,7 +167,10 @@ class ParticleRedistribution:
         return self.correction is not None and step % self.correction.every == 0
 
     def _share(self, dt: float) -> float:
-        """Return how much of what crowds a step moves apart: all where the scene says when, else at a rate that knows of no steps."""
+        """Return the fraction of the excess that a step removes.
+
+        All of it where the scene sets the steps; else a fraction in proportion to the time step.
+        """
         return (
             min(1.0, dt / self._pace)
             if self.density_monitor is not None and self._pace > 0.0
@@ -176,7 +183,7 @@ class ParticleRedistribution:
         return (*evens, *CORRECTION_COLUMNS) if self._scene.correction is not None else evens
 
     def notes(self) -> list[str]:
-        """Return why nothing keeps the particles apart where the scene leaves that to the program."""
+        """Return why no density correction acts, if the program was to decide."""
         if self._scene.density_correction is not None or self.density_monitor is not None:
             return []
         none = "density correction is off: it is not available with periodic axes"
@@ -187,7 +194,7 @@ class ParticleRedistribution:
         return {} if self.correction is None else {STATE: self.correction.x.numpy().copy()}
 
     def expect(self, state: Mapping[str, np.ndarray]) -> None:
-        """Get ready for a state of this scene, which may be from before or after the first correction."""
+        """Prepare for a state from before or after the first correction."""
         if self.density_monitor is not None:
             self.correction = (self.correction or self._made()) if STATE in state else None
 

@@ -1,4 +1,4 @@
-"""Scenes of a material that particles carry, whatever it is: its sampling, sources and drains, and what a run would take."""
+"""Scenes of materials on particles: sampling, sources, estimates of a run."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from warp_lcp.scene.table import Complaint, Table
 from warp_lcp.settings import Count, CountOrZero, Part, Share
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
-GRID_BYTES = 36  # fields of the grid, a cell
+GRID_BYTES = 36  # fields of the grid, per cell
 CUT_BYTES = 45
 MOVING_BYTES = 30
 SOURCE_BYTES = 8
-# the density correction's fields and method, and more where cells are cut
+# Bytes a cell of the density correction's fields and method; and more where cells are cut.
 CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22
-EVEN_BYTES = 9  # and more where it closes voids
+EVEN_BYTES = 9  # and more where the correction closes voids
 RESEED_BYTES = 13
 BAND_BYTES = 24
-FLIGHT_BYTES = 10  # what says which cells belong to bodies in flight
-# how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam
-# break in 3-D
+FLIGHT_BYTES = 10  # marks of the cells of airborne bodies
+# Largest growth of a narrow band with its surface: 1.3 times in a double dam break, 1.7 in a dam
+# break in 3-D.
 SPREAD = 2.0
-PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
+PLANES = 2.5  # planes for which a 2-D cell counts: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
-SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
-# of the distance of particles: their float32 coordinates may be off by that on 4096 cells
+SEEDING_BYTES = 136  # a particle on the host, before the solver is made
+# Fraction of the distance of particles: the error of their float32 coordinates on 4096 cells.
 SITE_SLACK = 1e-3
-LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
+LATTICE_BYTES = 50  # a point of one plane of cells, while particles are selected
 
 
 class Reseed(Table):
@@ -79,13 +79,13 @@ class ParticleSettings(Table):
     narrow_band: NarrowBandSettings | None = None
 
     def reseed_range(self, dimension: int) -> tuple[int, int]:
-        """Return the fewest and the most particles of a cell that reseeding leaves alone."""
+        """Return the range of particle numbers of cells that reseeding leaves alone."""
         at_rest, given = self.per_axis**dimension, self.reseed or Reseed()
         return given.min or math.ceil(0.375 * at_rest), given.max or 2 * at_rest
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles out of overfull cells; without the table, once these hold 0.1 % of a liquid."""
+    """[density_correction]: reduces overfull cells; by default once they hold 0.1 % of a liquid."""
 
     every: CountOrZero = Field(default=1, description="steps between corrections; 0: off")
     tolerance: Share = Field(default=1e-2, description="relative residual")
@@ -97,27 +97,30 @@ class DensityCorrectionSettings(Table):
     )
 
     def largest(self, per_axis: int) -> float:
-        """Return the density [of that at rest] that a cell may have: particles on a lattice are uneven the more, the fewer they are."""
+        """Return the largest density of a cell, relative to rest.
+
+        Particles on a lattice are the more uneven, the fewer they are.
+        """
         return self.max_density if self.max_density is not None else 1.0 + 0.1 / per_axis
 
 
 class ParticleScene(Scene):
-    """A scene of a material that particles carry.
+    """Scene of a material that particles carry.
 
     Subclasses add the list of the material's shapes and name it in `materials`.
     """
 
-    # a cell, of the fields of the solve that are there before the particles are made
+    # Bytes a cell of the solve's fields that exist before the particles are made.
     solve_bytes: ClassVar[int] = 0
-    correction_gain: ClassVar[float] = 1.0  # of the density correction
-    # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed
-    # 1e-2
+    correction_gain: ClassVar[float] = 1.0  # gain of the density correction
+    # Fraction of the material in excess, times particles.per_axis. A pool at rest has 1e-3 / 3e-5
+    # at 1 / 2, a splash 1e-2.
     crowded: ClassVar[float] = 2e-3
-    # of its fastest particle in the mean of a run, in units of that after its whole fall
+    # Mean speed of the fastest particle over a run, relative to that after its whole fall.
     fall_speed: ClassVar[float] = 1.0
-    # times a step's price while a column falls: what a step takes in the mean of a run
+    # Mean cost of a step over a run, relative to that while a column falls.
     stirred: ClassVar[float] = 1.0
-    # whether the grid can carry the material without particles
+    # Whether the grid can carry the material without particles.
     carried_by_grid: ClassVar[bool] = False
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
@@ -127,16 +130,19 @@ class ParticleScene(Scene):
 
     @abstractmethod
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
-        """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
+        """Return the key of the material's shapes, such as `liquid`, and the shapes."""
 
     def kept(
         self, materials: Sequence[MaterialProperties | SourceProperties]
     ) -> list[float] | None:
-        """Return the number that the particles of each material or source take along; None: particles have none."""
+        """Return the number that particles of each material or source carry; None if none."""
         return None
 
     def models(self) -> list[Model]:
-        """Return the models that the scene turns on, and those that it asks for but cannot need. Subclasses add their own."""
+        """Return the models of the scene, and the models that it cannot need.
+
+        Subclasses add their own.
+        """
         moving = [number for number, solid in enumerate(self.solid) if solid.moves]
         bodies = [number for number, solid in enumerate(self.solid) if solid.is_body]
         settings, output = self.particles, self.output
@@ -168,7 +174,10 @@ class ParticleScene(Scene):
 
     @property
     def correction(self) -> DensityCorrectionSettings | None:
-        """Return how particles are moved apart, with or without the table, which a preset's values stand in for; None: they never are."""
+        """Return the settings of the density correction; None if there is none.
+
+        Without the table they are the values of a preset.
+        """
         given = self.density_correction
         if given is None:
             if self.endless or self.stays_full or self.settles:
@@ -178,7 +187,10 @@ class ParticleScene(Scene):
 
     @property
     def most_crowded(self) -> float:
-        """Return which share of the material may be beyond what cells hold before it is moved apart where the scene does not say when."""
+        """Return the fraction of overfull material that starts a density correction.
+
+        It applies if the scene does not set the steps.
+        """
         return self.crowded / self.particles.per_axis
 
     @property
@@ -193,26 +205,30 @@ class ParticleScene(Scene):
 
     @property
     def speeds_up(self) -> bool:
-        """Return whether the material's own forces may make what flies move faster within itself."""
+        """Return whether internal forces can accelerate airborne material."""
         return self.settles
 
     @property
     def stays_full(self) -> bool:
-        """Return whether the material fills the domain for ever."""
+        """Return whether the material fills the domain at all times."""
         return False
 
     @property
     def coheres(self) -> bool:
-        """Return whether what turns in flight keeps together."""
+        """Return whether rotating airborne material stays together."""
         return False
 
     @property
     def flies(self) -> bool:
-        """Return whether bodies in flight can be told: not where they lack particles inside, nor where they go on at another side."""
+        """Return whether airborne bodies are detected.
+
+        Not with a narrow band, which has no particles inside; not in a domain that stays full; not
+        with periodic axes.
+        """
         return self.particles.narrow_band is None and not self.stays_full and not self.endless
 
     def complaints(self) -> list[Complaint]:
-        """Return what is wrong across keys."""
+        """Return errors that concern several keys."""
         key, materials = self.materials()
         found = (
             []
@@ -251,13 +267,14 @@ class ParticleScene(Scene):
         return [Complaint(("particles", "reseed", key), value, message)]
 
     def particle_estimate(self, *, later: bool = True) -> int:
-        """Return how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
+        """Return the largest number of particles of the scene.
 
-        Sources may fill the domain; whether they do, and what leaves it, is not known before. How a
-        narrow band grows is not known either: with one it is an estimate.
+        Meshes and slanted shapes count as the boxes around them. Sources may fill the domain;
+        whether they do, and what leaves it, is not known before. With a narrow band it is an
+        estimate, since its growth is not known either.
 
         Args:
-            later: count what sources let in; False: what is there at the start.
+            later: include what sources add; False for the particles at the start.
         """
         let_in = sum(self._source_sites(source, later=later) for source in self.source)
         at_start = sum(
@@ -276,11 +293,13 @@ class ParticleScene(Scene):
         return count
 
     def _sites(self, box: np.ndarray | None, *, whole_cells: bool = False) -> np.ndarray:
-        """Return how many points the jittered lattice of the start has in a box along each axis, shape (dimension,), at most.
+        """Return the most lattice points of the start in a box, along each axis.
+
+        The shape is (dimension,).
 
         Args:
-            box: low and high corner [m], shape (2, 3); None: the domain.
-            whole_cells: of the cells whose centers lie in the box.
+            box: low and high corner [m], shape (2, 3); None for the domain.
+            whole_cells: count the points of cells whose centers lie in the box.
         """
         count = np.array(self.cell_counts[: self.dimension]) * self.particles.per_axis
         if box is None:
@@ -294,12 +313,12 @@ class ParticleScene(Scene):
         return found * self.particles.per_axis if whole_cells else found
 
     def _source_sites(self, source: Source, *, later: bool) -> int:
-        """Return how many particles a source's cells hold at most when it starts, and with those that it lets in until the run ends."""
+        """Return the most particles of a source, at its start and until the run ends."""
         held = self._sites(source.bounds(self.dimension), whole_cells=True)
         at_start = int(held.prod()) if later or source.begin == 0.0 else 0
         seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
         speed = np.abs(source.velocity)
-        # a lattice that moves along an axis may have one more point there
+        # A lattice that moves along an axis may have one more point there.
         across = held + (speed > 0.0)
         layers = np.where(
             speed > 0.0,
@@ -313,7 +332,10 @@ class ParticleScene(Scene):
         return at_start + (int(min(let_in, 2.0**62)) if later and held.all() else 0)
 
     def _band_volume(self, shape: MaterialProperties, width: float) -> float:
-        """Return the part of the box around a shape that is no deeper than a band below a free side [m^3; m^2 in 2-D]."""
+        """Return the volume of a shape's box in a narrow band [m^3; m^2 in 2-D].
+
+        It is no deeper than the band below a free side.
+        """
         size, deep = np.array(self.domain.size), width * self.spacing
         bounds = shape.bounds(self.dimension)
         low, high = (
@@ -326,7 +348,7 @@ class ParticleScene(Scene):
         return float(np.maximum(high - low, 0.0).prod() - np.maximum(inner, 0.0).prod())
 
     def plan(self) -> list[tuple[str, str]]:
-        """Return what a run would do."""
+        """Return the plan of a run in words."""
         particles = self.particle_estimate()
         settings = self.particles
         at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
@@ -357,8 +379,7 @@ class ParticleScene(Scene):
         """Return the models in words, with their shares of memory and time.
 
         Args:
-            measured: how long a step takes on the machine at hand [s]; None: as where the prices
-                were measured.
+            measured: time of a step on this machine [s]; None for the machine of the price table.
         """
         cells, particles = math.prod(self.covered_counts), self.particle_estimate()
         listed = prices(self.scene.simulator, self.dimension)
@@ -372,7 +393,7 @@ class ParticleScene(Scene):
         )
 
     def _rearrangement(self) -> list[tuple[str, str]]:
-        """Return what moves particles apart from the flow."""
+        """Return the density correction and reseeding in words."""
         lines, correction, reseed = [], self.correction, self.particles.reseed
         band = self.particles.narrow_band
         if band is not None:
@@ -400,7 +421,10 @@ class ParticleScene(Scene):
         return lines
 
     def memory_parts(self) -> dict[str, int]:
-        """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
+        """Return the largest device memory of each part of a run [bytes].
+
+        Parts that the run does not have are left out. The values are estimates.
+        """
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
         vectors = (
@@ -423,7 +447,10 @@ class ParticleScene(Scene):
         return {name: count for name, count in parts.items() if count}
 
     def _surface_bytes(self) -> int:
-        """Return what the lattice of a surface mesh takes, and a mesh as large as the domain's sides [bytes]."""
+        """Return the memory of a surface mesh and its lattice [bytes].
+
+        The mesh is assumed to be as large as the domain's sides.
+        """
         nx, ny, nz = (
             n * (self.output.surface_resolution or self.particles.per_axis)
             for n in self.covered_counts
@@ -436,11 +463,17 @@ class ParticleScene(Scene):
         )
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return what the material's own models take at most on the device [bytes]; parts that a scene does not have count 0."""
+        """Return the largest device memory of the material's own models [bytes].
+
+        Parts that a scene does not have count 0.
+        """
         return {}
 
     def memory_estimate(self) -> int:
-        """Return about how much memory a run takes at most [bytes], without the program itself; the particles' making may take the most."""
+        """Return the estimated peak memory of a run [bytes], without the program itself.
+
+        The making of the particles may need the most.
+        """
         nx, ny, _ = self.covered_counts
         lattice = nx * ny * self.particles.per_axis**self.dimension
         making = (
@@ -451,12 +484,15 @@ class ParticleScene(Scene):
 
     @property
     def covered_counts(self) -> tuple[int, int, int]:
-        """Return the cells along x, y and z that the grid covers at the start; it grows with what the material reaches."""
+        """Return the cells along x, y and z that the grid covers at the start.
+
+        The grid grows with the material.
+        """
         return start_of(self, "cpu")[1].counts
 
     @property
     def counted_cells(self) -> int:
-        """Return how many cells of a 3-D grid the cells that it covers at the start count for in memory."""
+        """Return the equivalent 3-D cells of the first grid, for memory estimates."""
         nx, ny, nz = self.covered_counts
         return round(nx * ny * (nz if self.dimension == 3 else PLANES))
 
@@ -471,7 +507,7 @@ def _megabytes(count: int) -> str:
 
 
 def _steps(every: int) -> str:
-    """Return how often, in words."""
+    """Return the interval of steps in words."""
     return "every step" if every == 1 else f"every {every} steps"
 
 

@@ -1,4 +1,4 @@
-"""A material on a staggered grid, carried by particles: what all such simulations do besides their own solve."""
+"""Particle simulations: the parts of a step besides the material's own solve."""
 
 from __future__ import annotations
 
@@ -35,74 +35,75 @@ from warp_lcp.material.wall import Join
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
-# relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and
-# bodies creep
+# Largest relative residual of bodies' contacts. Above it gravity's velocity of a step is wrong by a
+# hundredth, and bodies creep.
 CONTACTS_MISSED = 1e-2
 
 
 class ParticleSimulation(ParticleCheckpoints):
-    """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
+    """Simulation of particles on a staggered grid, without the material's own solve.
 
-    Particles have the velocities of the middle of the last step, the grid in a step those of its
-    middle: forces act for `kick_dt`, half of the last step and half of this one, and then particles
-    move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme that is its own
-    inverse in time, whatever the steps' lengths: what flies goes along its parabola.
+    A subclass calls the parts of a step in its own `step`. Particles have the velocities of the
+    middle of the last step; the grid has, in a step, those of its middle. Forces act for `kick_dt`,
+    half of the last step and half of this one; then particles move for the whole step (the leapfrog
+    of Verlet). One solve a step gives a scheme that is its own inverse in time, whatever the steps'
+    lengths: airborne material moves along its parabola.
 
-    The grid's part says what of it this process works on. On several ranks making a simulation,
-    `stable_dt`, `step`, `mark`, `frame` and `restore_pieces` are collective and give every rank the
-    same numbers, or raise the same error on all: rows of the log are of the whole material; a frame
-    shows this rank's particles and cells. What another rank knows comes in where the chain of
-    dependence needs it: particles a cell from the cut before they are brought to the faces;
-    velocities and weights of the faces; what a material finds of its cells; the solve, which is one
-    of all ranks; the velocity that it leaves, and again while that is continued into air and walls.
-    All of it is computed by the same kernels from the same numbers in the same order as by one
-    process, so that runs on any number of ranks differ by the rounding in the solver and in sums
-    over all particles alone.
+    The grid's part defines the cells that this process works on. On several ranks, making a
+    simulation, `stable_dt`, `step`, `mark`, `frame` and `restore_pieces` are collective. They give
+    every rank the same numbers, or raise the same error on all. Rows of the log are of the whole
+    material; a frame has this rank's particles and cells. Data of other ranks are exchanged where
+    they are needed: particles within a cell of the cut before the transfer to the faces; velocities
+    and weights of the faces; the material's fields of cells; the solve, which is one solve of all
+    ranks; the velocity after the solve, and again while it is extrapolated into air and walls. The
+    same kernels compute with the same numbers in the same order as one process does. Runs on
+    different numbers of ranks therefore differ only by rounding in the solver and in sums over all
+    particles.
 
     A step calls `begin_step`, `window` and `particles_to_grid`; changes `velocity` by the laws of
     its material; then calls `extrapolate_velocity`, `grid_to_particles` and `move`, and returns the
     log columns of `logged`. Until `move` the state is unchanged except for the order of the
-    particles, so that a solve may fail: all of it is in the context `attempt`.
+    particles, so that a solve may fail. The whole step is in the context `attempt`.
 
-    Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In
-    between the subclass gives them the impulses of its solve and calls `solve_contacts`.
+    For rigid bodies, `begin_step` starts their step and `move` ends it. In between, the subclass
+    gives them the impulses of its solve and calls `solve_contacts`.
 
-    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's
-    clock, time step, checkpoints, resampling, notes and columns; `step` and `frame` are the
-    subclass's.
+    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` the class has the
+    clock, time step, checkpoints, resampling, notes and columns of a Simulation; the subclass
+    defines `step` and `frame`.
 
     Args:
-        scene: what to simulate.
-        grid: the one that it starts on.
-        parts: what of it belongs to that grid: walls and solids, sources, a narrow band.
-        particles: the material at the start, this process's.
-        make_parts: makes the parts of another grid; None: this one is kept.
-        outlets: where it leaves.
+        scene: the scene.
+        grid: the initial grid.
+        parts: the parts that belong to that grid: walls and solids, sources, a narrow band.
+        particles: this process's material at the start.
+        make_parts: makes the parts of another grid; None if the grid never changes.
+        outlets: drains and open sides.
         bodies: solids of the boundary that the material moves.
-        coverage: says when the material needs another grid; None: this one is kept.
-        spray: carries particles that need no grid; None: none does.
-        notes: facts for the start of a run.
+        coverage: chooses the grid window; None if the grid never changes.
+        spray: carries particles that need no grid; None if there is none.
+        notes: notes for the start of a run.
 
     Attributes:
-        particles: the material, but for its spray.
-        velocity: of the last step on the faces, one field a component [m/s].
-        weights: of the particles on each component's faces, in the last step.
-        flights: gives bodies in flight their momenta back; None: the material has none, or none
-            that can be told.
+        particles: the material, without its spray.
+        velocity: velocity of the last step on the faces, one field a component [m/s].
+        weights: weights of the particles on each component's faces, in the last step.
+        flights: conserves the momenta of airborne bodies; None if it is off.
         gravity: [m/s^2], shape (3,).
         particle_mass: [kg]; 2-D: [kg/m].
-        layers: how far the velocity is continued into air and walls, in faces.
-        reach: how far from particles a step touches cells; more than `layers` where a subclass
-            needs it.
+        layers: number of layers of faces to which the velocity is extrapolated into air and walls.
+        reach: distance from particles, in cells, within which a step writes to cells; more than
+            `layers` where a subclass needs it.
         time: [s].
         step_count: steps done.
         last_dt: length of the last step [s], 0 before the first.
-        kick_dt: how long forces act in the step that has begun [s].
-        watch: what the stages of a step are measured with.
-        sides: joins the ends of axes without an end; None: there are none.
-        diagnostics: are called before the totals of particles that have moved, to launch what is
-            read with them.
-        vicinity: finds the cells that a step must visit; None: all around the particles.
+        kick_dt: time for which forces act in the current step [s].
+        watch: stopwatch of the stages of a step.
+        sides: periodic sides; None if there are none.
+        diagnostics: functions that are called before the totals of moved particles, to launch work
+            that is read with them.
+        vicinity: active row segments, the cells that a step must visit; None for all cells around
+            the particles.
     """
 
     vicinity: ActiveRows | None = None
@@ -121,7 +122,7 @@ class ParticleSimulation(ParticleCheckpoints):
         spray: Spray | None = None,
         notes: Sequence[str] = (),
     ) -> None:
-        """Allocate the fields, fill the sources that run at the start and sort the particles."""
+        """Allocate the fields, fill running sources and sort the particles."""
         self.scene, self.particles, self.outlets, self.bodies = scene, particles, outlets, bodies
         self._bodies_at_start = (
             [body.state() for body in bodies.bodies] if bodies is not None else []
@@ -153,12 +154,12 @@ class ParticleSimulation(ParticleCheckpoints):
         particles.exchange.count()
 
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
-        """Allocate what belongs to a grid. Subclasses add theirs."""
+        """Allocate the parts that belong to a grid; subclasses add theirs."""
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
-        self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
-        # [m]; a tent at the very end would reach beyond what is stored
+        self._columns: tuple[str, ...] | None = None  # columns of the log, after their first use
+        # [m]. A tent at the very end would reach beyond the stored cells.
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
         self.sides, at_once = parts.boundary.sides, grid.part.at_once
@@ -166,14 +167,14 @@ class ParticleSimulation(ParticleCheckpoints):
             grid.device, self._launch_particles_to_grid, at_once=at_once
         )
         self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
-        # beside those FLIP copies velocities, as many as there are
+        # Near barriers FLIP copies velocities; a recorded launch would copy a fixed number.
         at_once |= grid.barriers is not None
         self._transfer_to_particles = LaunchGraph(
             grid.device, self._launch_grid_to_particles, at_once=at_once
         )
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        # without an interior, and ends where the grid does
+        # Active rows need a grid without ranks, without an interior and without periodic axes.
         if not (grid.part.shared or self.band is not None or scene.endless):
             self.vicinity = ActiveRows(grid, self.vicinity)
         self.flights = make_flights(scene, grid, self.boundary)
@@ -186,11 +187,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """Return the names of the log's columns that the material's own models fill."""
 
     def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
-        """Go on on another grid of the same domain.
+        """Continue on another grid of the same domain.
 
         Args:
             grid: the other one.
-            state: what to go on from; None: as it is.
+            state: the state to continue from; None for the current one.
         """
         before, kept = self.grid, self._fields() if state is None else state
         self._lay_anew(grid)
@@ -199,7 +200,7 @@ class ParticleSimulation(ParticleCheckpoints):
             self._take_fields(carry_over(kept, before, grid, self._fields()))
 
     def _lay_anew(self, grid: StaggeredGrid) -> None:
-        """Allocate another grid, whose fields then hold nothing yet."""
+        """Allocate another grid; its fields have no values yet."""
         assert self._make_parts is not None, "this grid is kept"
         for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
             delattr(self, name)
@@ -214,7 +215,10 @@ class ParticleSimulation(ParticleCheckpoints):
         self.boundary.place(self.time)
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
-        """Go on on another grid if the material leaves this one in a step or is much smaller, or in other boxes of ranks."""
+        """Change the grid or the boxes of ranks, if needed.
+
+        The grid changes if the material leaves it in a step, or if it is much too large.
+        """
         if self.grid.part.should_rebalance(self.step_count):
             self.rebalance()
         if self._coverage is None or (
@@ -224,7 +228,7 @@ class ParticleSimulation(ParticleCheckpoints):
         ):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
-        # `window`, a cell off the grid's end, where the step brings the material
+        # `window`, one cell off the grid's end, and the cells that the step adds.
         grow = self.reach + 3 + way
         low, high = cells_between(totals.low, totals.high, self.grid.spacing, grow)
         if self.scene.domain.boundless and (trouble := self._coverage.beyond(high)):
@@ -238,7 +242,10 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.regrid(grid)
 
     def stable_dt(self) -> float:
-        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
+        """Return the stable time step CFL dx / (v_max + sqrt(CFL g dx)) [s].
+
+        v_max is the largest speed of the material, and of solids and sources in the near future.
+        """
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = (
@@ -251,14 +258,17 @@ class ParticleSimulation(ParticleCheckpoints):
             for part in (self.boundary, self.sources)
             if part is not None
         ]
-        # gravity's own speed counts, so that a material at rest does not take off
+        # Gravity's own speed counts, so that the time step of a material at rest is bounded.
         speed = max(totals.max_speed, *driven) + math.sqrt(
             cfl * math.sqrt(self.gravity @ self.gravity) * dx
         )
         return cfl * dx / speed if speed > 0.0 else math.inf
 
     def events(self, until: float) -> list[float]:
-        """Return the times [s] later than now, up to `until`, at which a source or drain starts or stops or a solid's velocity jumps."""
+        """Return the times [s] of events later than now, up to `until`.
+
+        Events are starts and stops of sources and drains, and jumps of a solid's velocity.
+        """
         timed: list[Source | Drain] = [
             *(self.sources.sources if self.sources else ()),
             *(self.outlets.drains if self.outlets else ()),
@@ -270,7 +280,10 @@ class ParticleSimulation(ParticleCheckpoints):
         return [time for time in times if self.time < time <= until]
 
     def rebalance(self) -> None:
-        """Go on in the boxes of ranks in which the busiest has least to do, if they are much better than those there are; collective."""
+        """Continue in better boxes of ranks, if there are any; collective.
+
+        The busiest rank then has least work; the gain must be large enough.
+        """
         with self.watch.stage("repartitioning", self.particles.position):
             part = self.grid.part.rebalance(
                 self.particles, self.scene.particles.per_axis**self.grid.dimension
@@ -280,7 +293,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
-        """Return a context for a step: if it fails, bodies are where they were, and particles of other ranks are gone."""
+        """Return a context for a step that restores bodies and removes ghosts on failure."""
         try:
             yield
         except (StepFailed, SimulationFailed):
@@ -290,7 +303,7 @@ class ParticleSimulation(ParticleCheckpoints):
             raise
 
     def begin_step(self, dt: float) -> ParticleTotals:
-        """Check time step and particles, bring the particles into order, and return sums over them.
+        """Check time step and particles, arrange the particles, and return sums over them.
 
         Args:
             dt: time step [s].
@@ -321,7 +334,9 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals
 
     def solve_contacts(self) -> None:
-        """Solve for the rigid bodies' contacts with what the material has given them, before anything moves.
+        """Solve the rigid bodies' contacts with the impulses of the material.
+
+        Nothing has moved yet.
 
         Raises:
             StepFailed: they are far from solved; the bodies are where they were before the step.
@@ -342,12 +357,12 @@ class ParticleSimulation(ParticleCheckpoints):
             )
 
     def window(self, totals: ParticleTotals) -> Window:
-        """Return the cells that the particles can touch in a step: the step's `active` window, which is moved there."""
+        """Return the cells that particles can touch in a step, as the `active` window."""
         self.active.move_to(self._reached(totals))
         return self.active
 
     def _reached(self, totals: ParticleTotals) -> Window:
-        """Return the cells that the particles can touch in a step."""
+        """Return the cells that particles can touch in a step."""
         low, high = (self.particles.cell_of(corner) for corner in (totals.low, totals.high))
         box = self.grid.window(low, high, grow=self.reach + 2, shift=1)
         return (
@@ -357,18 +372,18 @@ class ParticleSimulation(ParticleCheckpoints):
         )
 
     def top_speed(self, totals: ParticleTotals) -> float:
-        """Return the scale of the velocities that `particles_to_grid` leaves [m/s]."""
+        """Return the scale of the velocities after `particles_to_grid` [m/s]."""
         return totals.max_speed + self.kick_dt * math.sqrt(self.gravity @ self.gravity)
 
     def particles_to_grid(self, window: Window) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
+        """Transfer particle velocities to the faces, and apply gravity for `kick_dt`."""
         p = self.particles
         with self.watch.stage(
             "particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights
         ):
             for kick, change in zip(self.kicks, self.gravity * self.kick_dt, strict=True):
                 kick.value = float(change)
-            # gravity may be turned between steps
+            # Gravity may change its direction between steps.
             acts = tuple(kick.value != 0.0 for kick in self.kicks)
             self._transfer_to_grid.run(window, variant=(window.near is None, acts, p.runs is None))
 
@@ -400,7 +415,9 @@ class ParticleSimulation(ParticleCheckpoints):
         contact: wp.array,
         dt: float = 0.0,
     ) -> None:
-        """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
+        """Extrapolate the velocity from the valid faces of a solve into air and walls.
+
+        See `warp_lcp.material.wall`.
 
         Args:
             window: faces to consider.
@@ -448,13 +465,20 @@ class ParticleSimulation(ParticleCheckpoints):
         contact: wp.array,
         join: Join | None,
     ) -> None:
-        """Continue the velocity among the boundary's walls; `join` is called after each layer."""
+        """Extrapolate the velocity among the boundary's walls.
+
+        `join` is called after each layer.
+        """
         self.boundary.extrapolate_velocity(
             window, self.velocity, self.weights, known, kind, contact, self.layers, join
         )
 
     def _layer_filled(self) -> Join | None:
-        """Return what is called with marks and field of a component when a layer of faces is filled: ghost cells, and ends, follow."""
+        """Return a function that is called after each layer of extrapolated faces.
+
+        Its arguments are the marks and the field of a component. It fills ghost cells and periodic
+        sides; None if there is nothing to fill.
+        """
         refill, sides = self.grid.part.refill(), self.sides
         if refill is None or sides is None:
             return refill if sides is None else sides.wrap
@@ -468,7 +492,10 @@ class ParticleSimulation(ParticleCheckpoints):
     def exchange(
         self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array
     ) -> None:
-        """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
+        """Exchange particles with the interior of a narrow band, if there is one.
+
+        Arguments as of `warp_lcp.material.narrow_band.NarrowBand`.
+        """
         if self.band is not None:
             with self.watch.stage(
                 "narrow band", *self.particles.arrays().values(), self.band.depth
@@ -478,10 +505,10 @@ class ParticleSimulation(ParticleCheckpoints):
                 )
 
     def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
-        """Find the bodies in flight, and give the particles the velocity of the faces.
+        """Find airborne bodies, and transfer the faces' velocity to the particles.
 
         Args:
-            window: of the step.
+            window: window of the step.
             kind: int8 of AIR, FLUID, SOLID, of the step's solve.
             dt: time step [s].
         """
@@ -509,18 +536,20 @@ class ParticleSimulation(ParticleCheckpoints):
         density: wp.array | None = None,
         contact: wp.array | None = None,
     ) -> Row:
-        """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
+        """Move particles and solids by dt [s], and finish the step.
+
+        Particles are exchanged with sources and outlets and redistributed; the clock advances.
 
         Args:
             dt: time step [s].
-            window: of the step.
-            density: of the particles before they move, in units of that at rest; None: no step has
-                found it yet.
+            window: window of the step.
+            density: density of the particles before they move, in units of that at rest; None if it
+                is not known.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED: the contact with walls in the step;
-                None: not known.
+                None if it is not known.
 
         Returns:
-            What the log says of it and of the particles.
+            The log entries of the step and of the particles.
 
         Raises:
             SimulationFailed: something is not finite, or a particle has left the domain.
@@ -545,13 +574,13 @@ class ParticleSimulation(ParticleCheckpoints):
             rearranged |= self.rearrangement.apply(
                 self.particles, window, self.step_count, dt, self.watch, fill, contact
             )
-            # the density correction may push particles out through open sides
+            # The density correction may push particles out through open sides.
             if self.outlets is not None:
                 exchanged["departed"] += int(
                     self.grid.part.ranks.sum(self.outlets.remove_departed(self.particles))
                 )
             if early:
-                # as read with the solve, before particles have been displaced
+                # As read with the solve, before particles have been displaced.
                 stopped, pushed, stuck = self.met()
             if (
                 early
@@ -572,18 +601,23 @@ class ParticleSimulation(ParticleCheckpoints):
         )
 
     def monitor_density(self, window: Window, density: wp.array | None) -> None:
-        """Measure the density at the start of a step, before anything moves, if that has not been done.
+        """Measure the density at the start of a step, unless it has been measured.
+
+        Nothing has moved yet.
 
         Args:
             window: around the particles.
-            density: of the particles, in units of that at rest, where it is known.
+            density: density of the particles, in units of that at rest, where it is known.
         """
         with self.watch.stage("density monitor", self.particles.position):
             self.rearrangement.look(self.step_count, density, self.particles, window)
 
     @property
     def _monitored(self) -> bool:
-        """Whether a GPU knows what a density correction is decided by before particles move, and need not measure them in between."""
+        """Whether the density was measured on a GPU, and particle numbers stay the same.
+
+        The density correction then needs no readback between the move and the correction.
+        """
         kept = (
             self.grid.part.shared
             or self.band is not None
@@ -606,7 +640,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return self.checked_totals(when)
 
     def carry(self, dt: float) -> None:
-        """Move particles and solids by dt [s]; bodies in flight keep their momenta."""
+        """Move particles and solids by dt [s]; airborne bodies keep their momenta."""
         if self.bodies is not None:
             self.bodies.end_step(dt)
             if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
@@ -621,16 +655,19 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.boundary.thin.stop(self.particles.position, still=not self.boundary.moves)
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many of all particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
+        """Return numbers of particles that met a wall, were pushed, and are stuck.
+
+        They are those of all ranks. The counts are those of the last `carry`.
+        """
         met, pushed, stuck = self.grid.part.ranks.sum(np.array(self.boundary.met())).tolist()
         return met, pushed, stuck
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
-        """Return what the log says of a step's solve; nothing if there was none."""
+        """Return the log entries of a step's solve; empty if there was none."""
         return {} if result is None else {"solver": self.scene.solver.method} | solve_row(result)
 
     def logged(self, row: Row) -> Row:
-        """Return the entries of a row that the log has columns for, in their order."""
+        """Return the entries of a row that have log columns, in their order."""
         bodies = self.bodies.row() if self.bodies is not None else {}
         found = row | bodies
         if self._columns is None:
@@ -638,7 +675,10 @@ class ParticleSimulation(ParticleCheckpoints):
         return {name: found.get(name) for name in self._columns}
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns, see `warp_lcp.material.particle_log.columns`."""
+        """Return the names of the log's columns.
+
+        See `warp_lcp.material.particle_log.columns`.
+        """
         told = {
             **{
                 "stopped": True,
@@ -657,7 +697,7 @@ class ParticleSimulation(ParticleCheckpoints):
         )
 
     def notes(self) -> list[str]:
-        """Return warnings and facts worth a line at the start of a run."""
+        """Return warnings and notes for the start of a run."""
         cells, covered = (
             " x ".join(map(str, n[: self.grid.dimension]))
             for n in (self.grid.domain_counts, self.grid.counts)
@@ -704,7 +744,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals if self.band is None else self.band.with_interior(totals)
 
     def _exchange(self, dt: float) -> dict[str, int]:
-        """Remove the particles that have left in the step and add those that have come in; return how many all ranks have."""
+        """Remove particles at outlets, add those of sources; return global counts."""
         span, drained, departed = (self.time, self.time + dt), 0, 0
         with self.watch.stage("sources and outlets", self.particles.position):
             for outlets in [] if self.outlets is None else [self.outlets]:
@@ -732,7 +772,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return row | {"interior_density": density, "spray": flying}
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points [m], shape (n, 3), a particle may be at."""
+        """Return at which points [m], shape (n, 3), a particle may be."""
         i, j, k = np.clip(self.particles.cells_of(points), -1, self.grid.counts).T + 1
         free = self.boundary.base.numpy()[k, j, i] != wl.SOLID
         if self.grid.barriers is not None:

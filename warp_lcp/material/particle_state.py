@@ -1,4 +1,4 @@
-"""What says whether particles, or a saved state, are such that a simulation can go on from them."""
+"""Validate particles and saved states."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from warp_lcp.operators.grid_poisson import SOLID
 
 
 def signature(scene: ParticleScene, grid: StaggeredGrid) -> np.ndarray:
-    """Return numbers that tell a scene's arrays from another's, shape (7,): cells along x, y and z, of the whole domain, and others."""
+    """Return numbers that identify a scene's arrays, shape (7,).
+
+    Cells of the domain along x, y and z, and others.
+    """
     settings = scene.particles
     transfer = ("apic", "flip", "pic").index(settings.transfer)
     counts = grid.domain_counts
@@ -29,11 +32,11 @@ def check_state(
     changing: Collection[str] = (),
     solids_move: bool = False,
 ) -> None:
-    """Refuse a state that is not of the same scene.
+    """Refuse a state that does not belong to the same scene.
 
     Args:
-        state: what to continue from.
-        expected: what the simulation that shall continue has now; `cells` are among it.
+        state: the state to continue from.
+        expected: the current state of the simulation that will continue; it includes `cells`.
         changing: the particles' arrays, if their number changes.
         solids_move: whether solids may be where they have not been.
 
@@ -87,7 +90,10 @@ def other_spacing(
 def particle_trouble(
     particles: Particles, grid: StaggeredGrid, totals: ParticleTotals, end: np.ndarray
 ) -> str:
-    """Say which particles are not finite, or outside the domain, which ends at `end` [m]; "" if there are none."""
+    """Return a message about particles that are not finite or outside the domain.
+
+    The domain ends at `end` [m]. Empty if there are no such particles.
+    """
     position, velocity = particles.position.numpy(), particles.velocity.numpy()
     if totals.bad_velocities:
         field, bad = (
@@ -104,8 +110,8 @@ def particle_trouble(
     found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
     if not len(found):
         return ""
-    # of the cell that it was last sorted into
+    # The cell into which it was last sorted.
     k, j, i = np.unravel_index(int(particles.key.numpy()[found[0]]), grid.shape)
-    # counted from 0
+    # Counted from 0.
     cell = tuple(int(c) - 1 + before for c, before in zip((i, j, k), grid.origin, strict=True))
     return f"{field} is {wrong} in cell (x, y, z) = {cell} ({len(found)} particles)"

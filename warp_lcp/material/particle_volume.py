@@ -1,4 +1,4 @@
-"""What particles fill, as volumes that renderers take: distance to the surface, and density."""
+"""Volumes of a material for renderers: distance to the surface, and density."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.simulation import Volume
 
-VOLUME_BYTES = 13  # a cell: the level set's fields
+VOLUME_BYTES = 13  # fields of the level set, per cell
 
 
 class ParticleVolume:
-    """Measure a material on the cells of its grid, where its particles are when a frame is made.
+    """Measure a material on the cells of its grid when a frame is written.
 
     Args:
         grid: a 3-D grid.
         boundary: solids and walls.
-        particles_a_cell: of the material at rest.
+        particles_a_cell: number of particles in a cell of the material at rest.
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
@@ -27,12 +27,15 @@ class ParticleVolume:
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell)
 
     def measure(self, particles: Particles, *, fill: Fill | None = None) -> list[Volume]:
-        """Return the volumes `level_set`, the distance to the surface [m], < 0 inside, and `density`, in units of that at rest.
+        """Return the volumes `level_set` and `density`.
+
+        `level_set` is the distance to the surface [m], < 0 inside; `density` is in units of that at
+        rest.
 
         Args:
-            particles: of the material; where it is needed, on CUDA, they are sorted, as the next
-                step would do.
-            fill: adds to the density in a window what no particle stands for.
+            particles: particles of the material; on CUDA they are sorted, as the next step would
+                do, where the order is needed.
+            fill: adds the density of material without particles, in a window.
         """
         if particles.offsets is not None:
             particles.sort()

@@ -1,4 +1,4 @@
-"""Material that a program adds between two steps."""
+"""Add material between two steps."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 
 
 def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -> int:
-    """Fill what of a shape is empty, outside solids and cells of material, and return how many particles that took.
+    """Fill the empty part of a shape with particles, and return their number.
+
+    Cells of solids and of material stay as they are.
 
     Args:
         simulation: between two steps (updated).
-        shape: an entry of a scene's `[[liquid]]` or `[[sand]]`, with the velocity of what comes.
-        name: of the shape, for messages.
+        shape: an entry of a scene's `[[liquid]]` or `[[sand]]`, with the velocity of the new
+            material.
+        name: name of the shape, for messages.
 
     Raises:
         ValueError: the shape holds no empty cell, or the grid covers but a part of the domain.
@@ -33,7 +36,7 @@ def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -
     cells = grid.interior(simulation.own_state()["cells"])
     free = (cells == wl.AIR) & (grid.interior(boundary.base.numpy()) != wl.SOLID)
     i, j, k = simulation.particles.cells_of(simulation.particles.position.numpy()).T
-    free[k, j, i] = False  # where material has gone since the last solve
+    free[k, j, i] = False  # cells that material has entered since the last solve
     region = region_of(shape.to_geometry(Path.cwd(), grid.dimension), boundary, grid.device)
     points, _ = seed(
         grid,

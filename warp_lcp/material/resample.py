@@ -1,4 +1,4 @@
-"""Material brought from one grid to another: as many particles a cell as before, so more or fewer of them."""
+"""Resample material for another grid, with as many particles a cell as before."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from warp_lcp.grid.particles import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
-# x^(d+1) = x + 1: the steps of a sequence that fills a cube evenly
+# x^(d+1) = x + 1: the steps of a sequence that fills a cube evenly.
 PLASTIC = {2: 1.32471795724474602596, 3: 1.22074408460575947536}
 
 
@@ -25,19 +25,19 @@ def resampled(
 ) -> tuple[dict[str, np.ndarray], int]:
     """Return the particles of a state, made finer or coarser for another grid.
 
-    With k > 1 times as many particles as there were, every one is followed by k on average, spread
-    over the square or cube that was its share of a cell at rest; its velocity is continued there by
-    its gradient. With k < 1 one of every 1/k stays, chosen by chance among neighbors. A uniform
+    With k > 1 times as many particles as before, each is replaced by k on average, spread over the
+    square or cube that was its share of a cell at rest. Its velocity is extrapolated there by its
+    gradient. With k < 1 one of every 1/k stays, chosen at random among neighbors. A uniform
     velocity is added, so that momentum is conserved but for the rounding of the particles' number.
 
     Args:
         state: `position` [m], `velocity` [m/s], for APIC `affine_0` ... [1/s] and what particles
             take along, `kept`; float32, shape (n, 3), about in the order of the cells.
         grid: the new grid.
-        admits: tells which points [m], shape (n, 3), a particle may be at.
-        spacing: of the old grid [m].
+        admits: returns a mask of the points [m], shape (n, 3), at which a particle may be.
+        spacing: spacing of the old grid [m].
         per_axis: particles along the edge of a cell at rest, on both grids.
-        random_seed: of the places.
+        random_seed: seed of the places.
 
     Returns:
         The arrays by name, and how many particles had to be moved out of solids.
@@ -88,13 +88,13 @@ def resampled(
 def resampling_notes(
     before: int, after: int, moved: int, spacing: float, grid: StaggeredGrid
 ) -> list[str]:
-    """Return what a user should know of a resampled material.
+    """Return notes for the user about a resampled material.
 
     Args:
         before: particles on the old grid.
         after: particles on the new one.
         moved: particles that were moved out of solids.
-        spacing: of the old grid [m].
+        spacing: spacing of the old grid [m].
         grid: the new one.
     """
     change = after * grid.cell_volume / (before * spacing**grid.dimension) - 1.0 if before else 0.0
@@ -114,7 +114,10 @@ def _placed(
     low: float,
     high: np.ndarray,
 ) -> np.ndarray:
-    """Return start + offset where a particle may be there, else start, else the nearest place of another particle."""
+    """Return start + offset where a particle may be there, else start.
+
+    If start is not admitted either, it is the nearest admitted place of another particle.
+    """
     dimension = len(high)
 
     def inside(points: np.ndarray) -> np.ndarray:

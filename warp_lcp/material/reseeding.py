@@ -1,4 +1,4 @@
-"""Reseeding: evens out the particles deep inside the material."""
+"""Reseeding: even out the number of particles of cells deep inside the material."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material import reseeding_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
-COST = 8 * PARTICLE  # of a cell that wants particles, in cells of a usual pass
+COST = 8 * PARTICLE  # work of a cell that wants particles, in cells of a usual pass
 
 
 class Reseeding:
     """Reseeding: sparse cells deep inside take particles from dense neighbors.
 
     A flow draws particles together along some streamlines and apart along others. A density
-    correction cures the first, but voids between particles remain: they count as material as long
-    as the surface does not see them, and the volume grows. A cell that no wall touches, whose
-    surroundings of 3^dimension cells are full, takes particles from neighbors that hold more than
-    at rest, if it holds fewer than `least`; and from those with more than `most`, until it holds as
-    many as at rest. So nothing comes or goes:
+    correction repairs the first, but voids between particles remain: they count as material as long
+    as the surface does not see them, and the volume grows. A cell takes particles if no wall
+    touches it, and if its surroundings of 3^dimension cells are full. If it holds fewer than
+    `least`, it takes from neighbors that hold more than at rest. It takes from neighbors with more
+    than `most` until it holds as many as at rest. Nothing is created or removed:
 
-    - mass: particles only move, to the emptiest part of the cell, by less than two cells along each
-      axis;
-    - momentum and kinetic energy: each keeps its velocity and its gradient, which over this way
-      differ from the flow's by as much as the interpolation errs. Angular momentum and the center
-      of mass change with the particles' places;
-    - the surface and bubbles of more than a cell: what is not full around is left alone. A whole
-      region that is thin stays thin.
+    - Mass: particles only move, to the emptiest part of the cell, by less than two cells along each
+      axis.
+    - Momentum and kinetic energy: each particle keeps its velocity and its gradient. Over this
+      distance they differ from the flow's by as much as the interpolation errs. Angular momentum
+      and the center of mass change with the particles' places.
+    - The surface and bubbles of more than a cell: cells with surroundings that are not full stay
+      unchanged. A whole region that is thin stays thin.
 
-    The result is the same on every run. `apply` is collective: a rank does what its cells and those
-    beside them do, whose particles it knows as ghosts; after each direction all agree about how
-    many particles cells hold.
+    The result is the same on every run. `apply` is collective: a rank treats its own cells and
+    those beside them, whose particles it has as ghosts. After each direction all ranks agree on the
+    number of particles in cells.
 
     Args:
         grid: the grid.
         boundary: solids and walls.
-        least: particles of a cell below which it is filled up, at most those at rest.
-        most: particles of a cell above which it hands on, at least those at rest.
-        particles_a_cell: of material at rest.
-        every: steps from one time to the next.
+        least: number of particles below which a cell is filled up, at most that at rest.
+        most: number of particles above which a cell gives some away, at least that at rest.
+        particles_a_cell: number of particles in a cell of material at rest.
+        every: steps between reseedings.
 
     Raises:
         ValueError: `least` <= `particles_a_cell` <= `most` does not hold.
@@ -88,7 +88,7 @@ class Reseeding:
             for f in (self._find, self._exchange)
         )
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
-        # of takers, and of particles moved
+        # Number of takers, and of particles moved.
         self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
         self._directions = sorted(
@@ -96,7 +96,7 @@ class Reseeding:
         )
 
     def _settings(self) -> typing.Any:
-        """Return what is the same for all cells and steps, as kernels take it."""
+        """Return the settings that are the same for all cells and steps, for kernels."""
         grid, s = self.grid, kernels.ReseedingSetting()
         s.planes, s.dx, s.inverse_dx = grid.planes, grid.spacing, 1.0 / grid.spacing
         s.origin, s.across = (
@@ -107,7 +107,7 @@ class Reseeding:
         return s
 
     def apply(self, particles: Particles, window: Window, step: int) -> int:
-        """Move particles; return their number.
+        """Move particles; return the number of moved particles.
 
         Args:
             particles: the material (sorted, moved).
@@ -118,7 +118,7 @@ class Reseeding:
         if not ranks.any(particles.count > 0):
             return 0
         particles.arrange(SORTED)
-        # beyond open sides lies air without particles, and nothing beyond that
+        # Beyond open sides is air without particles; beyond that are no cells.
         inside = window.common(self._asked)
         self._seed.value = step
         if inside is not None:
@@ -135,7 +135,10 @@ class Reseeding:
         return self._moved(before)
 
     def _find(self, particles: Particles, window: Window, nothing: bool) -> None:
-        """Launch the count of the particles of each cell, and the search for cells that want some, of which there may be none."""
+        """Launch the particle count of each cell, and the search for cells with too few.
+
+        With `nothing` there is nothing to search.
+        """
         b, offsets = self.boundary, particles.offsets
         if offsets is None:
             offsets, count = self._offsets, particles.listed_count
@@ -162,7 +165,7 @@ class Reseeding:
             self._inside.launch(kernels.find_kernel, inputs)
 
     def _exchange(self, particles: Particles) -> None:
-        """Launch what lets cells take from their neighbors, one direction after another."""
+        """Launch moves of particles between neighboring cells, direction by direction."""
         offsets = self._offsets if particles.offsets is None else particles.offsets
         count = int(self._list.count.value)
         inputs = [
@@ -187,12 +190,18 @@ class Reseeding:
             self.grid.part.fill(self._count)
 
     def _held(self) -> np.ndarray | None:
-        """Return how many particles the cells of a rank hold, before any has moved; None: one process counts what it moves."""
+        """Return the particle counts of a rank's cells before any have moved.
+
+        None on one process, which counts the moves.
+        """
         part = self.grid.part
         return np.array(part.box_of(self._count.numpy())) if part.shared else None
 
     def _moved(self, before: np.ndarray | None) -> int:
-        """Return how many particles have moved: a rank moves ghosts, too, so that ranks count what their cells have gained."""
+        """Return the number of particles that have moved.
+
+        A rank moves ghosts, too, so ranks count what their cells have gained.
+        """
         if before is None:
             return int(self._numbers.numpy()[1])
         part = self.grid.part

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels that even out how many particles the cells deep in the material hold."""
+"""Kernels that even out the particles of cells deep inside the material."""
 
 import warp as wp
 
@@ -7,11 +7,11 @@ from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kerne
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
-# of half a cell: how far from the center of its part of a cell a particle is put at random, as at
-# the start
+# Fraction of half a cell: the largest random distance of a particle from the center of its part of
+# a cell, as at the start.
 JITTER = 0.25
-# of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a
-# bubble of more than a cell
+# Fraction of the particles that the cells around a cell can hold. A cell with less around it is
+# near a surface (a level one: 2/3), or in a bubble of more than a cell.
 FULL = 0.75
 
 _AIR = wp.constant(wp.int8(AIR))
@@ -20,7 +20,7 @@ _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 
 @wp.struct
 class ReseedingSetting:
-    """How many particles a cell should hold, and what else is the same for all cells of a step."""
+    """Wanted numbers of particles of a cell, and other settings of a step."""
 
     planes: int
     origin: wp.vec3i  # cells of a larger grid before the first one of this
@@ -52,9 +52,10 @@ def find_kernel(
     takers: INTS,
     numbers: INTS,
 ):
-    """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
+    """List open cells that want particles and whose surroundings are nearly full.
 
-    The order of the list differs from run to run on CUDA, and does not matter.
+    No wall touches them. The surroundings include the cell itself. The order of the list differs
+    from run to run on CUDA; it has no effect.
     """
     has = count[k, j, i]
     if has < s.at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
@@ -81,7 +82,10 @@ def emptiest(
     inverse_dx: float,
     position: wp.array(dtype=wp.vec3),
 ):
-    """Return which of the 2^dimension parts of a cell (x, y, z) held the fewest of its particles `start` ... `start + here` at the sort."""
+    """Return the part of a cell (x, y, z) with the fewest particles at the sort.
+
+    There are 2^dimension parts. The cell's particles are `start` ... `start + here`.
+    """
     part = int(0)
     fewest = int(1 << 30)
     for q in range(2 << planes):
@@ -112,10 +116,10 @@ def take_from(
     position: POINTS,
     numbers: INTS,
 ):
-    """Let a cell that wants particles take some from the neighbor in one direction.
+    """Move particles to a cell that wants some from the neighbor in one direction.
 
-    No race, though a cell may be the neighbor of another that takes: whoever gives holds more than
-    `at_rest` before and no less after, whoever takes holds less before and no more after.
+    There is no race, although a cell may be the neighbor of several takers: a giving cell holds
+    more than `at_rest` before and no less after; a taking cell holds less before and no more after.
     """
     i = cell % count.shape[2]
     j = (cell // count.shape[2]) % count.shape[1]
@@ -132,7 +136,7 @@ def take_from(
     donor = offsets[other]
     here_too = offsets[other + 1] > donor  # its particles: those of another rank's cell may not be
     place = wp.vec3i(i, j, k) + s.origin
-    # the same number in all parts of a grid
+    # The same number in all parts of a grid.
     own = (place[2] * s.across[1] + place[1]) * s.across[0] + place[0]
     first_part = emptiest(planes, place, start, here, s.inverse_dx, position)
     taken = int(0)
@@ -181,5 +185,5 @@ def exchange_kernel(
     position: POINTS,
     numbers: INTS,
 ):
-    """Let each cell that wants particles take some from the neighbor in one direction."""
+    """Move particles to each cell that wants some from the neighbor in one direction."""
     take_from(takers[i], way, seed, s, offsets, count, position, numbers)

@@ -22,10 +22,10 @@ from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
 
-NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
-GRAZED = 1e-9  # of a way: less than that in a cell is rounding
-FILLED = 0.5  # of a full cell's particles: a source that starts fills cells that hold fewer
-JAMMED = 2.0  # cells that hold more than this share get no more
+NOW = 1e-9  # s: rounding error of a time at which a step ends
+GRAZED = 1e-9  # fraction of a path: a shorter piece in a cell is rounding
+FILLED = 0.5  # fraction of a full cell: a source that starts fills cells with less
+JAMMED = 2.0  # fraction of a full cell: a cell with more gets no more particles
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Source:
     """Inflow region.
 
     Args:
-        name: what messages call it.
+        name: name of the source in messages.
         contains: returns which points [m], shape (n, 3), lie in it, shape (n,).
-        velocity: of its material [m/s], shape (3,), not 0.
+        velocity: velocity of its material [m/s], shape (3,), not 0.
         start: when it starts to run [s].
         stop: when it no longer does [s].
-        kept: number carried by its particles; None: none.
+        kept: number carried by its particles; None if they carry none.
     """
 
     name: str
@@ -56,18 +56,17 @@ class Source:
 class Sources:
     """Inflow through the cells whose centers lie in a source.
 
-    The area of the inflow is that of the cells' faces.
+    The area of the inflow is that of the cells' faces. While a source runs, the faces of its cells
+    have its velocity, and the pressure treats the cells as a solid that moves at it: the outflow is
+    area times velocity, whatever is in the way. Material behind a source is not drawn in.
 
-    While a source runs, the faces of its cells have its velocity, and the pressure sees the cells
-    as a solid that moves at it: what leaves them is area times velocity, whatever is in the way.
-    Material behind a source is not drawn in. Particles lie on a jittered lattice that moves with
-    the source; those that the lattice brings into the cells in a step are new. It is a function of
-    time alone, so that an resumed run is bitwise identical. A source that starts fills its cells,
-    unless they are full already.
+    Particles lie on a jittered lattice that moves with the source; those that the lattice moves
+    into the cells in a step are new. The lattice is a function of time alone, so that a resumed run
+    is bitwise identical. A source that starts fills its cells, unless they are full already.
 
-    A step need not end where a source starts or stops. What comes in is what the lattice brings in
-    from start to stop, to the particle, however the time is cut into steps; the flow has the
-    source's velocity in the steps in whose middle it runs.
+    A step need not end where a source starts or stops. The particles that enter are exactly those
+    that the lattice brings in from start to stop, however the time is divided into steps. The flow
+    has the source's velocity in the steps in whose middle the source runs.
 
     Args:
         grid: the grid.
@@ -75,7 +74,7 @@ class Sources:
         sources: a cell belongs to the first that contains its center.
         per_axis: particles along the edge of a cell.
         jitter: width of their random displacement, a fraction of their distance.
-        random_seed: of the displacements.
+        random_seed: seed of the displacements.
 
     Raises:
         ValueError: a source has no open cell.
@@ -101,7 +100,7 @@ class Sources:
         part = grid.part
         self._check_cells(part.ranks.sum(np.bincount(self._owner, minlength=len(self.sources))))
         low, high = np.array(part.owned.low) - 1, np.array(part.owned.high) - 1
-        # by slot: whether the cell is this process's
+        # By slot: whether this process owns the cell.
         self._emits = np.append(True, ((cells >= low) & (cells < high)).all(axis=1))
         self._boxes = [
             self._box(cells[self._owner == number]) for number in range(len(self.sources))
@@ -121,7 +120,7 @@ class Sources:
                 (cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1
             )
         self._moving_walls = boundary.velocity if not boundary.open else []
-        self._running: list[bool] | None = None  # what the device knows of it
+        self._running: list[bool] | None = None  # values on the device; None if not set
         self._imposing, self._counting = (
             LaunchGraph(device, record) for record in (self._impose, self._count)
         )
@@ -157,7 +156,7 @@ class Sources:
         Before the pressure solve.
 
         Args:
-            time: in the middle of the step [s].
+            time: time in the middle of the step [s].
             velocity: u* of each component [m/s] (updated).
             kind: int8 of AIR, FLUID, SOLID (updated).
         """
@@ -173,7 +172,7 @@ class Sources:
         Of those that `supply` found.
 
         Args:
-            velocity: of each component [m/s] (updated).
+            velocity: velocity of each component [m/s] (updated).
             known: int8 of each component (updated): 1 on those faces; or empty.
             shown: int8 (updated): the sources' cells become FLUID.
         """
@@ -187,8 +186,8 @@ class Sources:
 
         Args:
             particles: the material (updated).
-            before: at the start of the step [s]; None: there has been no step.
-            now: at its end [s].
+            before: at the start of the step [s]; None if there has been no step.
+            now: time at the end of the step [s].
         """
         since = now if before is None else before
         running = [
@@ -222,7 +221,7 @@ class Sources:
         return emitted
 
     def _check_cells(self, counts: np.ndarray) -> None:
-        """Refuse sources without an open cell, given how many each has."""
+        """Refuse sources without an open cell; `counts` are their open cells."""
         for source, count in zip(self.sources, counts, strict=True):
             if count == 0:
                 raise ValueError(
@@ -232,7 +231,10 @@ class Sources:
                 )
 
     def _occupants(self, particles: Particles) -> np.ndarray:
-        """Return how many particles each cell holds, of all processes: some have come into cells that are not their process's yet."""
+        """Return the number of particles in each cell, of all processes.
+
+        Particles may have entered cells that another process owns.
+        """
         self._counting.run(particles)
         mine, part = np.asarray(self._counts.numpy()), self.grid.part
         if part.across is None:
@@ -302,7 +304,7 @@ class Sources:
         return slot[which], entries[which], filled[which] * starts, points[which]
 
     def _enter(self, number: int) -> None:
-        """Launch what follows the points of a source's lattice through its cells."""
+        """Launch the motion of a source's lattice points through its cells."""
         grid, seed = self.grid, (self.random_seed + number) * 0x9E3779B97F4A7C15 + 1
         size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
         numbers = {
@@ -335,13 +337,14 @@ class Sources:
         )
 
     def _reserve(self, count: int) -> None:
-        """Have room for so many points of a lattice."""
+        """Allocate memory for a number of lattice points."""
         if count > len(self._points["entries"]):
             size, memory = (
                 int(GROWTH * count),
                 zeros(6 * int(GROWTH * count), wp.int32, self.grid.device),
             )
-            for place, name in enumerate(self._points):  # in one memory, which is read by one copy
+            # One memory for all arrays, so that one copy reads them.
+            for place, name in enumerate(self._points):
                 kind = wp.vec3 if name == "point" else wp.int32
                 self._points[name] = wp.array(
                     ptr=memory.ptr + 4 * place * size,
@@ -357,7 +360,7 @@ class Sources:
 
     @staticmethod
     def _split(memory: np.ndarray) -> list[np.ndarray]:
-        """Return entries, slots, filled and points, shape (n, 3), as they lie in one memory."""
+        """Return entries, slots, filled and points, shape (n, 3), as views of one memory."""
         size = len(memory) // 6
         return [
             *memory[: 3 * size].reshape(3, size),
@@ -372,11 +375,13 @@ class Sources:
         filled: np.ndarray,
         points: np.ndarray,
     ) -> np.ndarray:
-        """Return where particles come in [m], of the points of `_entered`: if the source starts, those that fill cells are among them.
+        """Return the places of new particles [m], from the points of `_entered`.
+
+        If the source starts, points that fill its cells are included.
 
         Args:
-            held: by each cell, as a share of what it holds at rest.
-            slot: as returned there, like the others.
+            held: fill of each cell, relative to rest.
+            slot: slots returned by `_entered`.
             entries: likewise.
             filled: likewise.
             points: likewise.
@@ -387,12 +392,12 @@ class Sources:
         return points[self.boundary.admits(points)] if len(points) else points
 
     def _way(self, number: int, time: float) -> list[float]:
-        """Return how far a source's lattice has moved at a time [m]."""
+        """Return the displacement of a source's lattice at a time [m]."""
         source = self.sources[number]
         return [float(v) * (time - source.start) for v in source.velocity]
 
     def _box(self, cells: np.ndarray) -> tuple[list[float], list[float]] | None:
-        """Return the low and the high corner [m] of cells (k, j, i); None: there are none."""
+        """Return the low and high corner [m] of cells (k, j, i); None without cells."""
         if not len(cells):
             return None
         low, high = (
@@ -402,7 +407,7 @@ class Sources:
         return (low * self.grid.spacing).tolist(), (high * self.grid.spacing).tolist()
 
     def _impose(self, velocity: Faces, known: Faces, cells: wp.array | None, supply: bool) -> None:
-        """Launch what `supply` does, or what `hold` does."""
+        """Launch the kernels of `supply` or of `hold`."""
         walls = self._moving_walls if supply else []
         if self._window is None:
             return
@@ -416,7 +421,7 @@ class Sources:
 
 
 def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) -> np.ndarray:
-    """Return the source that each open cell belongs to, -1 for none, shape (nz, ny, nx)."""
+    """Return the source of each open cell, -1 for none, shape (nz, ny, nx)."""
     nz, ny, nx = (n - 2 for n in grid.shape)
     K, J, I = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
     centers = (
@@ -471,13 +476,13 @@ class Outlets:
     Args:
         grid: the grid.
         drains: regions that swallow material.
-        open_sides: of the domain, see `warp_lcp.grid.sides.side_bits`.
+        open_sides: open sides of the domain, see `warp_lcp.grid.sides.side_bits`.
     """
 
     def __init__(self, grid: StaggeredGrid, drains: Sequence[Drain], open_sides: int) -> None:
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
         self._store, self._slot = zeros(0, wp.float32, grid.device), Slot()
-        self._distance = self._store  # of as many as there are particles
+        self._distance = self._store  # view of as many entries as there are particles
         self._leaving = LaunchGraph(grid.device, self._launch)
 
     def apply(self, particles: Particles, before: float, now: float) -> tuple[int, int]:
@@ -485,8 +490,8 @@ class Outlets:
 
         Args:
             particles: the material (updated).
-            before: at the start of the step [s].
-            now: at its end [s].
+            before: time at the start of the step [s].
+            now: time at the end of the step [s].
 
         Returns:
             How many drains have swallowed, and how many have left through open sides.
@@ -500,7 +505,10 @@ class Outlets:
         return self._remove(particles, ())[1]
 
     def _remove(self, particles: Particles, drains: tuple[Drain, ...]) -> tuple[int, int]:
-        """Remove particles beyond open sides and in some drains; return how many drains have swallowed, and how many have left."""
+        """Remove particles beyond open sides and in some drains.
+
+        Returns how many the drains have removed, and how many have left.
+        """
         count = particles.count
         if not count or not (self.open_sides or drains):
             return 0, 0
@@ -518,7 +526,7 @@ class Outlets:
     def _launch(
         self, particles: Particles, drains: tuple[Drain, ...], marks: wp.array, distance: wp.array
     ) -> None:
-        """Launch the marks of the particles that leave, and their removal."""
+        """Launch the marking of the particles that leave, and their removal."""
         position = particles.position
         mark_gone(self.grid, self.open_sides, position, marks)
         for drain in drains:

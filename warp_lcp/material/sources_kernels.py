@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of sources: their velocity on faces, their cells, and how many particles those hold."""
+"""Kernels of sources: velocity on faces, cell types, particle counts."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ ENTER = KernelFile(Path(__file__).parent / "headers/sources.h")["warp_lcp.materi
 
 @wp.func
 def source_of(slot: int, sources: INTS, running: _BYTES):
-    """Return the source that a slot (0: none) belongs to, -1 if it has none that runs."""
+    """Return the running source of a slot; -1 if there is none (slot 0: none)."""
     source = int(-1)
     if slot > 0:
         source = sources[slot - 1]
@@ -52,10 +52,10 @@ def impose_kernel(
     solid: F32,
     known: I8,
 ):
-    """Give the faces of the running sources' cells their velocity.
+    """Set the velocity on the faces of the running sources' cells.
 
-    Where the flow would enter a source nothing passes as far as the pressure is concerned
-    (`supply`): its material comes from nowhere, not from the material behind it.
+    With `supply`, faces where the flow would enter a source are closed to the pressure: the
+    source's material does not come from the material behind it.
     """
     c, b, a = cell_below(axis, k, j, i)
     if slots[k, j, i] > 0 or slots[c, b, a] > 0:
@@ -86,7 +86,10 @@ def occupy_kernel(
     fluid: int,
     kind: I8,
 ):
-    """Mark the cells of running sources SOLID, since their faces' velocities are given, or (`fluid`) as the material that they hold."""
+    """Mark the cells of running sources as SOLID, or as material with `fluid`.
+
+    SOLID, since the velocities of their faces are given.
+    """
     if source_of(slots[k, j, i], sources, running) >= 0:
         kind[k, j, i] = wp.where(fluid != 0, _FLUID, _SOLID)
 

@@ -1,4 +1,4 @@
-"""Particles in free flight far from all others: they need no grid."""
+"""Spray: lone particles in free flight, which need no grid."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.memory import Scalar
 
-EVERY = 8  # steps between looks for particles that have left the others
-TILE = 8  # cells: clusters of particles are told apart by empty tiles between them
-FEW = 8  # particles: no more make a cluster that flies off the grid
-# cells from the box around all others from which on it does; it comes back at half of that
+EVERY = 8  # steps between searches for particles that have left the others
+TILE = 8  # cells of a tile; empty tiles separate clusters of particles
+FEW = 8  # most particles of a cluster that leaves the grid
+# Cells from the box around all other particles at which a cluster leaves the grid; it returns at
+# half of that.
 AWAY = 2 * TILE
-MOST_TILES = 1 << 22  # else they are larger
-CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
+MOST_TILES = 1 << 22  # most tiles; they are larger if there would be more
+# Cells from a solid or wall, in addition to a step's path, within which particles stay on the grid.
+CLEAR = 3
 
 
 @list_kernel("warp_lcp.material.spray")
@@ -36,29 +38,30 @@ def fly_kernel(
     position: wp.array(dtype=wp.vec3),
     velocity: wp.array(dtype=wp.vec3),
 ):
-    """Change velocities, then move for a time step."""
+    """Change velocities, then move particles for a time step."""
     v = velocity[i] + wp.vec3(change_x, change_y, change_z)
     velocity[i] = v
     position[i] = position[i] + dt * v
 
 
 class Spray:
-    """Carry particles that are alone along their parabolas, off the grid, until they come near others, a solid or a wall.
+    """Carry lone particles along their parabolas, off the grid.
 
-    A cluster of at most `FEW` particles far outside the box around all others flies: the grid need
-    not reach there. Its particles go straight on with what forces give them, as a body in flight on
-    the grid would, but for its turning: mass, momentum, energy and angular momentum stay what they
-    are. The gradients that APIC carries are lost, those of a lone particle move nothing.
+    They return when they come near other particles, a solid or a wall. A cluster of at most `FEW`
+    particles far outside the box around all others flies, so the grid need not reach there. Its
+    particles move on straight with gravity, as an airborne body on the grid would, except for
+    rotation: mass, momentum, energy and angular momentum are conserved. The APIC gradients are
+    lost; those of a lone particle have no effect.
 
     Args:
         grid: any of the simulation's.
-        solids: what it may meet.
-        open_sides: of the domain, see `warp_lcp.grid.sides.side_bits`.
+        solids: solids that it may meet.
+        open_sides: open sides of the domain, see `warp_lcp.grid.sides.side_bits`.
         active: whether any particle may fly.
-        keeps: whether particles take a number along.
+        keeps: whether particles carry a number.
 
     Attributes:
-        particles: those that fly.
+        particles: those in flight.
     """
 
     def __init__(
@@ -92,13 +95,15 @@ class Spray:
     def exchange(
         self, particles: Particles, totals: ParticleTotals, step: int, time: float, dt: float
     ) -> ParticleTotals:
-        """Take what has left the others, give back what comes near something, and return sums over those on the grid.
+        """Exchange particles with the grid, and return sums over those on the grid.
+
+        Clusters that have left the others start to fly; particles near an obstacle return.
 
         Args:
             particles: on the grid (updated).
             totals: sums over them.
             step: number of the step.
-            time: at its start [s].
+            time: time at the start of the step [s].
             dt: its length [s].
         """
         own, dx, before = self.particles, particles.grid.spacing, particles.count
@@ -113,7 +118,7 @@ class Spray:
         return totals if particles.count == before else particles.totals()
 
     def fly(self, change: np.ndarray, dt: float) -> None:
-        """Move by a time step [s], after a change of the velocity [m/s], shape (3,)."""
+        """Change the velocity by `change` [m/s], shape (3,), and move by a time step [s]."""
         own = self.particles
         if own.count:
             for number, value in zip(self._numbers, (*change, dt), strict=True):
@@ -121,7 +126,7 @@ class Spray:
             self._flying.run()
 
     def _launch(self) -> None:
-        """Launch the way of the particles in a step."""
+        """Launch the motion of the particles in a step."""
         own = self.particles
         launch_list(
             fly_kernel,
@@ -131,7 +136,7 @@ class Spray:
         )
 
     def behind(self, name: str, array: np.ndarray) -> np.ndarray:
-        """Return an array of the particles on the grid with that of those that fly behind it, shape (n, 3)."""
+        """Append the spray's array to that of the particles on the grid, (n, 3)."""
         own = self.particles.arrays().get(name)
         return np.concatenate(
             [
@@ -143,11 +148,11 @@ class Spray:
         )
 
     def with_own(self, totals: ParticleTotals) -> ParticleTotals:
-        """Return sums over particles on the grid with those over the ones that fly."""
+        """Add the sums over the spray to those over the particles on the grid."""
         return totals.joined(self.particles.totals()) if self.particles.count else totals
 
     def _leaves(self, particles: Particles, time: float, dt: float, dx: float) -> np.ndarray:
-        """Tell which particles are alone, away from the box around all others, and near nothing."""
+        """Return a mask of lone particles, far from all others and near no obstacle."""
         x = particles.position.numpy()
         alone = self._alone(x, dx)
         if alone.any() and not alone.all():
@@ -160,7 +165,7 @@ class Spray:
         return alone
 
     def _within(self, particles: Particles, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Tell which particles lie in a box."""
+        """Return a mask of the particles in a box."""
         x, axes = particles.position.numpy(), slice(self._dimension)
         return np.asarray(((x >= low) & (x <= high))[:, axes].all(axis=1))
 
@@ -172,7 +177,7 @@ class Spray:
         dx: float,
         which: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Tell which of some particles may come near a solid or a closed side of the domain in a step."""
+        """Return a mask of particles that may come near a solid or closed side in a step."""
         x, v = (
             array.numpy() if which is None else array.numpy()[which]
             for array in (particles.position, particles.velocity)
@@ -196,7 +201,7 @@ class Spray:
         return near
 
     def _alone(self, position: np.ndarray, dx: float) -> np.ndarray:
-        """Tell which particles [m] belong to clusters of few."""
+        """Return a mask of particles, given by position [m], in clusters of few."""
         tile, low = (
             np.floor(position / (TILE * dx)).astype(np.int64),
             np.floor(position.min(axis=0) / (TILE * dx)).astype(np.int64),
@@ -212,7 +217,7 @@ class Spray:
         return np.asarray(few[cluster.ravel()[flat]])
 
     def _move(self, source: Particles, target: Particles, which: np.ndarray) -> None:
-        """Move some particles from one set to the end of another."""
+        """Move particles from one set to the end of another."""
         if not which.any():
             return
         kept = None if source.kept is None else source.kept.numpy()[which, 0]

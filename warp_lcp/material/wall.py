@@ -1,25 +1,25 @@
-"""Velocity around the material after the projection: into the air, and at walls that hold it or let it go.
+"""Extrapolate the projected velocity into air and to walls.
 
-The order matters. 0. Closed faces of RELEASED cells that particles gave weight keep their own
-velocity, but no more than the mean of the projected faces around them: a layer over them would
-throw all that rests at a wall after the one particle that leaves it, and their own alone would let
-a cell's worth of a full box fall. 1. One layer is extrapolated from the projected faces. 2. Faces
-between AIR cells that particles gave weight keep their own velocity: extrapolating over spray would
-make a droplet hang above a pool. 3. Further layers are extrapolated from all of them. Closed faces
-have taken part and now carry the material's velocity, not the wall's. 4. Held cells give their
-closed faces the wall's normal velocity (not merely less of the inward one: a moving wall drags its
-material along); released and AIR cells lose only the part into the wall, so that the last particles
-can leave. 5. Faces inside solids follow the faces beside them, so that tangential flow is not
-slowed by a wall.
+The order matters. 0. Closed faces of RELEASED cells with particle weight keep their own velocity,
+but no more than the mean of the projected faces around them. (Extrapolated values would throw
+everything that rests at a wall after the one particle that leaves it. Their own velocity alone
+would let a cell's worth of a full box fall.) 1. One layer is extrapolated from the projected faces.
+2. Faces between AIR cells with particle weight keep their own velocity: extrapolating over spray
+would make a droplet hang above a pool. 3. Further layers are extrapolated from all of them. Closed
+faces are included and now have the material's velocity, not the wall's. 4. Held cells set their
+closed faces to the wall's normal velocity (not merely less of the inward one: a moving wall drags
+its material along). Released and AIR cells lose only the part into the wall, so that the last
+particles can leave. 5. Faces inside solids follow the faces beside them, so that a wall does not
+slow tangential flow.
 
 Where walls cut cells the order is the same, for the same reasons; partly open faces have been
-projected and keep their velocity. 4. With n the gradient of the distance to the wall that closes a
-face, at the face's center, u the velocity there (of known faces alone) and u_s the wall's, w = n.(u
-- u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance lies
-between their normals: with one wall's u_s it would turn the flow before a piston away from the
-floor.) Where the wall holds the material the face loses w n, of either sign; released cells and AIR
-lose it only where w < 0. 5. Faces of the ring beside the domain's walls follow the faces next to
-them.
+projected and keep their velocity. 4. Let n be the gradient of the distance to the wall that closes
+a face, at the face's center, u the velocity there (of known faces alone), and u_s the wall's
+velocity. The relative normal velocity is w = n.(u - u_s). (Beside two walls the gradient of the
+smaller distance lies between their normals: with one wall's u_s it would turn the flow before a
+piston away from the floor.) Where the wall holds the material the face loses w n, of either sign;
+released cells and AIR lose it only where w < 0. 5. Faces of the ring beside the domain's walls
+follow the faces next to them.
 """
 
 import typing
@@ -41,8 +41,8 @@ from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
 
-# cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), and what the distance
-# errs
+# Cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), plus the error of the
+# distance.
 DEPTH = 2.0
 _CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID": FLUID} | {
     "TOUCHES_NOTHING": TOUCHES_NOTHING,
@@ -59,12 +59,12 @@ _FLUID = wp.constant(wp.int8(FLUID))
 def keep_released_kernel(
     k, j, i, axis: int, kind: I8, contact: U8, weight: F32, field: F32, known: I8
 ):
-    """Faces of RELEASED cells that are still unknown, closed ones, become known after the first layer if they carry weight.
+    """Keep the velocity of closed faces of RELEASED cells that carry weight.
 
-    They move as their own particles do, but no faster than the known faces around them in the mean,
-    nor against those.
+    They are still unknown, and become known after the first layer. They move as their own particles
+    do, but no faster than the mean of the known faces around them, nor against it.
     """
-    # and so no face of the array's edge, see below
+    # A face with weight is not on the array's edge, see below.
     if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:
         c = k - wp.where(axis == 2, 1, 0)
         b = j - wp.where(axis == 1, 1, 0)
@@ -105,7 +105,10 @@ def closed_face_kernel(
     solid: F32,
     field: F32,
 ):
-    """Closed faces take the wall's normal velocity, or lose only the velocity into the wall."""
+    """Set the wall's normal velocity on closed faces, or limit theirs.
+
+    Where the material may leave, only the part into the wall is removed.
+    """
     c, b, a = cell_below(axis, k, j, i)
     here = index[k, j, i]
     below = index[c, b, a]
@@ -140,21 +143,22 @@ def extend_velocity(
     *,
     join: Join | None = None,
 ) -> None:
-    """Continue the projected velocity into air and walls.
+    """Extrapolate the projected velocity into air and walls.
 
     Args:
         window: faces to consider.
         velocity: each component [m/s] (updated): projected where `known`, the particles' average
             where there is weight.
-        weights: of the particles on each component's faces.
+        weights: weights of the particles on each component's faces.
         known: int8 of each component (updated): 1 on projected faces, 0 on others, -1 inside
             solids.
         kind: int8 of AIR, FLUID, SOLID.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         index: int32: -1 in open cells, the wall's number elsewhere.
         separating: uint8 a wall.
-        solid_velocity: of the solids on each component's faces [m/s], or empty if all stand still.
-        layers: how far into the air, in faces.
+        solid_velocity: velocity of the solids on each component's faces [m/s], or empty if all
+            stand still.
+        layers: number of layers of faces to fill in the air.
         join: called with the marks and the velocity of a component after each layer, see
             `warp_lcp.grid.extrapolate`.
     """
@@ -169,7 +173,8 @@ def extend_velocity(
         window.launch(closed_face_kernel, [axis, kind, contact, index, separating, solid, field])
         if join is not None:
             join(marks, field)
-        # a particle's tent reaches faces inside a solid beside its cell, and in 3-D beside those
+        # A particle's tent reaches faces inside a solid beside its cell and, in 3-D, the faces
+        # beside those.
         extrapolate(
             window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join
         )
@@ -181,7 +186,9 @@ TAKE = KERNELS["warp_lcp.material.cut_wall.take"]
 
 @dataclass(frozen=True, slots=True)
 class WallFields:
-    """Walls that cut cells, as the kernel takes them that constrains velocities beside them; components along z are None in 2-D.
+    """Walls that cut cells, for the kernel that constrains velocities beside them.
+
+    Components along z are None in 2-D.
 
     Attributes:
         known_u: marks of the faces along x: 1 known, 0 not, -1 deep inside solids; int8.
@@ -190,10 +197,10 @@ class WallFields:
         wall_u: numbers of the walls that close the faces along x, int16.
         wall_v: likewise along y.
         wall_w: likewise along z.
-        moving_u: velocity of solids on the faces along x [m/s], float32; None: they rest.
+        moving_u: velocity of solids on the faces along x [m/s], float32; None if they rest.
         moving_v: likewise along y.
         moving_w: likewise along z.
-        owner: number of the solid nearest to each node, int16; None: there is one.
+        owner: number of the solid nearest to each node, int16; None if there is one solid.
         next_near: distance of the next one [cells].
         next_owner: its number.
         distance: to solids at nodes [cells], float32.
@@ -242,7 +249,7 @@ def extend_velocity_cut(
     *,
     join: Join | None = None,
 ) -> None:
-    """Continue the projected velocity into air and walls.
+    """Extrapolate the projected velocity into air and walls that cut cells.
 
     Args as of `extend_velocity`, but:
         known: -1 on faces deep inside solids. cut: the walls: distances at nodes, open fractions,
