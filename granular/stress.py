@@ -147,8 +147,8 @@ class Stress(wl.VariationalInequality):
     y/d), with y = (w, -E u), where P projects onto x >= 0 first and then onto the slice at that x.
     P is not the projection onto the cones themselves, which would make sand dilate as it shears (an
     associated flow rule, whose normal velocity is k times the slip). `wl.solve` solves the problem
-    by the methods of `granular.heavy_ball`. Gradient, projection and momentum of a cell are fused in
-    one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no separate
+    by the methods of `granular.heavy_ball`. Gradient, projection and momentum of a cell are fused
+    in one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no separate
     functions for y and P.
 
     Args:

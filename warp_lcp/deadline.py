@@ -28,8 +28,8 @@ class Deadline:
     Args:
         seconds: time limit from now; inf: no limit of its own. A deadline never ends later than
             that of the enclosing solve.
-        across: communicator of a distributed solve, see `warp_lcp.kernels.vectors.Across`: time is up
-            on all ranks as soon as it is up on one. None if serial.
+        across: communicator of a distributed solve, see `warp_lcp.kernels.vectors.Communicator`:
+            time is up on all ranks as soon as it is up on one. None if serial.
     """
 
     def __init__(self, seconds: float = math.inf, across: Any = None) -> None:

@@ -52,8 +52,9 @@ warp-lcp run dam-break --set output.surface=true
 warp-lcp render out/dam-break --sheet
 ```
 
-`output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `--set domain.resolution=128` refines.
-Pictures of one frame are made by [`--look photo`](frames-and-films.md#photographs).
+`output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D.
+`--set domain.resolution=128` refines. Pictures of one frame are made by
+[`--look photo`](frames-and-films.md#photographs).
 
 Run times are of one core of a shared {device},
 {date}; bodies alone on an AMD EPYC.

@@ -19,8 +19,8 @@ HEAD = """# Settings of methods
 
 <!-- Written by docs/generate/method_settings.py from the classes; do not edit. -->
 
-Defaults and allowed values; [Solvers](solvers.md) explains them. Other values raise a `ValueError` that names the setting and
-its range.
+Defaults and allowed values; [Solvers](solvers.md) explains them. Other values raise a `ValueError`
+that names the setting and its range.
 """
 ALSO = "- [common](#common-settings): "
 

@@ -66,28 +66,29 @@ warp-lcp run column.toml --set time.cfl=1.0    # overrides a key
 warp-lcp schema                                # JSON, for editors
 ```
 
-Units are SI, angles are in degrees, y is up. Vectors have an entry per axis. Keys are optional unless marked *required*.
-Unknown keys are refused; the message names the nearest key.
+Units are SI, angles are in degrees, y is up. Vectors have an entry per axis. Keys are optional
+unless marked *required*. Unknown keys are refused; the message names the nearest key.
 """
 
-STEPS = """Steps end exactly at frames. They also end when a source or drain starts or stops, or a solid's velocity jumps, if that leaves
-at least a quarter of the step.
+STEPS = """Steps end exactly at frames. They also end when a source or drain starts or stops, or a
+solid's velocity jumps, if that leaves at least a quarter of the step.
 """
 
-DOMAIN = """Material may leave `separating` walls. It slides along `free-slip` walls and sticks to `sticky` ones, which need
-`[viscosity]`.
+DOMAIN = """Material may leave `separating` walls. It slides along `free-slip` walls and sticks to
+`sticky` ones, which need `[viscosity]`.
 """
 
 MATERIAL = """## Material, sources and drains
 
-`[[liquid]]` and `[[sand]]` fill their [shape](#shapes) at the start. A `[[source]]` lets material in, a `[[drain]]` removes it.
+`[[liquid]]` and `[[sand]]` fill their [shape](#shapes) at the start. A `[[source]]` lets material
+in, a `[[drain]]` removes it.
 """
 
 PLACED = """### Placing a shape
 
-A shape is moved by `scale`, `rotate` and `translate`, in this order. **`rotate` and `scale` are about the origin**, not about
-the shape's center; `about` gives another point. 2-D angles are counterclockwise; in 3-D a shape is rotated about the fixed axes
-x, then y, then z.
+A shape is moved by `scale`, `rotate` and `translate`, in this order. **`rotate` and `scale` are
+about the origin**, not about the shape's center; `about` gives another point. 2-D angles are
+counterclockwise; in 3-D a shape is rotated about the fixed axes x, then y, then z.
 """
 
 SHAPED = """## Shapes
@@ -95,22 +96,23 @@ SHAPED = """## Shapes
 A shape has a `shape` and its keys, all of them required:
 """
 
-MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is positive. Vertices closer than a millionth of
-its size are merged, triangles without area are dropped, and triangles and parts that are inside out are flipped; `warp-lcp check`
-and `run` report this. Intersecting and nested parts stay, but such a mesh cannot be a rigid body. Open and one-sided surfaces are
-refused, and those of which more than 1 % stays inside out.
+MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is
+positive. Vertices closer than a millionth of its size are merged, triangles without area are
+dropped, and triangles and parts that are inside out are flipped; `warp-lcp check` and `run` report
+this. Intersecting and nested parts stay, but such a mesh cannot be a rigid body. Open and one-sided
+surfaces are refused, and those of which more than 1 % stays inside out.
 """
 
 MOVING = """## Motions
 
-`motion = { kind = "...", ... }` moves a solid from where its shape is placed. Angles of `keyframes` are in the order of
-[`rotate`](#placing-a-shape), about axes through `center`.
+`motion = { kind = "...", ... }` moves a solid from where its shape is placed. Angles of `keyframes`
+are in the order of [`rotate`](#placing-a-shape), about axes through `center`.
 """
 
 BODIES = """## Rigid bodies
 
-A `[[solid]]` with `mass` or `density` is a [rigid body](bodies.md). It must start apart from walls and other solids. A 2-D mass is
-that of a meter of depth.
+A `[[solid]]` with `mass` or `density` is a [rigid body](bodies.md). It must start apart from walls
+and other solids. A 2-D mass is that of a meter of depth.
 """
 
 LIQUID = """## Liquid
@@ -125,16 +127,19 @@ SAND = """## Sand
 
 CONTACTS = """## Bodies alone
 
-`scene.simulator = "contacts"`: walls, gravity and `[[solid]]`s, at least one of them a rigid body. See
-[bodies without a material](bodies.md#without-a-material). There are no presets and no frames of material.
+`scene.simulator = "contacts"`: walls, gravity and `[[solid]]`s, at least one of them a rigid body.
+See [bodies without a material](bodies.md#without-a-material). There are no presets and no frames of
+material.
 """
 
 LIMITS = """## Limits
 
 - At most 8192 cells along an axis. Sides must be whole numbers of cells.
-- A scene has one kind of sand, and its walls are `separating`. Liquids may differ in viscosity, not in density.
+- A scene has one kind of sand, and its walls are `separating`. Liquids may differ in viscosity, not
+  in density.
 - `narrow_band` and `output.forces` are for liquids only.
-- Periodic axes are for sand without rigid bodies, sources, drains, reseeding or `[density_correction]`.
+- Periodic axes are for sand without rigid bodies, sources, drains, reseeding or
+  `[density_correction]`.
 - A solid is moved by `motion` or is a rigid body, not both. Neither works with `solids = "voxel"`.
 """
 

@@ -29,9 +29,10 @@ KNOWN = REQUIRED | FIELDS  # further arrays of a file are ignored
 DESCRIPTION = """\
 # Complementarity problems of a simulation
 
-`problem_<step>.npz` is the problem of the step from <step> to <step> + 1: find x with y = A x + b, lower <= x <= upper, and y > 0 only
-where x = lower, y < 0 only where x = upper. Of a step that was tried again it is the last attempt; a step without liquid cells has none.
-The files are NumPy archives of plain arrays (`numpy.load`, no pickles). Cells are indexed [z, y, x], or [y, x] in 2-D.
+`problem_<step>.npz` is the problem of the step from <step> to <step> + 1: find x with y = A x + b,
+lower <= x <= upper, and y > 0 only where x = lower, y < 0 only where x = upper. Of a step that was
+tried again it is the last attempt; a step without liquid cells has none. The files are NumPy
+archives of plain arrays (`numpy.load`, no pickles). Cells are indexed [z, y, x], or [y, x] in 2-D.
 
 | key | type | shape | meaning |
 |---|---|---|---|
@@ -44,10 +45,12 @@ The files are NumPy archives of plain arrays (`numpy.load`, no pickles). Cells a
 | `step`, `time`, `dt`, `spacing` | int64, float64 | () | steps done before; their time [s]; length of the step [s]; edge of a cell [m] |
 | `tolerance`, `absolute_tolerance` | float64 | () | what the solve was held to: r <= max(absolute, tolerance r at clip(0, lower, upper)) |
 
-(A x)_i = shift_i x_i + sum of face (x_i - x_neighbor) over the faces of FLUID cell i that no SOLID cell touches. r is the 2-norm of
-d (x - clip(x - y / d, lower, upper)) with d the diagonal of A. `absolute_tolerance` has the unit of y.
+(A x)_i = shift_i x_i + sum of face (x_i - x_neighbor) over the faces of FLUID cell i that no SOLID
+cell touches. r is the 2-norm of d (x - clip(x - y / d, lower, upper)) with d the diagonal of A.
+`absolute_tolerance` has the unit of y.
 
-`warp_lcp.gallery.recorded.load(file)` gives the problem to Python; `warp-lcp solve FILE --method NAME` solves it.
+`warp_lcp.gallery.recorded.load(file)` gives the problem to Python;
+`warp-lcp solve FILE --method NAME` solves it.
 """
 
 
