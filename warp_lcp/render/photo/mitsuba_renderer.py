@@ -37,7 +37,8 @@ LLVM_FILE = re.compile(r"libLLVM(?:-|\.so\.|\.)?(\d+)?.*")
 TRIAL = """
 import mitsuba
 mitsuba.set_variant("llvm_ad_rgb")
-scene = {"type": "scene", "integrator": {"type": "volpath"}, "sensor": {"type": "perspective"}, "sky": {"type": "constant"}}
+scene = {"type": "scene", "integrator": {"type": "volpath"}}
+scene |= {"sensor": {"type": "perspective"}, "sky": {"type": "constant"}}
 mitsuba.render(mitsuba.load_dict(scene), spp=1).numpy()
 """
 VERSION = 1  # version of the pictures' appearance; pictures of another version are rendered again
