@@ -83,6 +83,6 @@ def test_headers_have_the_tests_of_who_names_them():
         in chosen_for(ROOT, "warp_lcp/multigrid/headers/coarsen.h")[:4]
     )
     assert (
-        "tests/kernels/test_stencil_kernel.py"
+        "tests/kernels/test_persistent_kernel.py"
         in chosen_for(ROOT, "warp_lcp/kernels/headers/piece.h")[:2]
     )
