@@ -12,7 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from multigrid.test_hierarchy import level_matrix, masked_hierarchy
 from warp_lcp.kernels import Rows
-from warp_lcp.kernels.persistent_kernel import CUDA_THREADS
+from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, THREADS
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
 from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, cells_of_one_launch
@@ -293,7 +293,8 @@ def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_p
         assert text.count("bar.sync") == barriers, module
         assert "ld.global.nc" not in text
         # Otherwise too few registers may be left for such a block.
-        assert f".maxntid {CUDA_THREADS}" in text
+        block = CUDA_THREADS if "coarsest" in module else THREADS
+        assert f".maxntid {block}" in text
 
 
 def test_levels_of_at_most_so_many_cells_are_taken(device):

@@ -56,7 +56,7 @@ LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")
     ],
 )
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
-    for module in ("team", "program", "wave"):
+    for module in ("thread_pool", "launch_graph", "fused_kernel"):
         monkeypatch.setattr(f"warp_lcp.kernels.{module}.CELLS", 100)
     before = wl.get_threads()
     try:

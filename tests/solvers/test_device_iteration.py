@@ -314,7 +314,7 @@ def test_threads_take_the_steps_of_the_host(
 ) -> None:
     before = wl.get_threads()
     wl.set_threads(threads)
-    for module in ("team", "wave", "program"):
+    for module in ("thread_pool", "fused_kernel", "launch_graph"):
         monkeypatch.setattr(f"warp_lcp.kernels.{module}.CELLS", 64)
     try:
         problem, alone, ahead = both(4100 + threads)

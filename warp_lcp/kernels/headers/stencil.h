@@ -9,10 +9,10 @@ const auto beside = [&](int rows, int planes, auto down, auto up) {
 // Sum of w x(k, rows, planes) over the neighbors, at relative rows and planes. x is a function, so
 // that its values need not be stored; the sum is not rounded.
 #ifdef EACH_WEIGHT
-#define BEFORE(W, X, Y, Z) +W(k) * (T)x(k + (X), Y, Z)
+#define BEFORE(W, X, Y, Z) +W(at + k) * (T)x(k + (X), Y, Z)
 #define AND_AFTER(W, X, Y, Z) \
-    BEFORE(W, X, Y, Z) + W(k - (X) + beside(-(Y), -(Z), zm, zp)) * (T)x(k - (X), -(Y), -(Z))
-const auto around_of = [&](auto x, int k, long long = 0) -> T {
+    BEFORE(W, X, Y, Z) + W(at + k - (X) + beside(-(Y), -(Z), zm, zp)) * (T)x(k - (X), -(Y), -(Z))
+const auto around_of = [&](auto x, int k, int at = 0) -> T {
     if constexpr (SYMMETRIC)
         return (T)0 EACH_WEIGHT(AND_AFTER);
     else
