@@ -21,6 +21,7 @@ from benchmarks import emulated_cuda, gpu_counts  # before the package
 # ruff: isort: split
 
 import argparse
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -35,14 +36,15 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.kernels import StencilKernel
-from warp_lcp.kernels.persistent_kernel import PersistentKernel
+from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
 SHARE = 0.8  # of the bandwidth of data sheets that streaming kernels reach
 RECORDED, LAUNCHED = 6.0, 12.0  # [us] a small launch in a graph, and one from Python
-BARRIER, READBACK = 1.2, 15.0  # [us] a stage of small levels with its barrier; in a cluster .5 more
+BARRIER, READBACK = 1.2, 15.0  # [us] a stage of small levels with its barrier
+ACROSS = 0.5  # [us] more in a cluster of blocks: its barrier, and loads from L2 after it
 GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
     "H100 SXM": (3350.0, 16_700.0),
     "H200": (4800.0, 16_700.0),
@@ -51,6 +53,7 @@ GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
 }
 # such instructions a byte of the passes that have many, see `benchmarks.two_floats`
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
+WARPS = 24  # of a launch that are counted where their work differs
 STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
 SIZES = (128, 256, 512, 1024)
 
@@ -67,6 +70,7 @@ class Work:
         cells: that they visit.
         bounds: a launch of each pass, by key.
         stages: of small levels, each with a barrier.
+        across: of these, stages of clusters of blocks.
         readbacks: how often the host waited.
     """
 
@@ -77,7 +81,13 @@ class Work:
     cells: list[float] = field(default_factory=list)
     bounds: dict[str, Heard] = field(default_factory=dict)
     stages: int = 0
+    across: int = 0
     readbacks: int = 0
+
+    @property
+    def barriers(self) -> float:
+        """Time [us] of the stages of small levels."""
+        return BARRIER * self.stages + ACROSS * self.across
 
     def ms(self, bandwidth: float, float64: float) -> float:
         """Return the time [ms] at a bandwidth [GB/s] and a rate of instructions in float64 [10^9/s]."""
@@ -87,18 +97,14 @@ class Work:
         )
         moved = np.array(self.bytes) * np.maximum(1 / (SHARE * bandwidth), slow) / 1e3
         return (
-            float(
-                np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks
-            )
-            / 1e3
+            float(np.maximum(least, moved).sum() + self.barriers + READBACK * self.readbacks) / 1e3
         )
 
-    def terms(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]) -> dict[str, float]:
+    def terms(
+        self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]
+    ) -> dict[str, float]:
         """Return the time [ms] that each limit holds launches: that of a launch is the slowest one."""
-        found = {
-            "barriers": BARRIER * self.stages / 1e3,
-            "readbacks": READBACK * self.readbacks / 1e3,
-        }
+        found = {"barriers": self.barriers / 1e3, "readbacks": READBACK * self.readbacks / 1e3}
         for size, graph, key, cells in zip(
             self.bytes, self.graph, self.keys, self.cells, strict=True
         ):
@@ -110,6 +116,38 @@ class Work:
             found[limit] = found.get(limit, 0.0) + limits[limit]
         return found
 
+    def longest(
+        self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount], times: int
+    ) -> str:
+        """Return a table of the ten kernels that take longest, of one of some `times`."""
+        rows: dict[str, list[Any]] = {}
+        for size, graph, key, cells, name in zip(
+            self.bytes, self.graph, self.keys, self.cells, self.names, strict=True
+        ):
+            one = counts.get(key)
+            limits = {"bytes": size / (SHARE * gpu.bandwidth * 1e3)}
+            if one is not None:
+                limits = {limit: 1e3 * ms for limit, ms in one.limits(gpu, round(cells)).items()}
+            limit = max(limits, key=lambda name: limits[name])
+            floor = RECORDED if graph else LAUNCHED
+            row = rows.setdefault(key or name, [0, 0.0, 0.0, limit, "", 0.0, 0.0])
+            row[0] += 1
+            row[1] += max(floor, limits[limit])
+            if limits[limit] >= row[2]:
+                row[2:4] = limits[limit], limit
+            if one is not None:
+                threads = one.issued.instructions / one.cells, one.issued.wavefronts / one.cells
+                row[4], row[5], row[6] = str(one.registers), *threads
+        lines = [
+            f"| `{name}` | {n / times:.0f} | {total / times:.0f} | {longest:.1f}, {limit} | "
+            f"{issued:.0f} | {wavefronts:.0f} | {registers} |"
+            for name, (n, total, longest, limit, registers, issued, wavefronts) in sorted(
+                rows.items(), key=lambda row: -row[1][1]
+            )[:10]
+        ]
+        head = "| kernel | launches | us | largest without floor, limit | issued a cell | L1 |"
+        return "\n".join([f"{head} registers |", "|---|---|---|---|---|---|---|", *lines])
+
     def uncounted(self, counts: dict[str, gpu_counts.InstructionCount]) -> float:
         """Return the share of the bytes that passes move which have not been counted."""
         moved = [size for size, key in zip(self.bytes, self.keys, strict=True) if key not in counts]
@@ -120,7 +158,10 @@ class Work:
         more = [b for b, g in zip(self.bytes, self.graph, strict=True) if g]
         added = max(len(self.bytes) - len(before.bytes), 0) * levels
         sizes = [b * 8.0**levels for b in self.bytes] + sorted(more)[len(more) // 2 :][:1] * added
-        stages = self.stages + max(self.stages - before.stages, 0) * levels
+        stages, across = (
+            now + max(now - then, 0) * levels
+            for now, then in ((self.stages, before.stages), (self.across, before.across))
+        )
         return replace(
             self,
             bytes=sizes,
@@ -129,6 +170,7 @@ class Work:
             keys=[*self.keys, *[""] * added],
             cells=[*(c * 8.0**levels for c in self.cells), *[0.0] * added],
             stages=stages,
+            across=across,
         )
 
     def passes(self, most: int = 12) -> str:
@@ -144,13 +186,14 @@ class Work:
 
 
 class Launched(NamedTuple):
-    """A launch: bytes of its fields, barriers, and of a pass its name and its cells; the kernel's name."""
+    """A launch: bytes of its fields, barriers; a pass's name, cells; the kernel's name; barriers of clusters."""
 
     bytes: float
     stages: int
     key: str = ""
     cells: float = 0.0
     name: str = ""
+    across: int = 0
 
 
 def name_of(kernel: Any) -> str:
@@ -208,7 +251,9 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         current.pop()
 
     def sequencing(sequence: PersistentKernel, *args: Any) -> None:
-        current.append(Launched(0.0, len(sequence._stages)))
+        stages = len(sequence._stages)
+        across = stages if sequence.tasks > THREADS else 0
+        current.append(Launched(0.0, stages, across=across))
         launch_sequence(sequence, *args)
         current.pop()
 
@@ -242,6 +287,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         found.keys.append(launched.key)
         found.cells.append(launched.cells)
         found.stages += launched.stages
+        found.across += launched.across
 
     patches = (
         mock.patch.object(StencilKernel, "bind_arguments", binding),
@@ -256,7 +302,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
     work()
     for kept in (found.bytes, found.graph, found.names, found.keys, found.cells):
         kept.clear()
-    found.stages = 0
+    found.stages = found.across = 0
     emulated_cuda.meter.clear()
     work()
     for patch in reversed(patches):
@@ -324,7 +370,9 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
     return "\n".join(lines)
 
 
-def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]) -> str:
+def limits_table(
+    small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]
+) -> str:
     """Return a table of what holds solves on GPUs, from the work at n / 2 and at n and counted passes."""
     names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
     lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
@@ -343,11 +391,26 @@ def limits_table(small: Work, large: Work, n: int, counts: dict[str, gpu_counts.
     return "\n".join(lines)
 
 
-def counted(counts: dict[str, gpu_counts.InstructionCount]) -> Iterator[gpu_counts.InstructionCount]:
+def counted(
+    counts: dict[str, gpu_counts.InstructionCount],
+) -> Iterator[gpu_counts.InstructionCount]:
     """Count passes, and note each by its key."""
     for one in gpu_counts.counts():
         counts[one.key] = one
         yield one
+
+
+def counts_of(work: Work) -> dict[str, gpu_counts.InstructionCount]:
+    """Count the passes of some work where they were launched: on boxes, lists, rows with gaps."""
+    found = dict[str, gpu_counts.InstructionCount]()
+    with tempfile.TemporaryDirectory() as folder:
+        for key in sorted({key for key in work.keys if key in work.bounds}):
+            one = work.bounds[key]
+            try:
+                found[key] = gpu_counts.count(key, one, one.bound.given, Path(folder), WARPS)
+            except (NotImplementedError, KeyError, RuntimeError) as error:
+                print(f"{key}: {error!r}")
+    return found
 
 
 def main() -> None:
@@ -375,9 +438,19 @@ def main() -> None:
         action="store_true",
         help="of --sass: whole solves, too, each launch by its slowest limit",
     )
+    parser.add_argument(
+        "--steps", action="store_true", help="of --sass: a step of the dam break instead of passes"
+    )
     clusters = "solves as on GPUs with clusters of blocks (capability 9.0 on)"
     parser.add_argument("--clusters", action="store_true", help=clusters)
     given = parser.parse_args()
+    if given.sass and given.steps:
+        n = given.step_cells or given.cells
+        work = step(n)
+        counts = counts_of(work)
+        print(f"Longest kernels of a step of the dam break, {n} cells along x, on an H200 [us]\n")
+        print(work.longest(gpu_counts.GPUS["H200"], counts, HEARD))
+        return
     if given.sass:
         print(
             f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as "
@@ -388,7 +461,9 @@ def main() -> None:
             print(line, flush=True)
         if given.solves:
             n = given.cells
-            (small, _), (large, iterations) = solve(n // 2), solve(n)
+            (small, _), (large, iterations) = (
+                solve(m, clusters=given.clusters) for m in (n // 2, n)
+            )
             print(
                 f"\nA cold solve to 1e-6: {iterations} iterations; what holds it, and for how long "
                 "[ms]\n"

@@ -76,3 +76,14 @@ def issued(
         found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
     found.read, found.written = frozenset(reached[True]), frozenset(reached[False])
     return found
+
+
+def mean_of(found: Sequence[Issued]) -> Issued:
+    """Return the mean of what some warps issue, rounded, with all addresses that they reach."""
+    mean = lambda name: round(sum(getattr(one, name) for one in found) / len(found))  # noqa: E731
+    names = ("instructions", "float64", "loads", "stores", "wavefronts", "atomics")
+    return Issued(
+        *(mean(name) for name in names),
+        read=frozenset[int]().union(*(one.read for one in found)),
+        written=frozenset[int]().union(*(one.written for one in found)),
+    )

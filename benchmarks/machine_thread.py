@@ -477,6 +477,10 @@ class Lane:
     def _do_vimnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._least_or_most(m, self._int(o[1]), self._int(o[2]), o)
 
+    def _do_vimnmx3(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._least_or_most(m, self._int(o[1]), self._int(o[2]), o)
+        self._least_or_most(m, self._int(o[0]), self._int(o[3]), o)
+
     def _do_viaddmnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._least_or_most(m, (self._int(o[1]) + self._int(o[2])) & LOW, self._int(o[3]), o)
 

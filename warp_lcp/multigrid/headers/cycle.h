@@ -44,7 +44,7 @@ else
 // which is made again for each neighbor; `choose_clip` hands over how values are clipped to the
 // bounds
 const auto diagonal_of = [&](int k, int at) -> T { return unit * (T)(d + at)[k]; };
-const auto sweep_again = [&](auto value, auto clip) {
+const auto sweep_again = [&](auto value, auto clip) INLINED {
     SIMD for (int k = 0; k < n; ++k) {
         const auto there = [&](int i, int rows, int planes) {
             return value(i, (int)beside(rows, planes, zm, zp));
@@ -54,7 +54,7 @@ const auto sweep_again = [&](auto value, auto clip) {
         y[k] = clip(k, 0, e != 0 ? v : (T)0);
     }
 };
-const auto choose_clip = [&](auto sweeps) {
+const auto choose_clip = [&](auto sweeps) INLINED {
     if (!projected)
         sweeps([](int, int, T v) { return v; });
     else if (upper)
@@ -189,7 +189,7 @@ if (projected) {
 //   writes     S y
 //   numbers    S first, omega; bool projected
 #include "sweep_again"
-const auto sweeps = [&](auto clip) {
+const auto sweeps = [&](auto clip) INLINED {
     // the first sweep at a cell of a row `at` elements from ours
     sweep_again(
         [&](int k, int at) -> T {
@@ -223,8 +223,8 @@ constexpr int odd = 0;  // quads and spans begin with even cells
 #else
 const int odd = P.first & 1;
 #endif
-with_pairs(pairs, [&](auto fx) {
-    const auto sweeps = [&](auto clip) {
+with_pairs(pairs, [&](auto fx) INLINED {
+    const auto sweeps = [&](auto clip) INLINED {
         sweep_again(
             [&](int k, int at) -> T {
                 const T c = (coarse + aggregates(at))[fx == 2 ? (k + odd) >> 1 : k], v = scale * c,
