@@ -262,7 +262,7 @@ def count(
     fields = {
         int(a.ptr): a.size * wp.types.type_size_in_bytes(a.dtype)
         for n, a in one.fields.items()
-        if n not in apart
+        if a.size and n not in apart
     }
     moved = sum(
         size

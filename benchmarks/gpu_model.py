@@ -55,6 +55,7 @@ GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
 WARPS = 24  # of a launch that are counted where their work differs
 STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
+CLUSTERS = ("H100 SXM", "H200")  # that have clusters of blocks
 SIZES = (128, 256, 512, 1024)
 
 
@@ -115,6 +116,15 @@ class Work:
             limit = max(limits, key=lambda name: limits[name])
             found[limit] = found.get(limit, 0.0) + limits[limit]
         return found
+
+    def floor(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]) -> float:
+        """Return the time [ms] of the bytes alone."""
+        by_key = {key: one.bytes for key, one in counts.items()}
+        moved = sum(
+            by_key[key] * cells if key in by_key else size
+            for size, key, cells in zip(self.bytes, self.keys, self.cells, strict=True)
+        )
+        return moved / (SHARE * gpu.bandwidth * 1e6)
 
     def longest(
         self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount], times: int
@@ -371,23 +381,29 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
 
 
 def limits_table(
-    small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]
+    works: dict[bool, tuple[Work, Work]], n: int, counts: dict[str, gpu_counts.InstructionCount]
 ) -> str:
-    """Return a table of what holds solves on GPUs, from the work at n / 2 and at n and counted passes."""
+    """Return a table of what holds solves on GPUs.
+
+    Args:
+        works: at n / 2 and at n, of GPUs with clusters of blocks and of others.
+        n: cells along an axis.
+        counts: of passes.
+    """
     names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
-    lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
+    lines = [
+        f"| cells | GPU | ms | by bytes alone | {' | '.join(names)} |",
+        "|---|---|" + "---|" * (len(names) + 2),
+    ]
     for size in (s for s in SIZES[:3] if s >= n // 2):
-        work = (
-            large.grown(small, int(np.log2(size / n)))
-            if size > n
-            else large
-            if size == n
-            else small
-        )
         for name, gpu in gpu_counts.GPUS.items():
+            small, large = works[name in CLUSTERS]
+            levels = int(np.log2(size / n))
+            work = small if levels < 0 else large.grown(small, levels) if levels else large
             terms = work.terms(gpu, counts)
             columns = " | ".join(f"{terms.get(term, 0.0):.2f}" for term in names)
-            lines.append(f"| {size}^3 | {name} | {sum(terms.values()):.1f} | {columns} |")
+            total, floor = sum(terms.values()), work.floor(gpu, counts)
+            lines.append(f"| {size}^3 | {name} | {total:.1f} | {floor:.1f} | {columns} |")
     return "\n".join(lines)
 
 
@@ -461,14 +477,15 @@ def main() -> None:
             print(line, flush=True)
         if given.solves:
             n = given.cells
-            (small, _), (large, iterations) = (
-                solve(m, clusters=given.clusters) for m in (n // 2, n)
-            )
+            works = {}
+            for clusters in (True, False):
+                (small, _), (large, iterations) = (solve(m, clusters=clusters) for m in (n // 2, n))
+                works[clusters] = small, large
             print(
                 f"\nA cold solve to 1e-6: {iterations} iterations; what holds it, and for how long "
                 "[ms]\n"
             )
-            print(limits_table(small, large, n, counts))
+            print(limits_table(works, n, counts))
             print(
                 f"\nOf the bytes {large.uncounted(counts):.1%} are of passes that have not been "
                 "counted."

@@ -72,9 +72,6 @@ const auto fused = [](auto a, auto b, auto c) { return fma(a, b, c); };
 #else
 const auto fused = [](auto a, auto b, auto c) { return __builtin_elementwise_fma(a, b, c); };
 #endif
-// after a lambda's parameters: of row functions so large that the compiler would call them, with all
-// that they take in memory
-#define INLINED __attribute__((always_inline))
 const auto clipped = [](auto v, auto l, auto u) {
     const auto w = v < l ? l : v;
     return w > u ? u : w;
@@ -95,7 +92,7 @@ struct One {
 struct Two {
     METHOD constexpr operator Whole() const { return 2; }
 };
-const auto with_pairs = [](bool pairs, auto body) INLINED {
+const auto with_pairs = [](bool pairs, auto body) {
     if (pairs)
         body(Two());
     else

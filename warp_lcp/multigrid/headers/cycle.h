@@ -43,6 +43,7 @@ else
 // snippet sweep_again: y = a sweep of `value(k, at)` at cell k of a row `at` elements from ours,
 // which is made again for each neighbor; `choose_clip` hands over how values are clipped to the
 // bounds
+#define INLINED __attribute__((always_inline))  // or the compiler calls them, with fields in memory
 const auto diagonal_of = [&](int k, int at) -> T { return unit * (T)(d + at)[k]; };
 const auto sweep_again = [&](auto value, auto clip) INLINED {
     SIMD for (int k = 0; k < n; ++k) {
@@ -223,7 +224,7 @@ constexpr int odd = 0;  // quads and spans begin with even cells
 #else
 const int odd = P.first & 1;
 #endif
-with_pairs(pairs, [&](auto fx) INLINED {
+const auto by_pairs = [&](auto fx) INLINED {
     const auto sweeps = [&](auto clip) INLINED {
         sweep_again(
             [&](int k, int at) -> T {
@@ -234,7 +235,15 @@ with_pairs(pairs, [&](auto fx) INLINED {
             clip);
     };
     choose_clip(sweeps);
-});
+};
+#ifdef QUADS
+if (pairs)
+    by_pairs(Two());
+else
+    by_pairs(One());
+#else
+by_pairs(pairs ? 2 : 1);
+#endif
 
 // kernel cycle.bounds: Bounds of a coarse correction: the tightest of its cells' gaps, divided by
 // the over-correction; 0 is always allowed
