@@ -457,8 +457,8 @@ def main() -> None:
     parser.add_argument(
         "--steps", action="store_true", help="of --sass: a step of the dam break instead of passes"
     )
-    clusters = "solves as on GPUs with clusters of blocks (capability 9.0 on)"
-    parser.add_argument("--clusters", action="store_true", help=clusters)
+    told = "without --sass: solves as on GPUs with clusters of blocks (capability 9.0 on)"
+    parser.add_argument("--clusters", action="store_true", help=told)
     given = parser.parse_args()
     if given.sass and given.steps:
         n = given.step_cells or given.cells
@@ -477,7 +477,7 @@ def main() -> None:
             print(line, flush=True)
         if given.solves:
             n = given.cells
-            works = {}
+            works = dict[bool, tuple[Work, Work]]()
             for clusters in (True, False):
                 (small, _), (large, iterations) = (solve(m, clusters=clusters) for m in (n // 2, n))
                 works[clusters] = small, large

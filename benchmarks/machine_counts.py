@@ -8,7 +8,7 @@ join again.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from benchmarks.machine_code import Instruction
@@ -80,10 +80,17 @@ def issued(
 
 def mean_of(found: Sequence[Issued]) -> Issued:
     """Return the mean of what some warps issue, rounded, with all addresses that they reach."""
-    mean = lambda name: round(sum(getattr(one, name) for one in found) / len(found))  # noqa: E731
-    names = ("instructions", "float64", "loads", "stores", "wavefronts", "atomics")
+
+    def mean(of: Callable[[Issued], int]) -> int:
+        return round(sum(of(one) for one in found) / len(found))
+
     return Issued(
-        *(mean(name) for name in names),
-        read=frozenset[int]().union(*(one.read for one in found)),
-        written=frozenset[int]().union(*(one.written for one in found)),
+        mean(lambda one: one.instructions),
+        mean(lambda one: one.float64),
+        mean(lambda one: one.loads),
+        mean(lambda one: one.stores),
+        mean(lambda one: one.wavefronts),
+        mean(lambda one: one.atomics),
+        frozenset[int]().union(*(one.read for one in found)),
+        frozenset[int]().union(*(one.written for one in found)),
     )
