@@ -540,6 +540,13 @@ class Lane:
     def _do_fsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._set_both(m, o, COMPARED[i.modifiers[0]](self._real(o[2]), self._real(o[3])))
 
+    def _do_fset(self, m: set[str], o: list[str], i: Instruction) -> None:
+        kind, other = i.modifiers[1 if "BF" in m else 0], self._predicate(o[3])
+        result = COMPARED[kind](self._real(o[1]), self._real(o[2])) and other
+        if "AND" not in m:
+            raise NotImplementedError(i.text)
+        self._put(o[0], (_bits(1.0) if "BF" in m else LOW) if result else 0)
+
     def _do_dsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._set_both(
             m, o, COMPARED[i.modifiers[0]](self._double_real(o[2]), self._double_real(o[3]))
