@@ -27,11 +27,12 @@ import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine_code import Kernel, assemble, tools_missing
-from benchmarks.machine_counts import Issued, issued
+from benchmarks.machine_counts import Issued, issued, mean_of
 from benchmarks.machine_thread import Memory, constants_of
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.kernels import StencilKernel, layout
 from warp_lcp.kernels.stencil_kernel import BoundKernel
+from warp_lcp.multigrid.stencil_level import StencilLevel
 
 assert emulated_cuda
 
@@ -177,23 +178,28 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
         heard.append((Heard(bound, fields), bound.given))
         return bound
 
-    many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1, MANY_CELLS_OF_BLOCKS=1)
+    blocks = math.prod(SHAPE) // 8  # of the next level, too, but not of those in one launch
+    many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1, MANY_CELLS_OF_BLOCKS=blocks)
     with many, mock.patch.object(StencilKernel, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
         lower = np.where(wall, 0.0, -np.inf)
         # Fields of weights, as coarser levels have.
         faces = np.full((*SHAPE[:2], SHAPE[2] + 1), 0.5)
         multigrid, newton = wl.ProjectedMultigrid(), wl.MinimumMapNewton()
-        for method, least, face_x in (
-            (multigrid, lower, 1.0),
-            (multigrid, -np.inf, 1.0),
-            (newton, lower, 1.0),
-            (multigrid, lower, faces),
-            (multigrid, -np.inf, faces),
-            (newton, lower, faces),
+        apart, joined = False, True  # two sweeps from zero; a correction with a sweep
+        for method, least, face_x, joins in (
+            (multigrid, lower, 1.0, apart),
+            (multigrid, -np.inf, 1.0, apart),
+            (multigrid, lower, 1.0, joined),
+            (newton, lower, 1.0, apart),
+            (multigrid, lower, faces, apart),
+            (multigrid, -np.inf, faces, apart),
+            (multigrid, lower, faces, joined),
+            (newton, lower, faces, apart),
         ):
             A = wl.GridPoisson(cells, device="cpu", face_x=face_x)
-            wl.solve(wl.LCP(A, b, least), method, stopping=stopping)
+            with mock.patch.object(StencilLevel, "joins_sweeps", joins):
+                wl.solve(wl.LCP(A, b, least), method, stopping=stopping)
         A = wl.GridPoisson(cells, device="cpu")
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
         A.stencil.product(x, wp.zeros_like(x))
@@ -216,10 +222,17 @@ def cells_of(bound: BoundKernel) -> int:
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
-def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> InstructionCount:
-    """Compile a kernel for CUDA, execute one warp, and return its counts.
+def count(
+    name: str, one: Heard, given: dict[str, Any], folder: Path, warps: int = 1
+) -> InstructionCount:
+    """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
-    The warp is in the middle of the grid.
+    Args:
+        name: of the count.
+        one: the pass.
+        given: its arguments.
+        folder: what is compiled lies there.
+        warps: more than one: the mean of so many, all over the launch, some of them without work.
 
     Raises:
         NotImplementedError: it has an instruction that `benchmarks.machine_thread` does not know.
@@ -243,11 +256,18 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Instruc
     ]
     memory = Memory((int(a.ptr), a.numpy().copy()) for a in arrays)
     blocks = -(-math.prod(dim) // BLOCK)
-    found = issued(
-        kernel.code,
-        constants_of(parameters, BLOCK, blocks),
-        memory,
-        [(t % BLOCK, t // BLOCK) for t in taken],
+    constants = constants_of(parameters, BLOCK, blocks)
+    if warps > 1:
+        every = -(-math.prod(dim) // WARP)  # warps of the launch
+        firsts = [every * (2 * i + 1) // (2 * warps) * WARP for i in range(min(warps, every))]
+        groups = [range(first, min(first + WARP, math.prod(dim))) for first in firsts]
+    else:
+        groups = [taken]
+    found = mean_of(
+        [
+            issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in group])
+            for group in groups
+        ]
     )
     planes, size = min(rows.slab, rows.planes), one.bound.rows.size
     ratio = max(one.bound.rows.other_size // size, 1) if size else 1
@@ -258,7 +278,7 @@ def count(name: str, one: Heard, given: dict[str, Any], folder: Path) -> Instruc
     fields = {
         int(a.ptr): a.size * wp.types.type_size_in_bytes(a.dtype)
         for n, a in one.fields.items()
-        if n not in apart
+        if a.size and n not in apart
     }
     moved = sum(
         size

@@ -21,6 +21,7 @@ from benchmarks import emulated_cuda, gpu_counts  # must precede the package
 # ruff: isort: split
 
 import argparse
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -35,14 +36,15 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.kernels import StencilKernel
-from warp_lcp.kernels.persistent_kernel import PersistentKernel
+from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
 SHARE = 0.8  # share of the data sheets' bandwidth that streaming kernels reach
 RECORDED, LAUNCHED = 6.0, 12.0  # [us] a small launch in a graph, and one from Python
-BARRIER, READBACK = 1.2, 15.0  # [us] a stage of fused levels with its barrier; in a cluster .5 more
+BARRIER, READBACK = 1.2, 15.0  # [us] a stage of small levels with its barrier
+ACROSS = 0.5  # [us] more in a cluster of blocks: its barrier, and loads from L2 after it
 GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
     "H100 SXM": (3350.0, 16_700.0),
     "H200": (4800.0, 16_700.0),
@@ -51,7 +53,9 @@ GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
 }
 # Float64 instructions a byte of the kernels that have many, see `benchmarks.two_floats`.
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
-STEPS, HEARD = 10, 5  # steps of the dam break: until it moves, and recorded ones
+WARPS = 24  # of a launch that are counted where their work differs
+STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
+CLUSTERS = ("H100 SXM", "H200")  # that have clusters of blocks
 SIZES = (128, 256, 512, 1024)
 
 
@@ -65,9 +69,10 @@ class Work:
         names: of the kernels.
         keys: of stencil kernels, as `gpu_counts` names them.
         cells: that they visit.
-        bounds: a launch of each stencil kernel, by key.
-        stages: of fused coarse levels, each with a barrier.
-        readbacks: number of waits of the host.
+        bounds: a launch of each pass, by key.
+        stages: of small levels, each with a barrier.
+        across: of these, stages of clusters of blocks.
+        readbacks: how often the host waited.
     """
 
     bytes: list[float] = field(default_factory=list)
@@ -77,7 +82,13 @@ class Work:
     cells: list[float] = field(default_factory=list)
     bounds: dict[str, Heard] = field(default_factory=dict)
     stages: int = 0
+    across: int = 0
     readbacks: int = 0
+
+    @property
+    def barriers(self) -> float:
+        """Time [us] of the stages of small levels."""
+        return BARRIER * self.stages + ACROSS * self.across
 
     def ms(self, bandwidth: float, float64: float) -> float:
         """Return the time of this work [ms].
@@ -90,10 +101,7 @@ class Work:
         )
         moved = np.array(self.bytes) * np.maximum(1 / (SHARE * bandwidth), slow) / 1e3
         return (
-            float(
-                np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks
-            )
-            / 1e3
+            float(np.maximum(least, moved).sum() + self.barriers + READBACK * self.readbacks) / 1e3
         )
 
     def terms(
@@ -103,10 +111,7 @@ class Work:
 
         The time of a launch belongs to its slowest limit.
         """
-        found = {
-            "barriers": BARRIER * self.stages / 1e3,
-            "readbacks": READBACK * self.readbacks / 1e3,
-        }
+        found = {"barriers": self.barriers / 1e3, "readbacks": READBACK * self.readbacks / 1e3}
         for size, graph, key, cells in zip(
             self.bytes, self.graph, self.keys, self.cells, strict=True
         ):
@@ -117,6 +122,47 @@ class Work:
             limit = max(limits, key=lambda name: limits[name])
             found[limit] = found.get(limit, 0.0) + limits[limit]
         return found
+
+    def floor(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]) -> float:
+        """Return the time [ms] of the bytes alone."""
+        by_key = {key: one.bytes for key, one in counts.items()}
+        moved = sum(
+            by_key[key] * cells if key in by_key else size
+            for size, key, cells in zip(self.bytes, self.keys, self.cells, strict=True)
+        )
+        return moved / (SHARE * gpu.bandwidth * 1e6)
+
+    def longest(
+        self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount], times: int
+    ) -> str:
+        """Return a table of the ten kernels that take longest, of one of some `times`."""
+        rows: dict[str, list[Any]] = {}
+        for size, graph, key, cells, name in zip(
+            self.bytes, self.graph, self.keys, self.cells, self.names, strict=True
+        ):
+            one = counts.get(key)
+            limits = {"bytes": size / (SHARE * gpu.bandwidth * 1e3)}
+            if one is not None:
+                limits = {limit: 1e3 * ms for limit, ms in one.limits(gpu, round(cells)).items()}
+            limit = max(limits, key=lambda name: limits[name])
+            floor = RECORDED if graph else LAUNCHED
+            row = rows.setdefault(key or name, [0, 0.0, 0.0, limit, "", 0.0, 0.0])
+            row[0] += 1
+            row[1] += max(floor, limits[limit])
+            if limits[limit] >= row[2]:
+                row[2:4] = limits[limit], limit
+            if one is not None:
+                threads = one.issued.instructions / one.cells, one.issued.wavefronts / one.cells
+                row[4], row[5], row[6] = str(one.registers), *threads
+        lines = [
+            f"| `{name}` | {n / times:.0f} | {total / times:.0f} | {longest:.1f}, {limit} | "
+            f"{issued:.0f} | {wavefronts:.0f} | {registers} |"
+            for name, (n, total, longest, limit, registers, issued, wavefronts) in sorted(
+                rows.items(), key=lambda row: -row[1][1]
+            )[:10]
+        ]
+        head = "| kernel | launches | us | largest without floor, limit | issued a cell | L1 |"
+        return "\n".join([f"{head} registers |", "|---|---|---|---|---|---|---|", *lines])
 
     def uncounted(self, counts: dict[str, gpu_counts.InstructionCount]) -> float:
         """Return the share of the bytes that belongs to uncounted kernels."""
@@ -132,7 +178,10 @@ class Work:
         more = [b for b, g in zip(self.bytes, self.graph, strict=True) if g]
         added = max(len(self.bytes) - len(before.bytes), 0) * levels
         sizes = [b * 8.0**levels for b in self.bytes] + sorted(more)[len(more) // 2 :][:1] * added
-        stages = self.stages + max(self.stages - before.stages, 0) * levels
+        stages, across = (
+            now + max(now - then, 0) * levels
+            for now, then in ((self.stages, before.stages), (self.across, before.across))
+        )
         return replace(
             self,
             bytes=sizes,
@@ -141,6 +190,7 @@ class Work:
             keys=[*self.keys, *[""] * added],
             cells=[*(c * 8.0**levels for c in self.cells), *[0.0] * added],
             stages=stages,
+            across=across,
         )
 
     def passes(self, most: int = 12) -> str:
@@ -156,16 +206,14 @@ class Work:
 
 
 class Launched(NamedTuple):
-    """One launch: bytes of its fields, barriers, and the kernel's name.
-
-    A stencil kernel also has the name of its declaration and its number of cells.
-    """
+    """Work of a launch: bytes, barriers, cells, and the names of the pass and its kernel."""
 
     bytes: float
     stages: int
     key: str = ""
     cells: float = 0.0
     name: str = ""
+    across: int = 0
 
 
 def name_of(kernel: Any) -> str:
@@ -227,7 +275,9 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         current.pop()
 
     def sequencing(sequence: PersistentKernel, *args: Any) -> None:
-        current.append(Launched(0.0, len(sequence._stages)))
+        stages = len(sequence._stages)
+        across = stages if sequence.tasks > THREADS else 0
+        current.append(Launched(0.0, stages, across=across))
         launch_sequence(sequence, *args)
         current.pop()
 
@@ -262,6 +312,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         found.keys.append(launched.key)
         found.cells.append(launched.cells)
         found.stages += launched.stages
+        found.across += launched.across
 
     patches = (
         mock.patch.object(StencilKernel, "bind_arguments", binding),
@@ -276,7 +327,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
     work()
     for kept in (found.bytes, found.graph, found.names, found.keys, found.cells):
         kept.clear()
-    found.stages = 0
+    found.stages = found.across = 0
     emulated_cuda.meter.clear()
     work()
     for patch in reversed(patches):
@@ -350,36 +401,52 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
 
 
 def limits_table(
-    small: Work, large: Work, n: int, counts: dict[str, gpu_counts.InstructionCount]
+    works: dict[bool, tuple[Work, Work]], n: int, counts: dict[str, gpu_counts.InstructionCount]
 ) -> str:
-    """Return a table of the limits of solves on GPUs.
+    """Return a table of what holds solves on GPUs.
 
-    It is extrapolated from the work at n / 2 and at n, with counted kernels.
+    Args:
+        works: at n / 2 and at n, of GPUs with clusters of blocks and of others.
+        n: cells along an axis.
+        counts: of passes.
     """
     names = ("bytes", "issue", "L1", "float64", "latency", "launches", "barriers", "readbacks")
-    lines = [f"| cells | GPU | ms | {' | '.join(names)} |", "|---|---|" + "---|" * (len(names) + 1)]
+    lines = [
+        f"| cells | GPU | ms | by bytes alone | {' | '.join(names)} |",
+        "|---|---|" + "---|" * (len(names) + 2),
+    ]
     for size in (s for s in SIZES[:3] if s >= n // 2):
-        work = (
-            large.grown(small, int(np.log2(size / n)))
-            if size > n
-            else large
-            if size == n
-            else small
-        )
         for name, gpu in gpu_counts.GPUS.items():
+            small, large = works[name in CLUSTERS]
+            levels = int(np.log2(size / n))
+            work = small if levels < 0 else large.grown(small, levels) if levels else large
             terms = work.terms(gpu, counts)
             columns = " | ".join(f"{terms.get(term, 0.0):.2f}" for term in names)
-            lines.append(f"| {size}^3 | {name} | {sum(terms.values()):.1f} | {columns} |")
+            total, floor = sum(terms.values()), work.floor(gpu, counts)
+            lines.append(f"| {size}^3 | {name} | {total:.1f} | {floor:.1f} | {columns} |")
     return "\n".join(lines)
 
 
 def counted(
     counts: dict[str, gpu_counts.InstructionCount],
 ) -> Iterator[gpu_counts.InstructionCount]:
-    """Count kernels, and yield each count by its key."""
+    """Count passes, and note each by its key."""
     for one in gpu_counts.counts():
         counts[one.key] = one
         yield one
+
+
+def counts_of(work: Work) -> dict[str, gpu_counts.InstructionCount]:
+    """Count the passes of some work where they were launched: on boxes, lists, rows with gaps."""
+    found = dict[str, gpu_counts.InstructionCount]()
+    with tempfile.TemporaryDirectory() as folder:
+        for key in sorted({key for key in work.keys if key in work.bounds}):
+            one = work.bounds[key]
+            try:
+                found[key] = gpu_counts.count(key, one, one.bound.given, Path(folder), WARPS)
+            except (NotImplementedError, KeyError, RuntimeError) as error:
+                print(f"{key}: {error!r}")
+    return found
 
 
 def main() -> None:
@@ -407,9 +474,19 @@ def main() -> None:
         action="store_true",
         help="of --sass: whole solves, too, each launch by its slowest limit",
     )
-    clusters = "solves as on GPUs with clusters of blocks (capability 9.0 on)"
-    parser.add_argument("--clusters", action="store_true", help=clusters)
+    parser.add_argument(
+        "--steps", action="store_true", help="of --sass: a step of the dam break instead of passes"
+    )
+    told = "without --sass: solves as on GPUs with clusters of blocks (capability 9.0 on)"
+    parser.add_argument("--clusters", action="store_true", help=told)
     given = parser.parse_args()
+    if given.sass and given.steps:
+        n = given.step_cells or given.cells
+        work = step(n)
+        counts = counts_of(work)
+        print(f"Longest kernels of a step of the dam break, {n} cells along x, on an H200 [us]\n")
+        print(work.longest(gpu_counts.GPUS["H200"], counts, HEARD))
+        return
     if given.sass:
         print(
             f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as "
@@ -420,12 +497,15 @@ def main() -> None:
             print(line, flush=True)
         if given.solves:
             n = given.cells
-            (small, _), (large, iterations) = solve(n // 2), solve(n)
+            works = dict[bool, tuple[Work, Work]]()
+            for clusters in (True, False):
+                (small, _), (large, iterations) = (solve(m, clusters=clusters) for m in (n // 2, n))
+                works[clusters] = small, large
             print(
                 f"\nA cold solve to 1e-6: {iterations} iterations; what holds it, and for how long "
                 "[ms]\n"
             )
-            print(limits_table(small, large, n, counts))
+            print(limits_table(works, n, counts))
             print(
                 f"\nOf the bytes {large.uncounted(counts):.1%} are of passes that have not been "
                 "counted."

@@ -8,7 +8,7 @@ branches join again.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from benchmarks.machine_code import Instruction
@@ -78,3 +78,21 @@ def issued(
         found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
     found.read, found.written = frozenset(reached[True]), frozenset(reached[False])
     return found
+
+
+def mean_of(found: Sequence[Issued]) -> Issued:
+    """Return the mean of what some warps issue, rounded, with all addresses that they reach."""
+
+    def mean(of: Callable[[Issued], int]) -> int:
+        return round(sum(of(one) for one in found) / len(found))
+
+    return Issued(
+        mean(lambda one: one.instructions),
+        mean(lambda one: one.float64),
+        mean(lambda one: one.loads),
+        mean(lambda one: one.stores),
+        mean(lambda one: one.wavefronts),
+        mean(lambda one: one.atomics),
+        frozenset[int]().union(*(one.read for one in found)),
+        frozenset[int]().union(*(one.written for one in found)),
+    )

@@ -487,6 +487,10 @@ class Lane:
     def _do_vimnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._least_or_most(m, self._int(o[1]), self._int(o[2]), o)
 
+    def _do_vimnmx3(self, m: set[str], o: list[str], i: Instruction) -> None:
+        self._least_or_most(m, self._int(o[1]), self._int(o[2]), o)
+        self._least_or_most(m, self._int(o[0]), self._int(o[3]), o)
+
     def _do_viaddmnmx(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._least_or_most(m, (self._int(o[1]) + self._int(o[2])) & LOW, self._int(o[3]), o)
 
@@ -545,6 +549,13 @@ class Lane:
 
     def _do_fsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._set_both(m, o, COMPARED[i.modifiers[0]](self._real(o[2]), self._real(o[3])))
+
+    def _do_fset(self, m: set[str], o: list[str], i: Instruction) -> None:
+        kind, other = i.modifiers[1 if "BF" in m else 0], self._predicate(o[3])
+        result = COMPARED[kind](self._real(o[1]), self._real(o[2])) and other
+        if "AND" not in m:
+            raise NotImplementedError(i.text)
+        self._put(o[0], (_bits(1.0) if "BF" in m else LOW) if result else 0)
 
     def _do_dsetp(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._set_both(

@@ -49,7 +49,17 @@ LARGE = {
 ISSUED = {
     "stencil.product uniform": 45,
     "cycle.sweep uniform": 55,
-    "cycle.sweep variable": 60,
+    "cycle.sweep uniform projected": 60,
+    "cycle.sweep variable": 55,
+    "cycle.sweep variable projected": 60,
+    "cycle.two_sweeps uniform": 120,
+    "cycle.two_sweeps uniform projected": 140,
+    "cycle.two_sweeps variable": 110,
+    "cycle.two_sweeps variable projected": 130,
+    "cycle.correct_and_sweep uniform": 110,
+    "cycle.correct_and_sweep uniform projected": 135,
+    "cycle.correct_and_sweep variable": 105,
+    "cycle.correct_and_sweep variable projected": 125,
     "cycle.restrict uniform": 30,
     "cycle.restrict variable": 30,
     "cycle.correct uniform": 40,
@@ -60,6 +70,9 @@ ISSUED = {
     "projected_multigrid.measure uniform": 50,
     "projected_multigrid.measure variable": 50,
 }
+# Passes that instructions or the L1 cache may hold on an H200: each makes a sweep again for each
+# neighbor, and takes less time than the two passes in place of which it is. Bytes hold the others.
+JOINED = ("cycle.two_sweeps", "cycle.correct_and_sweep")
 
 
 def known(kernel: str, among: dict[str, str]) -> bool:
@@ -181,11 +194,16 @@ def test_passes_issue_few_instructions() -> None:
         cwd=Path(__file__).parents[1],
     )
     found, limits = defaultdict[str, float](float), defaultdict[str, set[str]](set)
-    row = r"^\| `([\w.]+(?: (?:uniform|variable))?)[^`]*` \| ([\d.]+) \|(?:[^|]*\|){7} (\w+) \|"
-    for name, issued, limit in re.findall(row, done.stdout, re.MULTILINE):
+    row = (
+        r"^\| `([\w.]+(?: (?:uniform|variable))?)[^`]*?( projected)?` \| ([\d.]+) \|"
+        r"(?:[^|]*\|){7} (\w+) \|"
+    )
+    for one, projected, issued, limit in re.findall(row, done.stdout, re.MULTILINE):
+        name = one + projected
         found[name] = max(found[name], float(issued))
         limits[name].add(limit)
-    assert {name: limits[name] for name in ISSUED if limits[name] != {"bytes"}} == {}  # on an H200
+    held = {name: limits[name] - {"bytes"} for name in ISSUED if not name.startswith(JOINED)}
+    assert {name: limits for name, limits in held.items() if limits} == {}  # on an H200
     assert [
         (name, found[name], most) for name, most in ISSUED.items() if not 0 < found[name] <= most
     ] == []

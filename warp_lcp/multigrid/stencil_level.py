@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
@@ -20,10 +19,6 @@ from warp_lcp.multigrid.cycle_passes import Coarsening
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
-# Up to as many cells, a launch on a GPU costs more than repeated work: by the counts of
-# `benchmarks/gpu_counts.py`, two sweeps in one kernel issue 119 instructions a cell instead of 82,
-# and a correction with a sweep 105 instead of 78.
-JOINED_CELLS = 1 << 20
 Pair = tuple[wp.array[Any], wp.array[Any]]
 
 
@@ -252,13 +247,14 @@ class StencilLevel:
     def joins_sweeps(self) -> bool:
         """Whether two sweeps from zero are one launch, and correction and sweep another.
 
-        They are on CUDA, where small levels take as long as their launches, unless ghost cells must
-        be filled between sweeps. Compact stencils have too many neighbors.
+        They are on CUDA, unless ghost cells must be filled between sweeps. Small levels take as
+        long as their launches, large ones as long as their bytes: joined passes move 9 and 14 bytes
+        a cell instead of 22 and 23, on unit coefficients, and issue 116 and 103 instructions
+        instead of 84 and 79. Compact stencils have too many neighbors.
         """
         s = self.stencil
-        small = math.prod(s.padding.counts) <= JOINED_CELLS
         plain = not any(s.periodic) and s.ghosts is None and s.pattern is None
-        return s.device.is_cuda and small and plain
+        return s.device.is_cuda and plain
 
     @property
     def fuses(self) -> bool:

@@ -44,8 +44,10 @@ else
 // snippet sweep_again: y = a sweep of `value(k, at)`, the value at cell k of a row `at` elements
 // from this one. Values are computed again for each neighbor instead of stored. `choose_clip`
 // passes a function that clips values to the bounds.
+// Without inlining the compiler calls the functions, with their fields in memory.
+#define INLINED __attribute__((always_inline))
 const auto diagonal_of = [&](int k, int at) -> T { return unit * (T)(d + at)[k]; };
-const auto sweep_again = [&](auto value, auto clip) {
+const auto sweep_again = [&](auto value, auto clip) INLINED {
     SIMD for (int k = 0; k < n; ++k) {
         const auto there = [&](int i, int rows, int planes) {
             return value(i, (int)beside(rows, planes, zm, zp));
@@ -55,7 +57,7 @@ const auto sweep_again = [&](auto value, auto clip) {
         y[k] = clip(k, 0, e != 0 ? v : (T)0);
     }
 };
-const auto choose_clip = [&](auto sweeps) {
+const auto choose_clip = [&](auto sweeps) INLINED {
     if (!projected)
         sweeps([](int, int, T v) { return v; });
     else if (upper)
@@ -190,7 +192,7 @@ if (projected) {
 //   writes     S y
 //   numbers    S first, omega; bool projected
 #include "sweep_again"
-const auto sweeps = [&](auto clip) {
+const auto sweeps = [&](auto clip) INLINED {
     // first sweep at a cell of a row `at` elements from this one
     sweep_again(
         [&](int k, int at) -> T {
@@ -226,8 +228,8 @@ constexpr int odd = 0;  // quads and spans begin with even cells
 #else
 const int odd = P.first & 1;
 #endif
-with_pairs(pairs, [&](auto fx) {
-    const auto sweeps = [&](auto clip) {
+const auto by_pairs = [&](auto fx) INLINED {
+    const auto sweeps = [&](auto clip) INLINED {
         sweep_again(
             [&](int k, int at) -> T {
                 const T c = (coarse + aggregates(at))[fx == 2 ? (k + odd) >> 1 : k], v = scale * c,
@@ -237,7 +239,15 @@ with_pairs(pairs, [&](auto fx) {
             clip);
     };
     choose_clip(sweeps);
-});
+};
+#ifdef QUADS
+if (pairs)
+    by_pairs(Two());
+else
+    by_pairs(One());
+#else
+by_pairs(pairs ? 2 : 1);
+#endif
 
 // kernel cycle.bounds: Bounds of a coarse correction: the smallest gaps of its cells, divided by
 // the over-correction; 0 is always allowed
