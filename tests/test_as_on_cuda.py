@@ -215,7 +215,7 @@ CROWDED = "density_correction.max_density=0.9"
         ("dam-break", {"calls": 4, "readbacks": 2, "launches": 230}),
         ("dam-break-2d " + CROWDED, {"calls": 6, "readbacks": 3, "launches": 260}),
         # One of these is by a correction.
-        ("floating-bodies-2d", {"calls": 8, "readbacks": 4, "launches": 450}),
+        ("floating-bodies-2d", {"calls": 8, "readbacks": 4, "launches": 500}),
         pytest.param(
             "column-collapse", {"calls": 7, "readbacks": 3, "launches": 900}, marks=pytest.mark.slow
         ),
@@ -244,9 +244,10 @@ def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
     states, counts = [], []
     for on_device in (False, True):
         monkeypatch.setattr(LaunchGraph, "on_device", on_device)
-        simulation = made(
-            name.split(maxsplit=1)[0], 16 if name == "column-collapse" else 32, *name.split()[1:]
-        )
+        scene_name, *overrides = name.split()
+        # Bodies of less than three cells would be met as exact shapes, by more launches.
+        resolution = {"column-collapse": 16, "floating-bodies-2d": 96}.get(name, 32)
+        simulation = made(scene_name, resolution, *overrides)
         for _ in range(4):
             meter.clear()
             row = simulation.step(min(simulation.stable_dt(), DT))
