@@ -15,7 +15,7 @@ README = Path(__file__).parents[1] / "README.md"
 
 def test_it_is_short_and_counts_the_methods():
     text = README.read_text()
-    assert text.count("\n") <= 110
+    assert text.count("\n") <= 120
     assert f"[{len(wl.METHODS)} methods]" in text
     assert (
         f">{len(wl.METHODS)} methods: init, step<"
