@@ -50,6 +50,7 @@ BLADE = box(
     [0.7, 0.25, 0.26],
     motion={"kind": "rotation", "rate": 300.0, "axis": [0, 1, 0], "center": [0.45, 0, 0.23]},
 )
+THICK_BLADE = BLADE | {"max": [0.7, 0.25, 0.36]}  # cells are cut by solids of 3 cells and more
 OPEN = {"size": FLAT["size"], "resolution": 32, "wall": "separating", "open": ["right"]}
 PROBES = [
     {"name": f"{what}_{n}", "position": place, "quantity": what}
@@ -255,7 +256,7 @@ SCENES = {
 SCENES |= {
     "sand": COLUMN | {"solid": [BALL], "density_correction": {}, "gauge": {"height": 0.1}},
     "stirred sand": COLUMN
-    | {"solid": [BLADE], "source": [POURED], "particles": {"reseed": {"min": 4, "max": 12}}},
+    | {"solid": [THICK_BLADE], "source": [POURED], "particles": {"reseed": {"min": 4, "max": 12}}},
     "voxel sand": COLUMN
     | {"solid": [BALL], "solids": "voxel", "friction": {"dynamic_angle": 40.0, "grain_size": 1e-3}},
     "thrown sand": COLUMN | {"sand": THROWN},
