@@ -126,7 +126,7 @@ SLOPE = {
 ROUND = {  # along x and z, over a periodic step, around a wheel
     "periodic": [True, False, True],
     "sand": [box([0.0, 0.0, 0.0], [1.0, 0.2, 0.5], velocity=[-0.8, 0.0, 0.6])],
-    "solid": [box([-1.0, -1.0, -1.0], [2.0, 0.05, 2.0]), BLADE],
+    "solid": [box([-1.0, -1.0, -1.0], [2.0, 0.05, 2.0]), THICK_BLADE],
 }
 SPOUT = box([0.5, 0.45, 0.1], [0.7, 0.5, 0.3], velocity=[0.0, -0.8, 0.0], viscosity=0.5)
 PLUNGER = box(
