@@ -50,7 +50,8 @@ BLADE = box(
     [0.7, 0.25, 0.26],
     motion={"kind": "rotation", "rate": 300.0, "axis": [0, 1, 0], "center": [0.45, 0, 0.23]},
 )
-THICK_BLADE = BLADE | {"max": [0.7, 0.25, 0.36]}  # cells are cut by solids of 3 cells and more
+# Cells are cut by solids of 3 cells and more.
+THICK_BLADE = BLADE | {"min": [0.28, 0.1, 0.16], "max": [0.62, 0.25, 0.3]}
 OPEN = {"size": FLAT["size"], "resolution": 32, "wall": "separating", "open": ["right"]}
 PROBES = [
     {"name": f"{what}_{n}", "position": place, "quantity": what}
