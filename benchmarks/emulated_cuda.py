@@ -54,7 +54,7 @@ ORDER_MATTERS = {
     "warp_lcp.grid.transfer_*.scatter.*:scatter": "sums of atomic additions are rounded in their "
     "order",
     "warp_lcp.vectors:add_up_kernel": "a tile adds up by place in the block, and the emulation "
-    "deals places out anew",
+    "assigns places again",
 }
 
 libc = ctypes.CDLL(None)

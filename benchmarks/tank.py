@@ -288,7 +288,7 @@ def _table(records: Sequence[BenchmarkRecord]) -> RecordTable:
         "Pressures >= 0 at walls, cold, to a relative residual of 1e-6, on "
         f"{records[0].facts['threads']} threads. Peak: of the process, "
         "from before the arrays of cells, b and bounds are made until the result is there; the "
-        "arrays are let go when the problem is made. "
+        "arrays are released when the problem is made. "
         f"After the solve: what is resident when the result is there. {MCADAMS}"
     )
     return RecordTable("Tanks", columns, rows, remark)

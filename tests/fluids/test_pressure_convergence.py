@@ -20,7 +20,7 @@ import warp_lcp as wl
 
 THETA_MIN, FRACTION_MIN = 1e-3, 1e-3  # as the liquid has them
 SECOND_ORDER = 1.8
-# Center of walls and surfaces in a box [0, 1]: no two cells are alike.
+# Center of walls and surfaces in a box [0, 1]: every cell differs from the others.
 CENTER = np.array([0.513, 0.489, 0.507])
 
 

@@ -29,7 +29,7 @@ def test_published_digits_are_met(published):
     value = published.measure()
     off = abs(value - float(published.printed))
     assert off <= published.tolerance, (value, published.printed)
-    if published.within:  # if a digit differs, the table says so
+    if published.within:  # The table marks answers that differ in a digit.
         exact = type(published)("", "", published.printed, "", published.measure)
         assert off > exact.tolerance or published.source == "QuantLib"
 

@@ -247,7 +247,7 @@ def test_a_layer_squeezed_against_a_wall_counts_although_half_of_its_kernel_is_w
 def test_a_closed_room_that_is_too_full_is_left_alone() -> None:
     """Closed room that is too full: unchanged.
 
-    Whole cells without a way out: no exception, no motion, and the log says so.
+    Whole cells without a way out: no exception, no motion, and a note in the log.
     """
     grid, boundary = tank(resolution=8)
     points = np.repeat(lattice(grid, boundary), 2, axis=0)

@@ -14,7 +14,7 @@ from warp_lcp.kernels.compiler import forward_kernel
 
 EXACT = 64.0  # units of rounding: a candidate with a smaller measure is accepted at once
 RANK = 1e3  # units of rounding: smaller pivots, relative to A's largest entry, are zero
-# Largest number of sweeps of Ruiz's iteration; the first changes nothing where rows are alike.
+# Largest number of sweeps of Ruiz's iteration; the first changes nothing if rows have equal norms.
 EQUILIBRATIONS = 8
 
 
