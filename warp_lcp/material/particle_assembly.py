@@ -29,6 +29,7 @@ from warp_lcp.grid.thin_walls import (
     fills_cells,
     is_sheet,
     is_thin,
+    is_thin_in_parts,
 )
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.ballistic_fragments import BallisticFragments
@@ -173,14 +174,14 @@ def make_boundary(
         thin, crossing = (
             make_thin_walls(scene, grid, placed, passed, crossing=c) for c in (False, True)
         )
-        numbers = crossing.numbers if crossing is not None else ()
         cut = CutCells(
             grid,
             placed,
             wall_separating=separating,
             open_sides=sides,
             remarks=not covered,
-            left_out=numbers,
+            left_out=crossing.everywhere if crossing is not None else (),
+            held=crossing.numbers if crossing is not None else (),
         )
         # On other ranks solids may cut cells.
         if not cut.whole_cells or (covered and placed) or thin is not None:
@@ -233,6 +234,8 @@ def make_thin_walls(
         most = walls[solid.motion is not None]
         if crossing:
             most = SHEET if is_body else BARRIER
+            if is_body and is_thin_in_parts(shape, most * dx, grid.device):
+                return False
         fills = solid.motion is None and fills_cells(shape, grid, DEEP)
         return is_thin(shape, most * dx, grid.device) and not fills
 
@@ -240,7 +243,21 @@ def make_thin_walls(
     if not any(thin):
         return None
     ends = side_bits(periodic_sides(scene.endless))
-    return ThinWalls(grid, placed, thin, open_sides | ends, scene.endless)
+    in_parts = [
+        crossing
+        and is_one
+        and is_thin_in_parts(solid.geometry, BARRIER * grid.spacing, grid.device)
+        for solid, is_one in zip(placed, thin, strict=True)
+    ]
+    return ThinWalls(
+        grid,
+        placed,
+        thin,
+        open_sides | ends,
+        scene.endless,
+        in_parts=in_parts,
+        thickness=BARRIER * grid.spacing,
+    )
 
 
 @dataclass(frozen=True)
