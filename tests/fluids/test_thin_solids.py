@@ -237,3 +237,35 @@ def test_a_mesh_that_is_thin_in_parts_cuts_cells_elsewhere(tmp_path: Path) -> No
     assert not barriers.near.numpy()[:, : int(ends[4] / CELL) - 4].any()
     partly = [((open_.numpy() > 0.0) & (open_.numpy() < 1.0)).any() for open_ in cut.open]
     assert all(partly)
+
+
+@pytest.mark.parametrize("angle", [0.0, 27.0])
+@pytest.mark.parametrize("thickness", [0.05, 0.3, 0.9])
+def test_a_surface_mesh_ends_at_both_sides_of_a_sheet(thickness: float, angle: float) -> None:
+    low, high = 0.52, 0.52 + thickness * CELL
+    place = {"rotate": [0.0, 0.0, angle], "translate": [0.5, 0.3, 0.0]}
+    sheet = box([low - 0.52, -1.0, -0.1], [high - 0.52, 1.0, 0.6], **place)
+    simulation = create(
+        scene(
+            size=[1.0, 1.0, 0.5],
+            resolution=CELLS,
+            liquid=[box([0.0, 0.0, 0.0], [1.0, 0.5, 0.5])],
+            solid=[sheet],
+            output={"surface": True},
+        )
+    )
+    mesh = simulation.surface_mesh.find(simulation.particles.position)
+    points = mesh.points.numpy().astype(np.float64)
+    triangles = points[mesh.corners.numpy().reshape(-1, 3)]
+    # Distance from the middle of the sheet along its normal.
+    turn = np.deg2rad(angle)
+    normal = np.array([np.cos(turn), np.sin(turn), 0.0])
+    away = (triangles - np.array([0.5, 0.3, 0.0])) @ normal - 0.5 * (high - low)
+    assert not ((away.min(axis=1) < -1e-6) & (away.max(axis=1) > 1e-6)).any()
+    # Both sides reach the sheet: no film of air is left.
+    for side in (-1.0, 1.0):
+        gap = (side * away)[side * away > 0.0].min() - 0.5 * (high - low)
+        assert -0.5 * (high - low) - 1e-6 <= gap + 0.03 * CELL < 0.02 * CELL
+    volume = np.einsum("ij,ij->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6.0
+    taken = (high - low) * 0.5 / np.cos(turn) * 0.5
+    assert volume == pytest.approx(0.25 - taken, rel=0.01)

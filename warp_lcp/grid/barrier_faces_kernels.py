@@ -269,6 +269,21 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
     share[k, j, i] = result
 
 
+@cell_kernel("warp_lcp.grid.barriers.room")
+def room_kernel(k, j, i, B: Barrier, room: F32):
+    """Limit the distance of a cell to solids [cells] by that to thin solids.
+
+    These count as thicker by half a cell on each side: then each line of cell centers that crosses
+    one has a center in it.
+    """
+    reach = wp.max(room[k, j, i] + 0.5, 0.0)
+    if reach > 0.0:
+        reach = wp.min(reach, REACH)
+        found, _n, d = nearest_wall(B, place_of(B, CENTERS, k, j, i), reach * B.dx)
+        if found > 0:
+            room[k, j, i] = wp.min(room[k, j, i], d / B.dx - 0.5)
+
+
 @cell_kernel(MODULE)
 def capacity_kernel(k, j, i, share: F32, cuts: bool, capacity: F32):
     """Reduce the open share of a cell's kernel to what its center sees.

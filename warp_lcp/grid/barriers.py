@@ -78,9 +78,9 @@ class Barriers:
         self.number, self._share, self._scratch = grid.faces(wp.int16), grid.field(), grid.faces()
         self.below, self.above = grid.faces(), grid.faces()
         self._share.fill_(1.0)
-        self._barrier = self._barrier_of(walls.shapes)
+        self._barrier = self._barrier_of(grid, walls.shapes)
         # Barriers are only near the thin parts of solids.
-        self._thin = self._barrier_of(walls.thin_shapes)
+        self._thin = self._barrier_of(grid, walls.thin_shapes)
         margin = np.full(3, MARGIN * grid.spacing)
         self._sides = wp.vec3(*margin), wp.vec3(*(grid.extent - margin))
         self.calm = grid.field(wp.int8)
@@ -88,9 +88,9 @@ class Barriers:
         self._aim = wp.empty(0, dtype=wp.vec3, device=grid.device)
         self._place()
 
-    def _barrier_of(self, shapes: wp.array) -> Barrier:
-        """Return shapes of the solids and the grid, as kernels take them."""
-        barrier, grid = Barrier(), self.grid
+    def _barrier_of(self, grid: StaggeredGrid, shapes: wp.array) -> Barrier:
+        """Return shapes of the solids and a grid, as kernels take them."""
+        barrier = Barrier()
         barrier.shapes, barrier.groups, barrier.near = shapes, self.walls.groups, self.near
         barrier.planes, barrier.dx = grid.planes, grid.spacing
         barrier.origin = wp.vec3i(*grid.origin)
@@ -168,6 +168,16 @@ class Barriers:
                 faces_kernels.wall_velocity_kernel,
                 [self._barrier, axis, number, cut.turn, cut.shift, velocity],
             )
+
+    def limit_room(self, lattice: StaggeredGrid, room: wp.array) -> None:
+        """Limit the distance to solids by that to the thin ones, which count as thicker.
+
+        Args:
+            lattice: a finer grid of the same region.
+            room: distance at its cells' centers [lattice cells], float32 (updated).
+        """
+        barrier = self._barrier_of(lattice, self.walls.shapes)
+        lattice.domain.launch(faces_kernels.room_kernel, [barrier, room])
 
     def enter(self, index: wp.array) -> None:
         """Mark whole cells as the solids' cells.

@@ -318,7 +318,9 @@ def make_surface_mesh(
         per_axis=scene.particles.per_axis,
         resolution=scene.output.surface_resolution,
         smoothing=scene.output.surface_smoothing,
-        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves, boundary.shapes)
+        obstacles=Obstacles(
+            boundary.base, boundary.distance, boundary.moves, boundary.shapes, grid.barriers
+        )
         if scene.solid
         else None,
     )
