@@ -13,13 +13,13 @@ import warp as wp
 from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledProxy
 
+from warp_lcp.extras.newton.bodies import WorldBodies
+from warp_lcp.extras.newton.shapes import geometries, reaches_into, united
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 from warp_lcp.fluids.scene import COUPLED_METHODS
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.particle_assembly import placed_solids
 from warp_lcp.material.particle_log import Row
-from warp_lcp.newton.bodies import WorldBodies
-from warp_lcp.newton.shapes import geometries, reaches_into, united
 from warp_lcp.scene.scene_file import SceneSource, load_scene
 from warp_lcp.scene.shapes import SolidSphere
 from warp_lcp.simulation import StepFailed

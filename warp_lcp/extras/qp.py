@@ -56,7 +56,7 @@ def register() -> None:
         import qpsolvers.solvers as there
     except ImportError as missing:
         raise ImportError(
-            "warp_lcp.qp needs qpsolvers: pip install 'warp-lcp[qpsolvers]' (or pip install "
+            "warp_lcp.extras.qp needs qpsolvers: pip install 'warp-lcp[qpsolvers]' (or pip install "
             "qpsolvers)"
         ) from missing
     there.solve_function[NAME] = solve_problem
