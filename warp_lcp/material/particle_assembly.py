@@ -47,7 +47,7 @@ from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
 from warp_lcp.rigid.obstacles import domain_walls, obstacle
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import SolidProperties
+from warp_lcp.scene.shapes import Shape, SolidProperties
 
 
 def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
@@ -526,7 +526,7 @@ def start_band(
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
     """Return a mask of stored cells near a source or a drain; None without both."""
-    regions = [*scene.source, *scene.drain]
+    regions: list[Shape] = [*scene.source, *scene.drain]
     if not regions:
         return None
     near = np.zeros(grid.shape, dtype=bool)
