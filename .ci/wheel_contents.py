@@ -2,7 +2,8 @@
 
 The wheel is built from a checkout, from the source distribution, and from a checkout without
 symbolic links, as git makes it on Windows. All three wheels must hold the sources, headers and
-tables of `warp_lcp`, and nothing else. Run this program in the repository by a Python with
+tables of `warp_lcp`, and nothing else; the source distribution holds all that is tracked, tests and
+docs among it. Run this program in the repository by a Python with
 setuptools: `python .ci/wheel_contents.py FOLDER`; the wheel goes into FOLDER.
 """
 
@@ -15,6 +16,8 @@ from zipfile import ZipFile
 
 LINKED = ("fluids", "granular", "benchmarks")
 SHIPPED = (".py", ".h", ".toml", ".html", ".typed")
+# The links' folders are in source distributions at the top alone.
+NOT_IN_SDIST = {".gitignore", ".pre-commit-config.yaml", *(f"warp_lcp/{name}" for name in LINKED)}
 
 
 def tracked() -> list[Path]:
@@ -63,6 +66,10 @@ def main(folder: Path) -> None:
     checkout = copied(folder / "checkout", links=True)
     with tarfile.open(built(checkout, "sdist", folder / "sdist")) as archive:
         archive.extractall(folder / "unpacked", filter="data")
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    left_out = {str(name) for name in tracked()} - packed - NOT_IN_SDIST
+    if left_out:
+        sys.exit(f"the source distribution lacks {sorted(left_out)}: see MANIFEST.in")
     trees = {
         "checkout": checkout,
         "sdist": next((folder / "unpacked").iterdir()),

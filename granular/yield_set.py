@@ -1,4 +1,7 @@
-"""Yield set of sand: layout of the stress fields, parameters, kernels.
+"""Yield set (friction cone) of sand: layout of stress fields, parameters, kernels.
+
+The projection onto it is the snippet `yield` of `headers/sand.h`; each step of a stress solve
+applies it to each cell.
 
 All stresses are impulses over rho dx [m/s]: x = kick_dt p / (rho dx), and the shear stresses alike,
 so that equations contain neither spacing nor time step. A field of stresses has layers of the

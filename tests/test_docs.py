@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
-from code_blocks import blocks, run
+from code_blocks import blocks, links, run
 from warp_lcp.problem.protocol import CAPABILITIES, families, members
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.registry import grid_methods
@@ -85,6 +85,21 @@ def test_capabilities_have_their_rows():
         )
         expected.append((capability.__name__, names, ", ".join(having) or "-", asked or "-"))
     assert rows == expected
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "design").glob("*.md")), ids=lambda page: page.stem)
+def test_design_notes_are_a_page_each(page):
+    lines = page.read_text().splitlines()
+    assert len(lines) <= 80
+    assert max(map(len, lines)) <= 100
+    if page.stem == "index":
+        assert {other.name for other in page.parent.glob("*.md")} == {page.name, *links(page)} - {
+            link for link in links(page) if "/" in link
+        }
+        return
+    headings = [line.removeprefix("## ") for line in lines if line.startswith("## ")]
+    expected = ["Problem", "Decision", "How it works", "Tried and rejected", "What it costs"]
+    assert [name for name in headings if name != "What it is worth"] == [*expected, "Reconsider"]
 
 
 def test_prices_name_methods():

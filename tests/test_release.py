@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from warp_lcp.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT, BUILD = SETTINGS["project"], SETTINGS["build-system"]
 CITATION = (ROOT / "CITATION.cff").read_text()
 RECIPE = (ROOT / ".ci" / "conda" / "recipe.yaml").read_text()
 CONTAINER, BATCH = ((ROOT / "deploy" / name).read_text() for name in ("Containerfile", "slurm.sh"))
@@ -26,13 +27,21 @@ def test_versions_and_licenses_agree():
     assert re.search(r"^license: (.*)$", CITATION, flags=re.M)[1] == PROJECT["license"]
     assert f"license: {PROJECT['license']}\n" in RECIPE
     assert PROJECT["description"] in CITATION
-    assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+    newest = re.search(r"^## \[(.*?)\] - (\S+)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.M)
+    assert newest[1] == PROJECT["version"]
+    assert re.search(r"^date-released: (.*)$", CITATION, flags=re.M)[1] == newest[2]
 
 
 def test_the_recipe_wants_what_the_package_wants():
     run = RECIPE.split("  run:\n")[1].split("\n\n")[0]
     wanted = [line.strip().removeprefix("- ").replace(" ", "") for line in run.splitlines()]
     assert wanted == [f"python{PROJECT['requires-python']}", *PROJECT["dependencies"]]
+    host = RECIPE.split("  host:\n")[1].split("  run:\n")[0].replace(" ", "")
+    assert host.split() == [
+        f"-python{PROJECT['requires-python']}",
+        "-pip",
+        *(f"-{wanted}" for wanted in BUILD["requires"]),
+    ]
     (script,) = PROJECT["scripts"].items()
     assert f"- {script[0]} = {script[1]}\n" in RECIPE
 

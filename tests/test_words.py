@@ -15,7 +15,14 @@ from warp_lcp import gallery
 from warp_lcp.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
+PAGES = sorted(
+    [
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "docs" / "design").glob("*.md"),
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+    ]
+)
 LONGEST = 80  # characters of a summary line
 # A summary line begins with a noun or a verb.
 RIDDLES = {"what", "which", "how", "who", "that", "in", "of", "where", "when"}

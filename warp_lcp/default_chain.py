@@ -63,8 +63,6 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
     - After `PrimalDualActiveSet`, `MinimumMapNewton` (not on dense matrices), then as above.
     - `Staggering` without methods for its blocks gets `MinimumMapNewton` for each block, with
       `InteriorPoint` and `ProximalPoint` after it as above.
-    - `Staggering` without methods for its blocks: `MinimumMapNewton` in each block, then
-      `InteriorPoint` and `ProximalPoint` as above.
 
     Args:
         method: the first method.

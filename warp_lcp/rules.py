@@ -1,4 +1,4 @@
-"""Decision table of `wl.solve` and `wl.recommend`; rows are tried in order.
+"""Default method: decision table of `wl.solve` and `wl.recommend`, tried in order.
 
 Each row has a condition and the solves to attempt: a method, the form of the matrix that it works
 on, and a limit of steps. `default_chain` lists the methods that take over within a solve.

@@ -18,8 +18,10 @@ NOTEBOOK = re.compile(r"\]\(((?:\.\./)?[\w-]+)\.ipynb\)")  # link to a notebook
 FONT = "STIXTwoMath-Regular.ttf"  # font of ziamath; docs/site.css names it
 # Script that the plug-in `offline` loads for the search, and our copy.
 SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"
-# Link from a page directly under docs to a file of the repository.
+# Link from a page directly under docs to a file of the repository, and from one in a folder there.
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")
+FURTHER_OUTSIDE = re.compile(r"\]\(\.\./\.\./([^)#\s]+)(#[^)]*)?\)")
+FOLDERS = ("api/", "design/")  # of pages under docs; others are files of the repository
 # Output of pymdownx.arithmatex for $...$ and $$...$$.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[([](.*?)\\[])]</\1>', flags=re.S)
 
@@ -46,16 +48,19 @@ def page_of_notebook(text: str, name: str) -> tuple[str, dict[str, bytes]]:
     return "\n\n".join(parts) + "\n", pictures
 
 
-def outside_links(text: str) -> set[str]:
+def outside_links(text: str, *, in_folder: bool = False) -> set[str]:
     """Return the repository files, relative to its root, that a page links to.
 
-    The page is directly under docs.
+    The page is directly under docs, or in a folder there.
     """
-    return {match[1] for match in OUTSIDE.finditer(text)}
+    pattern = FURTHER_OUTSIDE if in_folder else OUTSIDE
+    return {match[1] for match in pattern.finditer(text)}
 
 
-def inside(text: str) -> str:
+def inside(text: str, *, in_folder: bool = False) -> str:
     """Return the page with these links made links within the site."""
+    if in_folder:
+        return FURTHER_OUTSIDE.sub(r"](../\1\2)", text)
     return OUTSIDE.sub(r"](\1\2)", text)
 
 
@@ -80,7 +85,10 @@ def on_files(files: Any, config: Any) -> Any:
             abs_src_path=str(distribution("ziamath").locate_file(f"ziamath/fonts/{FONT}")),
         )
     )
-    wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
+    wanted = set().union(
+        *(outside_links(page.read_text()) for page in docs.glob("*.md")),
+        *(outside_links(page.read_text(), in_folder=True) for page in docs.glob("*/*.md")),
+    )
     wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))
     for name in sorted(wanted):
         path = root / name
@@ -102,7 +110,10 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Make links out of docs, and to notebooks, links within the site."""
-    return NOTEBOOK.sub(r"](\1.md)", markdown if "/" in page.file.src_uri else inside(markdown))
+    depth = page.file.src_uri.count("/")
+    if depth == 0 or page.file.src_uri.startswith(FOLDERS):
+        markdown = inside(markdown, in_folder=depth > 0)
+    return NOTEBOOK.sub(r"](\1.md)", markdown)
 
 
 def formula(found: re.Match[str]) -> str:

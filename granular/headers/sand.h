@@ -102,7 +102,7 @@ auto shear = [&](int d, long long o, T by) {
     u[b][o - s[a]] += (T)inverse[b][o - s[a]] * by;
 };
 
-// snippet yield: Nearest point of { |n|^2 / 2 + sum over shears of max_q b_q^2 <= r^2 } in the
+// snippet yield: Projection onto the friction cone |n|^2 / 2 + sum_shears max_q b_q^2 <= r^2 in the
 // metric |n|^2 / 2 + sum of b_q^2 / 4. With a multiplier mu, n shrinks by 1 + mu, and the largest
 // |b_q| of a shear are cut to m = max_n S_n / (n + 4 mu), S_n the sum of the n largest of the four.
 // mu is the root of 1/r - 1/sqrt(|n|^2/2 + sum m^2), which is nearly linear in mu. The box of

@@ -1,4 +1,4 @@
-"""Ghost cells at the cuts between ranks, filled by PETSc."""
+"""Halo exchange: ghost cells at the cuts between ranks, filled by PETSc."""
 
 from __future__ import annotations
 

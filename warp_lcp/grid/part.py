@@ -353,9 +353,7 @@ class GridPart:
         parts: int = 1,
         forest: Any = None,
     ) -> None:
-        """Fill the ghost cells of fields from the processes that own them; collective.
-
-        This is the halo exchange.
+        """Halo exchange: fill the ghost cells of fields from their owners; collective.
 
         Args:
             fields: arrays of any types, or stacks of equally many layers; the last axes are z, y,

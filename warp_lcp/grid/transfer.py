@@ -1,4 +1,4 @@
-"""Particles to grid and grid to particles: PIC, FLIP and APIC, tent weights.
+"""Particles to grid (P2G), grid to particles (G2P): PIC, FLIP, APIC, tent weights.
 
 APIC [Jiang et al. 2015] carries the gradient of each component. With multilinear weights on faces
 its momentum a node is m_i v_i = sum_p w_ip m_p (v_p + c_p . (x_i - x_p)) and the gradient on the
@@ -78,7 +78,7 @@ def particles_to_faces(
     offsets: wp.array | None = None,
     runs: wp.array | None = None,
 ) -> None:
-    """Particles to grid: average the particles' velocities on the faces.
+    """Particles to grid (P2G): average the particles' velocities on the faces.
 
     All particles have the same weight.
 

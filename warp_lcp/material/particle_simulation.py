@@ -236,7 +236,7 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.regrid(grid)
 
     def stable_dt(self) -> float:
-        """Return the stable time step CFL dx / (v_max + sqrt(CFL g dx)) [s].
+        """Return the CFL time step: CFL dx / (v_max + sqrt(CFL g dx)) [s].
 
         v_max is the largest speed of the material, and of solids and sources in the near future.
         """
@@ -370,7 +370,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return totals.max_speed + self.kick_dt * math.sqrt(self.gravity @ self.gravity)
 
     def particles_to_grid(self, window: Window) -> None:
-        """Transfer particle velocities to the faces, and apply gravity for `kick_dt`."""
+        """Transfer particle velocities to the faces (P2G); apply gravity for `kick_dt`."""
         p = self.particles
         with self.watch.stage(
             "particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights
@@ -499,7 +499,7 @@ class ParticleSimulation(ParticleCheckpoints):
                 )
 
     def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
-        """Find airborne bodies, and transfer the faces' velocity to the particles.
+        """Find airborne bodies; transfer the faces' velocity to the particles (G2P).
 
         Args:
             window: window of the step.

@@ -1,4 +1,11 @@
-"""Checkpoints: the complete state of a run, as plain arrays in an .npz file."""
+"""Checkpoint format: the complete state of a run, as plain arrays in an .npz file.
+
+Format 2: `step_000120.npz` has an array `meta`, a JSON text with format, digest of the scene, step,
+time [s], keys of the scene and a checksum of the state; and an array `state/NAME` for each of
+`Simulation.state`, without pickles. On ranks each state lies in `rank_0003/step_000120.npz`, and
+`state/pieces_of_ranks` of `step_000120.npz` has their checksums. Files of another format are
+refused.
+"""
 
 from __future__ import annotations
 

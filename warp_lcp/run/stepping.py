@@ -1,4 +1,4 @@
-"""Choose the time step; repeat a failed step with half its length."""
+"""Choose the time step (CFL number); repeat a failed step with half its length."""
 
 from __future__ import annotations
 
