@@ -173,7 +173,9 @@ class ClosedSurface:
         return float(area[self._is_thin(thickness, device)].sum() / area.sum())
 
     def thin_part(self, thickness: float, device: wp.Device) -> wp.Mesh:
-        """Return the triangles where the solid is thinner than `thickness`, as a mesh of queries.
+        """Return the triangles on thin parts as a mesh for Warp queries.
+
+        Parts are thin if the solid is thinner than `thickness`, in the mesh's units.
 
         Coordinates are those of `on_device`. At least one triangle must be thin.
         """
