@@ -99,8 +99,10 @@ A shape has a `shape` and its keys, all of them required:
 MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is
 positive. Vertices closer than a millionth of its size are merged, triangles without area are
 dropped, and triangles and parts that are inside out are flipped; `warp-lcp check` and `run` report
-this. Intersecting and nested parts stay, but such a mesh cannot be a rigid body. Open and one-sided
-surfaces are refused, and those of which more than 1 % stays inside out.
+this. Intersecting and nested parts stay, but such a mesh cannot be a rigid body. One-sided surfaces
+are refused, and those of which more than 1 % stays inside out. An open mesh is refused, unless
+`thickness` is given: then it is the middle of a wall, which may be
+[thinner than a cell](liquids.md#walls-thinner-than-cells).
 """
 
 MOVING = """## Motions

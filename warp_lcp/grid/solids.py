@@ -460,6 +460,7 @@ class TriangleMesh(_Shape):
         folder: Path | None = None,
         placement: Placement | None = None,
         invert: bool = False,
+        thickness: float | None = None,
     ) -> TriangleMesh:
         """Read an OBJ, STL or PLY file, or a built-in mesh.
 
@@ -470,14 +471,16 @@ class TriangleMesh(_Shape):
             folder: where relative paths start; the working directory without it.
             placement: placement of the shape.
             invert: make it everything but the inside.
+            thickness: the file is an open mesh, the middle of a wall of this thickness [m] as
+                placed.
 
         Raises:
             ValueError: the file is missing or not a closed surface; the message names the file and
-                what to do.
+                what to do. With `thickness`, it is a closed surface.
         """
-        return cls(
-            surface=load_surface(file, folder), placement=placement or Placement(), invert=invert
-        )
+        place = placement or Placement()
+        wall = None if thickness is None else thickness / place.scale
+        return cls(surface=load_surface(file, folder, wall), placement=place, invert=invert)
 
     @property
     def volume(self) -> float:

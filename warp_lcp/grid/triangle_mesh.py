@@ -198,17 +198,99 @@ class ClosedSurface:
         return np.asarray(out.numpy() < np.float32(reach))
 
 
-def load_surface(file: str, folder: Path | None = None) -> ClosedSurface:
+def load_surface(
+    file: str, folder: Path | None = None, thickness: float | None = None
+) -> ClosedSurface:
     """Return the surface named by a scene: a path or `builtin:` and a name.
 
     Paths are relative to `folder`.
 
+    Args:
+        file: the path or name.
+        folder: folder of relative paths; the working directory without it.
+        thickness: the file is an open mesh, the middle of a wall of this thickness, in the mesh's
+            units.
+
     Raises:
-        ValueError: there is no such file or builtin mesh, or it is not a closed surface.
+        ValueError: there is no such file or builtin mesh, or it is not a closed surface; with
+            `thickness`, it is one.
     """
     if file.startswith(BUILTIN_PREFIX):
+        if thickness is not None:
+            raise ValueError(f"{file}: thickness is for open meshes, and this mesh is closed")
         return builtin_mesh(file.removeprefix(BUILTIN_PREFIX))
-    return read_mesh((folder or Path()) / Path(file).expanduser())
+    path = (folder or Path()) / Path(file).expanduser()
+    if thickness is None:
+        return read_mesh(path)
+    vertices, triangles = read_triangles(path)
+    return close_surface(*thickened(vertices, triangles, thickness, str(path)), str(path))
+
+
+def thickened(
+    vertices: np.ndarray, triangles: np.ndarray, thickness: float, name: str
+) -> Triangles:
+    """Return the closed surface of a wall whose middle is an open mesh.
+
+    The mesh is shifted by half the thickness to both sides along the normals of its vertices. A
+    strip joins both copies along the edges of the mesh. At a fold the shift is longer, so that both
+    faces keep their distance: n / (n . m), where n is the vertex's normal and m that of the face
+    with the largest angle to it, at most twice.
+
+    Args:
+        vertices: shape (n, 3).
+        triangles: vertex indices, shape (m, 3).
+        thickness: of the wall, in the units of the vertices.
+        name: name of the mesh in messages.
+
+    Raises:
+        ValueError: the mesh is closed, has one side only, more than two triangles meet at an edge,
+            or the thickness is not more than the distance at which vertices are merged.
+    """
+    vertices, triangles = weld(np.asarray(vertices, dtype=np.float64), np.asarray(triangles))
+    triangles = triangles[~_flat(vertices, triangles)]
+    least = 10.0 * WELD * _diagonal(vertices)
+    if not thickness > least:
+        raise ValueError(
+            f"{name}: thickness = {thickness:.3g} in units of the mesh: must be more than a "
+            f"hundred-thousandth of its diagonal, {least:.3g}"
+        )
+    edge, forward, uses = _edges(triangles)
+    if (uses > 2).any():
+        where = _first(vertices[triangles[(uses[edge] > 2).reshape(-1, 3).any(axis=1)]])
+        raise ValueError(
+            f"{name}: at an edge more than two triangles of the open mesh meet, {where}"
+        )
+    if (uses == 2).all():
+        raise ValueError(f"{name}: thickness is for open meshes, and this mesh is closed")
+    turn = _disagreeing(triangles, edge, forward, uses, name)
+    triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
+    areas = _double_areas(vertices, triangles)
+    faces = areas / np.linalg.norm(areas, axis=1, keepdims=True)
+    normal = np.zeros_like(vertices)
+    for corner in range(3):
+        # Faces count by their angle at the vertex: how a face is split does not matter.
+        here, after, before = (np.roll(triangles, -corner, axis=1)[:, n] for n in range(3))
+        one, other = vertices[after] - vertices[here], vertices[before] - vertices[here]
+        angle = np.arctan2(
+            np.linalg.norm(np.cross(one, other), axis=1), np.einsum("ij,ij->i", one, other)
+        )
+        np.add.at(normal, here, angle[:, None] * faces)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    least_cosine = np.ones(len(vertices))
+    for corner in range(3):
+        along = np.einsum("ij,ij->i", faces, normal[triangles[:, corner]])
+        np.minimum.at(least_cosine, triangles[:, corner], along)
+    shift = 0.5 * thickness * normal / np.maximum(least_cosine, 0.5)[:, None]
+    # Edges of one triangle, in its direction.
+    sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
+    edge, _, uses = _edges(triangles)
+    a, b = sides[uses[edge] == 1].T
+    n = len(vertices)
+    strip = np.concatenate([np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)])
+    return (
+        np.concatenate([vertices + shift, vertices - shift]),
+        np.concatenate([triangles, triangles[:, ::-1] + n, strip]),
+    )
 
 
 def builtin_mesh(name: str) -> ClosedSurface:
@@ -419,7 +501,7 @@ def _check_closed(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Non
             "so inside and outside are undefined "
             "and the material would leak through. "
             "Fill the holes (in Blender: Mesh > Clean Up > Merge by Distance, Fill Holes; in "
-            "MeshLab: Close Holes)"
+            "MeshLab: Close Holes), or give its thickness if it is the middle of a wall"
         )
 
 

@@ -274,11 +274,21 @@ class PlaneTable(Shape):
 
 
 class MeshTable(Shape):
-    """Interior of a closed triangle surface; in 2-D its cut by the plane z = 0."""
+    """Interior of a closed triangle surface; in 2-D its cut by the plane z = 0.
+
+    An open surface with a thickness is a wall.
+    """
 
     shape: Literal["mesh"] = "mesh"
     file: str = Field(
         min_length=1, description=f"OBJ, STL or PLY file, or built-in, such as {BUILTIN}torus"
+    )
+    thickness: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=1e9,
+        description="thickness of the wall whose middle is an open mesh [m]; without it the mesh "
+        "must be closed",
     )
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
@@ -286,7 +296,11 @@ class MeshTable(Shape):
         from warp_lcp.grid import solids
 
         return solids.TriangleMesh.from_file(
-            self.file, folder=folder, placement=self.placement(dimension), invert=self.invert
+            self.file,
+            folder=folder,
+            placement=self.placement(dimension),
+            invert=self.invert,
+            thickness=self.thickness,
         )
 
     def bounds(self, dimension: int) -> np.ndarray | None:
