@@ -93,7 +93,7 @@ counterclockwise; in 3-D a shape is rotated about the fixed axes x, then y, then
 
 SHAPED = """## Shapes
 
-A shape has a `shape` and its keys, all of them required:
+A shape has a `shape` and its keys, all of them required but `thickness`:
 """
 
 MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is
