@@ -15,8 +15,8 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.gallery import Plant, Problem, planted
-from warp_lcp.gallery.contact_models import StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import SCENES, contact_scene
+from warp_lcp.rigid.contact_models import StewartTrinkleModel
 
 ACCURACIES = (1e-2, 1e-4, 1e-6, 1e-8)
 DEVICE = "cpu"

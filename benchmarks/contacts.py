@@ -20,15 +20,15 @@ from warp_lcp.benchmarks.harness.record import (
     Results,
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.gallery.contact_models import (
+from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
+from warp_lcp.gallery.contact_stepper import ContactStepper
+from warp_lcp.gallery.rigid_world import Assembly, World
+from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
     ContactSystem,
     StewartTrinkleModel,
 )
-from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
-from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.gallery.rigid_world import Assembly, World
 
 TITLE = "Rigid contacts: the scenes of figures 2.9 and 2.11"
 DT = 0.01  # [s]

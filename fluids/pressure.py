@@ -13,9 +13,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp import recorded_problem
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
-from warp_lcp.gallery import recorded
 from warp_lcp.grid.advection import FaceVelocity
 from warp_lcp.grid.staggered import (
     ActiveWindow,
@@ -474,7 +474,7 @@ class PressureProjection:
         )
 
     def recorded(self, speed: float) -> dict[str, np.ndarray]:
-        """Return the prepared problem in the format of `warp_lcp.gallery.recorded`.
+        """Return the prepared problem in the format of `warp_lcp.recorded_problem`.
 
         Step, time and dt are added by the simulation.
 
@@ -488,7 +488,7 @@ class PressureProjection:
             "absolute_tolerance": criteria.atol,
             "spacing": self.grid.spacing,
         }
-        return recorded.arrays(self._problem, self._start) | {
+        return recorded_problem.arrays(self._problem, self._start) | {
             name: np.array(value) for name, value in numbers.items()
         }
 

@@ -12,7 +12,7 @@ from warp_lcp.fluids.tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
-from warp_lcp.scene.shapes import MaterialProperties, SourceProperties
+from warp_lcp.scene.shapes import LiquidProperties, MaterialProperties, SourceProperties
 from warp_lcp.scene.suspicious_settings import LIQUID_DENSITY, UsualRange
 from warp_lcp.settings import Positive
 
@@ -192,9 +192,13 @@ class LiquidScene(ParticleScene):
         """Return errors of settings that need viscosity or exclude it."""
         if self.viscosity is not None and self.endless:
             return [Complaint(("viscosity",), None, "cannot be combined with periodic axes")]
+        tables: dict[str, Sequence[LiquidProperties | SourceProperties]] = {
+            "liquid": self.liquid,
+            "source": self.source,
+        }
         own = [
             (key, n, shape.viscosity)
-            for key, shapes in (("liquid", self.liquid), ("source", self.source))
+            for key, shapes in tables.items()
             for n, shape in enumerate(shapes)
         ]
         own = [given for given in own if given[-1] is not None]
@@ -229,9 +233,8 @@ class LiquidScene(ParticleScene):
         self, materials: Sequence[MaterialProperties | SourceProperties]
     ) -> list[float] | None:
         """Return viscosities relative to `viscosity.value`; None if all are equal."""
-        if self.viscosity is None or all(
-            shape.viscosity is None for shape in (*self.liquid, *self.source)
-        ):
+        liquids: list[LiquidProperties | SourceProperties] = [*self.liquid, *self.source]
+        if self.viscosity is None or all(shape.viscosity is None for shape in liquids):
             return None
         return [
             (getattr(shape, "viscosity", None) or self.viscosity.value) / self.viscosity.value

@@ -16,17 +16,9 @@ from warp_lcp.scene.scene import PRESET_KEY, Complaint, Domain, Table, Time
 from warp_lcp.scene.shapes import (
     FRICTIONS,
     STICKS,
-    BoxTable,
-    CapsuleTable,
     MaterialProperties,
-    MeshTable,
-    PlaneTable,
-    SolidBox,
-    SolidCapsule,
-    SolidMesh,
-    SolidPlane,
-    SolidSphere,
-    SphereTable,
+    OfAnyShape,
+    SolidProperties,
     WallFriction,
 )
 from warp_lcp.scene.suspicious_settings import GRAIN_DENSITY, UsualRange
@@ -180,6 +172,7 @@ class SandSolver(Table):
 class SandProperties(MaterialProperties):
     """Properties of a body of sand besides its shape."""
 
+    noun: ClassVar[str] = "Sand"
     friction_angle: Angle | None = Field(
         default=None, description="friction angle [degrees]; default: material.friction_angle"
     )
@@ -188,58 +181,15 @@ class SandProperties(MaterialProperties):
     )
 
 
-class SandBox(SandProperties, BoxTable):
-    """Box of sand."""
+class RoughProperties(SolidProperties):
+    """Properties of a solid that has friction with sand."""
 
-
-class SandSphere(SandProperties, SphereTable):
-    """Ball of sand."""
-
-
-class SandCapsule(SandProperties, CapsuleTable):
-    """Capsule of sand."""
-
-
-class SandPlane(SandProperties, PlaneTable):
-    """Half space of sand."""
-
-
-class SandMesh(SandProperties, MeshTable):
-    """Sand inside a triangle mesh."""
-
-
-class RoughSolid(Table):
-    """Friction of a solid in sand."""
-
+    noun: ClassVar[str] = "Solid with friction"
     rubs: ClassVar[bool] = True
 
 
-class RoughBox(RoughSolid, SolidBox):
-    """Solid box with friction."""
-
-
-class RoughSphere(RoughSolid, SolidSphere):
-    """Solid ball with friction."""
-
-
-class RoughCapsule(RoughSolid, SolidCapsule):
-    """Solid capsule with friction."""
-
-
-class RoughPlane(RoughSolid, SolidPlane):
-    """Solid half space with friction."""
-
-
-class RoughMesh(RoughSolid, SolidMesh):
-    """Solid inside a triangle mesh, with friction."""
-
-
-Sand = Annotated[
-    SandBox | SandSphere | SandCapsule | SandPlane | SandMesh, Field(discriminator="shape")
-]
-Solid = Annotated[
-    RoughBox | RoughSphere | RoughCapsule | RoughPlane | RoughMesh, Field(discriminator="shape")
-]
+Sand = OfAnyShape[SandProperties]
+Solid = OfAnyShape[RoughProperties]
 
 
 def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[Complaint]:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 
-from warp_lcp.gallery.articulated_figure import (
+from warp_lcp.contacts.articulated_figure import (
     ArticulatedFigure,
     branching_figure,
     planar_chain,
     spatial_chain,
 )
-from warp_lcp.gallery.inverse_kinematics import InverseKinematics, ReachedPose
+from warp_lcp.contacts.inverse_kinematics import InverseKinematics, ReachedPose
 
 SAME = 1e-6  # of reach^2: objectives with a smaller difference are one optimum
 OUTSIDE = 1e-9  # [rad] tolerance beyond the limits

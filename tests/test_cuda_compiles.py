@@ -15,7 +15,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
+from warp_lcp.extras.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure import pressure_passes
 from warp_lcp.fluids.surface_tension_kernels import push_pass
 from warp_lcp.fluids.viscosity_passes import viscous_passes
@@ -349,7 +349,7 @@ def family(name):
 def modules_of_every_kernel(reals):
     """Instantiate all kernels; return the names of their modules."""
     for found in pkgutil.walk_packages(wl.__path__, "warp_lcp."):
-        if not found.name.startswith(("warp_lcp.benchmarks.", "warp_lcp.newton.")):
+        if not found.name.startswith(("warp_lcp.benchmarks.", "warp_lcp.extras.newton.")):
             importlib.import_module(found.name)
     use_every_kernel(reals)
     for cut in (False, True):

@@ -127,7 +127,7 @@ def test_python_examples_run(page, code, capsys):
         pytest.importorskip("petsc4py", reason="PETSc is missing")
     if "gradients.pytorch" in code:
         pytest.importorskip("torch", reason="PyTorch is missing")
-    if "warp_lcp.newton" in code:
+    if "warp_lcp.extras.newton" in code:
         pytest.importorskip("newton", reason="newton is missing")
     run(code, page)
     assert capsys.readouterr().out.startswith("CONVERGED")

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 
 from quadratic_programs import INFINITIES, draw
-from warp_lcp import qp
+from warp_lcp.extras import qp
 
 qpsolvers = pytest.importorskip("qpsolvers")
 OTHERS = [name for name in ("clarabel", "piqp") if name in qpsolvers.available_solvers]

@@ -11,10 +11,10 @@ import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp import gallery
 from warp_lcp.benchmarks.choose_problems import FAMILIES, KINDS, draw, make
-from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.recommend import LEAN, memory_of
+from warp_lcp.rigid.contact_models import BoxedModel
 from warp_lcp.rules import RULES
 from warp_lcp.traits import traits_of
 

@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from warp_lcp.gallery.inverse_kinematics import InverseKinematics
+from warp_lcp.contacts.inverse_kinematics import InverseKinematics
 from warp_lcp.gallery.planted import Plant
 from warp_lcp.granular.heavy_ball import METHODS as SAND
 from warp_lcp.grid import staggered

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from warp_lcp.default import default_method, solve
 from warp_lcp.default_chain import default_chain
 from warp_lcp.gradients.vjp import Gradients, vjp
+from warp_lcp.import_aliases import install_aliases
 from warp_lcp.kernels.log_filter import install_log_filter
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.linear_complementarity import linear_complementarity
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from warp_lcp.run.api import Run
 
 install_log_filter()
+install_aliases()
 
 try:
     __version__ = version("warp-lcp")

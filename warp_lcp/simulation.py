@@ -270,7 +270,7 @@ class Recorded(Protocol):
     """Optional interface of a simulation that records the problems it solves.
 
     Until a run sets `record`, it is None and costs nothing. Then each step calls it before its
-    solve, once an attempt, with the arrays of a file as `warp_lcp.gallery.recorded` describes them.
+    solve, once an attempt, with the arrays of a file as `warp_lcp.recorded_problem` describes them.
     Problems that no method solves are recorded too.
     """
 

@@ -23,7 +23,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import contact_scenes
-from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
+from warp_lcp.rigid.contact_models import BoxedModel, ContactSystem
 
 # Scenes in place of figure 2.3, whose scenes are dense and structured: brick walls.
 ORDERED = ("wall", "box-stack", "leaning-wall", "gear-pyramid")

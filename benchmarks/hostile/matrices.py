@@ -253,8 +253,8 @@ def friction(rng: Rng) -> HostileCase:
 
     They are scenes of the gallery as boxes, random boxes, and pyramids as LCPs.
     """
-    from warp_lcp.gallery.contact_models import BoxedModel, StewartTrinkleModel
     from warp_lcp.gallery.contact_scenes import SCENES
+    from warp_lcp.rigid.contact_models import BoxedModel, StewartTrinkleModel
 
     named = (
         "psor",

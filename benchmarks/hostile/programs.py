@@ -176,7 +176,7 @@ def solve_program(problem: Any) -> HostileAnswer:
     """Solve by qpsolvers and "warp_lcp"."""
     import qpsolvers
 
-    from warp_lcp import qp
+    from warp_lcp.extras import qp
 
     qp.register()
     solution = qpsolvers.solve_problem(problem, solver="warp_lcp")

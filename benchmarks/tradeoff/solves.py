@@ -18,7 +18,7 @@ from warp_lcp.benchmarks.extremes.exact import Exact
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.gallery.recorded import RecordedProblem, files, load
+from warp_lcp.recorded_problem import RecordedProblem, files, load
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.presets import changed

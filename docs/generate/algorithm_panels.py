@@ -18,16 +18,16 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import (
+from warp_lcp.gallery.contact_scenes import contact_scene, incline
+from warp_lcp.krylov import GMRES
+from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
     ContactSystem,
     StewartTrinkleModel,
     proximal_sweeps,
 )
-from warp_lcp.gallery.contact_scenes import contact_scene, incline
-from warp_lcp.krylov import GMRES
-from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 
 OUT = Path(__file__).parents[1] / "algorithms.png"
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=400, patience=400)

@@ -13,7 +13,7 @@ from oracle import boxed, lemke
 from warp_lcp.benchmarks.problems import cut_cells, splash
 from warp_lcp.cli import commands as cli
 from warp_lcp.cli.solve_file import MOST_ROWS
-from warp_lcp.gallery import recorded
+from warp_lcp.recorded_problem import NUMBERS
 
 
 def call(*arguments: object) -> Result:
@@ -306,7 +306,7 @@ def recorded_problem(tmp_path):
         format=1,
         **fields,
         **scene.faces,
-        **dict.fromkeys(recorded.NUMBERS, 1.0),
+        **dict.fromkeys(NUMBERS, 1.0),
     )
     return scene
 

@@ -13,8 +13,8 @@ from petsc_oracles import level_matrix, shared_problem, solve_ours, whole_field
 
 import warp_lcp as wl
 from warp_lcp.distributed.launch import petsc
-from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.extras.petsc_matrix import PetscGrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 
 

@@ -9,7 +9,7 @@ import pytest
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
 from warp_lcp.cli.solve_recorded import solve_recorded
-from warp_lcp.gallery.recorded import NUMBERS
+from warp_lcp.recorded_problem import NUMBERS
 
 NOTE = "import sys; from warp_lcp.cli.commands import main; main()"
 

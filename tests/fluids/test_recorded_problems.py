@@ -13,7 +13,7 @@ from command_line import invoke
 from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
 from warp_lcp.files import size_limits as claims
-from warp_lcp.gallery.recorded import FORMAT, cell_counts, files, load
+from warp_lcp.recorded_problem import FORMAT, cell_counts, files, load
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.simulation import Recorded

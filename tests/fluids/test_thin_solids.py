@@ -160,3 +160,112 @@ def test_built_in_scenes_have_no_thin_solids() -> None:
 def loaded_simulation(loaded: Any) -> Any:
     """Return the simulation of a scene."""
     return simulators()[loaded.scene.simulator].create(loaded, device="cpu", folder=Path())
+
+
+def block_with_a_fin(path: Path, x: np.ndarray, y: np.ndarray, depth: float) -> None:
+    """Write a mesh: a block with a fin on its top, the same over the depth.
+
+    Args:
+        path: OBJ file.
+        x: sides of the block, then of the fin [m], shape (4,).
+        y: bottom and top of the block, top of the fin [m], shape (3,).
+        depth: extent along z, from -0.1 m on.
+    """
+    profile = [(0, 0), (1, 0), (1, 1), (3, 1), (2, 1), (0, 1), (3, 2), (2, 2)]
+    vertices = [(x[a], y[b], z) for z in (-0.1, depth - 0.1) for a, b in profile]
+    # The cap of the block is a fan about its first corner. Normals point outward at large z.
+    cap = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5), (4, 3, 6), (4, 6, 7)]
+    outline = [0, 1, 2, 3, 6, 7, 4, 5]
+    triangles = [t[::-1] for t in cap] + [tuple(v + 8 for v in t) for t in cap]
+    for a, b in zip(outline, [*outline[1:], outline[0]], strict=True):
+        triangles += [(a, b, b + 8), (a, b + 8, a + 8)]
+    lines = [f"v {a} {b} {c}" for a, b, c in vertices]
+    path.write_text("\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles)]))
+
+
+def tank_with_a_fin(seed: int, kind: str, path: Path) -> tuple[LiquidSimulation, np.ndarray]:
+    """Return a tank with liquid on one side of a fin on a block, and the sides of both.
+
+    Returns the sides of the block and of the fin along x, and the top of the block [m].
+    """
+    rng = np.random.default_rng([3308, seed])
+    center, half = rng.uniform(0.45, 0.55), rng.uniform(4.0, 5.0) * CELL
+    fin = center + np.array([-0.5, 0.5]) * rng.uniform(0.05, 0.9) * CELL
+    x = np.array([center - half, center + half, *fin])
+    y = np.array([-0.1, rng.uniform(0.3, 0.4), 1.1])
+    if kind == "mesh":
+        block_with_a_fin(path / "fin.obj", x, y, 0.7)
+        solids = [{"shape": "mesh", "file": str(path / "fin.obj")}]
+    else:
+        solids = [
+            box([x[0], -0.1, -0.1], [x[1], y[1], 0.6]),
+            box([x[2], y[1] - 0.01, -0.1], [x[3], 1.1, 0.6]),
+        ]
+    simulation = create(
+        scene(
+            size=[1.0, 1.0, 0.5],
+            resolution=CELLS,
+            liquid=[box([0.0, 0.0, 0.0], [fin[0], 0.7, 0.5])],
+            solid=solids,
+        )
+    )
+    return simulation, np.array([*x, y[1]])
+
+
+@pytest.mark.parametrize("kind", ["mesh", "box"])
+@pytest.mark.parametrize("seed", [0, 4, 10])
+def test_a_pool_rests_on_a_block_beside_a_thin_fin(tmp_path: Path, seed: int, kind: str) -> None:
+    simulation, ends = tank_with_a_fin(seed, kind, tmp_path)
+    rows = advance(simulation, 0.3)
+    assert (simulation.particles.position.numpy()[:, 0] < ends[2]).all()
+    assert all(row["solve_status"] in (None, "CONVERGED") for row in rows)
+    # No cell under the fin joins the two sides: nothing flows there, and nothing is compressed.
+    assert rows[-1]["max_speed"] < 0.1
+    assert rows[-1]["max_density"] < rows[0]["max_density"] + 0.02
+
+
+def test_a_mesh_that_is_thin_in_parts_cuts_cells_elsewhere(tmp_path: Path) -> None:
+    simulation, ends = tank_with_a_fin(1, "mesh", tmp_path)
+    barriers, cut = simulation.boundary.barriers, simulation.boundary.cut
+    assert barriers.walls.in_parts == [1]
+    assert not any("thin" in note for note in cut.notes)
+    # The block takes its room from the cells, measured without the cells at the domain's walls.
+    taken = float((1.0 - cut.capacity.numpy()[2:-2, 2:-2, 2:-2]).sum()) * CELL**3
+    block = (ends[1] - ends[0]) * (ends[4] - CELL) * (0.5 - 2.0 * CELL)
+    assert taken == pytest.approx(block, rel=0.15)
+    # Cells far below the fin are not near a thin wall.
+    assert not barriers.near.numpy()[:, : int(ends[4] / CELL) - 4].any()
+    partly = [((open_.numpy() > 0.0) & (open_.numpy() < 1.0)).any() for open_ in cut.open]
+    assert all(partly)
+
+
+@pytest.mark.parametrize("angle", [0.0, 27.0])
+@pytest.mark.parametrize("thickness", [0.05, 0.3, 0.9])
+def test_a_surface_mesh_ends_at_both_sides_of_a_sheet(thickness: float, angle: float) -> None:
+    low, high = 0.52, 0.52 + thickness * CELL
+    place = {"rotate": [0.0, 0.0, angle], "translate": [0.5, 0.3, 0.0]}
+    sheet = box([low - 0.52, -1.0, -0.1], [high - 0.52, 1.0, 0.6], **place)
+    simulation = create(
+        scene(
+            size=[1.0, 1.0, 0.5],
+            resolution=CELLS,
+            liquid=[box([0.0, 0.0, 0.0], [1.0, 0.5, 0.5])],
+            solid=[sheet],
+            output={"surface": True},
+        )
+    )
+    mesh = simulation.surface_mesh.find(simulation.particles.position)
+    points = mesh.points.numpy().astype(np.float64)
+    triangles = points[mesh.corners.numpy().reshape(-1, 3)]
+    # Distance from the middle of the sheet along its normal.
+    turn = np.deg2rad(angle)
+    normal = np.array([np.cos(turn), np.sin(turn), 0.0])
+    away = (triangles - np.array([0.5, 0.3, 0.0])) @ normal - 0.5 * (high - low)
+    assert not ((away.min(axis=1) < -1e-6) & (away.max(axis=1) > 1e-6)).any()
+    # Both sides reach the sheet: no film of air is left.
+    for side in (-1.0, 1.0):
+        gap = (side * away)[side * away > 0.0].min() - 0.5 * (high - low)
+        assert -0.5 * (high - low) - 1e-6 <= gap + 0.03 * CELL < 0.02 * CELL
+    volume = np.einsum("ij,ij->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6.0
+    taken = (high - low) * 0.5 / np.cos(turn) * 0.5
+    assert volume == pytest.approx(0.25 - taken, rel=0.01)

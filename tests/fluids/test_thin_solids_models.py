@@ -122,9 +122,4 @@ def test_what_sheets_cannot_do_is_told() -> None:
     assert any(
         "contact_angle is 90 on solid[0] (box)" in note for note in pools(THIN, angle).notes()
     )
-    assert any(
-        "output.surface goes through solid[0]" in note
-        for note in pools(THIN, {"output": {"surface": True}}).notes()
-    )
-    for tables in (angle, {"output": {"surface": True}}):
-        assert not any("thinner than a cell" in note for note in pools(THICK, tables).notes())
+    assert not any("thinner than a cell" in note for note in pools(THICK, angle).notes())

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import BoxedModel, StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import (
     SCENES,
     arched_snake,
@@ -19,6 +18,7 @@ from warp_lcp.gallery.contact_scenes import (
 )
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.grid.solids import Sphere
+from warp_lcp.rigid.contact_models import BoxedModel, StewartTrinkleModel
 
 DT = 0.01
 SMALL = {

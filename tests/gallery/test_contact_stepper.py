@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import (
     SCENES,
     box,
@@ -22,6 +21,7 @@ from warp_lcp.gallery.contact_scenes import (
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.grid.solids import Sphere
+from warp_lcp.rigid.contact_models import StewartTrinkleModel
 from warp_lcp.rigid.joints import WORLD, Joint
 
 DT = 0.01

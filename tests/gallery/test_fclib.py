@@ -8,9 +8,9 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import box_stack
 from warp_lcp.gallery.fclib import read_fclib
+from warp_lcp.rigid.contact_models import BoxedModel
 
 h5py = pytest.importorskip("h5py")
 STORED = {"triplet": 0, "columns": -1, "rows": -2}

@@ -1,11 +1,14 @@
 """Thin solids as exact shapes: no leaks, and sliding along their surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation as Rotation3
 
 from warp_lcp.grid.motion import Rotation, Sinusoid
-from warp_lcp.grid.solids import Box, Capsule, Plane, Sphere, TriangleMesh, Union
+from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.thin_walls import ThinWalls, fills_cells, is_thin
 from warp_lcp.grid.triangle_mesh import close_surface
@@ -61,6 +64,13 @@ def flung(walls, points, ways, *, still=True, between=lambda: None):
     return position.numpy().astype(np.float64)
 
 
+def distance_of(shape, points):
+    """Return the signed distance [m] of points from a shape, shape (n,)."""
+    out = wp.empty(len(points), dtype=wp.float32, device="cpu")
+    shape.signed_distance(wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), out)
+    return out.numpy()
+
+
 def inside_points(dimension, count, rng, margin=2e-3 * CELL):
     points = np.zeros((count, 3))
     points[:, :dimension] = rng.uniform(LOW + margin, HIGH - margin, (count, dimension))
@@ -85,6 +95,48 @@ def test_nothing_leaves_a_closed_box(dimension, thickness, kind):
     assert free.sum() > 100 and np.allclose(
         ends[free], (points + ways)[free, :dimension], atol=1e-6
     )
+
+
+def leaning_shape(kind, rng):
+    """Return a thin shape in any position, which often meets the floor or a side of the domain."""
+    turn, place = Rotation3.random(rng=rng).as_matrix(), rng.uniform(0.0, 1.0, 3)
+    half = np.array([rng.uniform(0.05, 0.3), rng.uniform(0.05, 0.3), rng.uniform(0.1, 1.2) * CELL])
+    if kind is Capsule:
+        return Capsule(
+            start=tuple(place - turn[0] * 0.2), end=tuple(place + turn[0] * 0.2), radius=half[2]
+        )
+    shape = (
+        sheet(-half, half) if kind is TriangleMesh else Box(lower=tuple(-half), upper=tuple(half))
+    )
+    if kind is TriangleMesh and rng.random() < 0.7:  # two plates that cross, with folds
+        other = sheet(-half[[0, 2, 1]], half[[0, 2, 1]]).surface
+        one = shape.surface
+        both = (
+            np.concatenate(
+                [one.vertices, other.vertices + np.array([0.0, 0.0, 3.0 * half[2] + half[1]])]
+            ),
+            np.concatenate([one.triangles, other.triangles + len(one.vertices)]),
+        )
+        shape = TriangleMesh(surface=close_surface(*both, "folded"))
+    return replace(shape, placement=Placement(rotation=turn, translation=place))
+
+
+@pytest.mark.parametrize("kind", [Box, Capsule, TriangleMesh])
+@pytest.mark.parametrize("seed", range(8))
+def test_nothing_enters_between_a_solid_and_a_side_of_the_domain(seed, kind):
+    rng = np.random.default_rng([5022, seed])
+    shapes = [leaning_shape(kind, rng) for _ in range(3)]
+    walls = thin_walls(grid(3), shapes)
+    points = rng.uniform(0.002 * CELL, 1.0 - 0.002 * CELL, (6000, 3))
+    points = points[walls.admits(points)]
+    for _step in range(6):
+        # Towards the nearest solid and the nearest side, where wedges are.
+        ways = rng.normal(0.0, 0.5 * CELL, points.shape) + 0.3 * CELL * np.sign(points - 0.5)
+        aims = np.clip(points + ways, 0.001 * CELL, 1.0 - 0.001 * CELL)
+        points = flung(walls, points, aims - points)
+        assert (points > 0.0).all() and (points < 1.0).all()
+        for shape in shapes:
+            assert (distance_of(shape, points) > -1e-6 * CELL).all()
 
 
 @pytest.mark.parametrize(

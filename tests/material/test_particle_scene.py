@@ -18,7 +18,7 @@ from warp_lcp.material.particle_assembly import (
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene import Domain, SceneError, validate
 from warp_lcp.scene.scene_file import keys
-from warp_lcp.scene.shapes import BoxTable, MaterialProperties, SolidBox, SolidPlane
+from warp_lcp.scene.shapes import BoxTable, MaterialProperties, PlaneTable, SolidProperties
 
 BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 
@@ -29,14 +29,14 @@ class GrainBox(MaterialProperties, BoxTable):
     size: float = Field(default=1.0, gt=0, description="of a grain [mm]")
 
 
-class RoughBox(SolidBox):
+class RoughBox(SolidProperties, BoxTable):
     """Solid box with friction."""
 
     rubs = True
     friction: float | None = Field(default=None, ge=0)
 
 
-class RoughPlane(SolidPlane):
+class RoughPlane(SolidProperties, PlaneTable):
     """Solid half space with friction."""
 
     rubs = True

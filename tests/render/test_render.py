@@ -10,9 +10,9 @@ import warp as wp
 
 from command_line import invoke
 from small_runs import ball
+from warp_lcp.extras.live import Live
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.actors import shaded
-from warp_lcp.render.live import Live
 from warp_lcp.render.page import Page
 from warp_lcp.render.picture import Picture
 from warp_lcp.render.recording import (

@@ -11,10 +11,10 @@ from bodies_at_hand import GRAVITY, bodies_of, run
 from scipy.sparse.csgraph import connected_components
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
 from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rigid.contact_models import BoxedModel, ContactSystem
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.rigid.contacts import jacobian
 

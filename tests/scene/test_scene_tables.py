@@ -2,11 +2,13 @@
 
 import copy
 import math
+import pickle
 from typing import Any
 
 import pytest
 
 from warp_lcp.scene.scene import Scene, SceneError, validate
+from warp_lcp.scene.shapes import BoxTable, SolidProperties, shaped
 
 BASE: dict[str, Any] = {
     "scene": {"simulator": "dots"},
@@ -233,3 +235,12 @@ def test_shapes_become_geometry_in_place():
     bounds = scene.solid[0].bounds(2)
     assert bounds is not None
     assert bounds[:, :2].ravel() == pytest.approx([0.2, 0.0, 1.0, 0.8])
+
+
+def test_tables_of_shapes_have_names_by_which_they_are_pickled():
+    scene = build({"solid": [{**BOX, "wall": "sticky"}]})
+    solid = scene.solid[0]
+    assert type(solid) is shaped(SolidProperties, BoxTable)
+    assert f"{type(solid).__module__}.{type(solid).__name__}" == "warp_lcp.scene.shapes.SolidBox"
+    assert type(solid).__doc__ == "Solid: box between two corners."
+    assert pickle.loads(pickle.dumps(solid)) == solid == copy.deepcopy(solid)

@@ -10,9 +10,9 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, lemke
-from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import heavy_on_light
 from warp_lcp.kernels.vectors import rows_of
+from warp_lcp.rigid.contact_models import BoxedModel
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 from warp_lcp.sweeps.sweep_kernels import CHANGE
 

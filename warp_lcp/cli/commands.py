@@ -20,10 +20,10 @@ from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.cli.view_commands import export, looked_on, render, serve, view
 from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
+from warp_lcp.extras.viewer import check_window
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.protocol import families
-from warp_lcp.render.viewer import check_window
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.engines import launcher_of

@@ -16,8 +16,10 @@ from typing import Annotated, Any, cast
 import typer
 
 from warp_lcp.cli.exit_codes import wrong_input
+from warp_lcp.extras.live import PORT, live_server, served
+from warp_lcp.extras.usd import export_run
+from warp_lcp.extras.viewer import view_run
 from warp_lcp.render.film import check_rate
-from warp_lcp.render.live import PORT, live_server, served
 from warp_lcp.render.photo.photo import (
     SAMPLES,
     SHUTTER,
@@ -28,8 +30,6 @@ from warp_lcp.render.photo.photo import (
 )
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
-from warp_lcp.render.usd import export_run
-from warp_lcp.render.viewer import view_run
 from warp_lcp.run.devices import devices
 from warp_lcp.run.progress import Count, Observer
 from warp_lcp.run.terminal import Terminal, say, tell

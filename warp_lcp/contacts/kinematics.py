@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.gallery.articulated_figure import ArticulatedFigure
-from warp_lcp.gallery.inverse_kinematics import InverseKinematics, ReachedPose
+from warp_lcp.contacts.articulated_figure import ArticulatedFigure
+from warp_lcp.contacts.inverse_kinematics import InverseKinematics, ReachedPose
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.joints import WORLD, Joint
 from warp_lcp.rigid.outline import BodySurface

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import (
+from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
     ContactSystem,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.contacts.inverse_kinematics import InverseKinematics
 from warp_lcp.contacts.kinematics import KinematicSimulation
 from warp_lcp.contacts.methods import MethodOfChoice
 from warp_lcp.contacts.scene import ContactScene
-from warp_lcp.gallery.inverse_kinematics import InverseKinematics
 from warp_lcp.material.particle_assembly import make_bodies, placed_solids
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene

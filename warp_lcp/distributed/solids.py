@@ -52,8 +52,9 @@ def boundary_of_part(
         open_sides = side_bits(domain.open)
         thin = make_thin_walls(scene, grid, solids, open_sides, crossing=False)
         crossing = make_thin_walls(scene, grid, solids, open_sides, crossing=True)
-        numbers = crossing.numbers if crossing is not None else ()
-        cut = CutCells(grid, solids, open_sides=ends, left_out=numbers, **walls)
+        left_out = crossing.everywhere if crossing is not None else ()
+        held = crossing.numbers if crossing is not None else ()
+        cut = CutCells(grid, solids, open_sides=ends, left_out=left_out, held=held, **walls)
         if thin is not None or ranks.any(not cut.whole_cells):
             barriers = Barriers(grid, crossing, cut) if crossing is not None else None
             grid.divide(barriers)

@@ -1,12 +1,5 @@
 """Test problems for methods, deterministic by seed; most with a known solution."""
 
-from warp_lcp.gallery.contact_models import (
-    BoxedModel,
-    ContactSystem,
-    FrozenBoxModel,
-    StewartTrinkleModel,
-    proximal_sweeps,
-)
 from warp_lcp.gallery.contact_scenes import SCENES, contact, contact_scene
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES
@@ -16,10 +9,17 @@ from warp_lcp.gallery.heston import Heston, Prices
 from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
 from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
 from warp_lcp.gallery.planted import Plant, planted, poisson
-from warp_lcp.gallery.problem import FACTS, Problem
 from warp_lcp.gallery.published import PUBLISHED, Published
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.gallery.shallow_ice import IceDome
+from warp_lcp.host_problem import FACTS, Problem
+from warp_lcp.rigid.contact_models import (
+    BoxedModel,
+    ContactSystem,
+    FrozenBoxModel,
+    StewartTrinkleModel,
+    proximal_sweeps,
+)
 
 __all__ = [
     "FACTS",

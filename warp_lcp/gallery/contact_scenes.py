@@ -14,16 +14,16 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.gallery.contact_models import (
+from warp_lcp.gallery.contact_stepper import ContactStepper
+from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
+from warp_lcp.grid.solids import Box, Placement, Sphere
+from warp_lcp.host_problem import Problem
+from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
     ContactSystem,
     StewartTrinkleModel,
 )
-from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.gallery.problem import Problem
-from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
-from warp_lcp.grid.solids import Box, Placement, Sphere
 from warp_lcp.rigid.contacts import contact_frames, jacobian
 from warp_lcp.rigid.joints import WORLD, Joint
 from warp_lcp.rigid.obstacles import Obstacle

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
 from warp_lcp.gallery.planted import Plant, poisson
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.host_problem import Problem
 
 
 def _some(seed: int) -> Any:

@@ -24,7 +24,7 @@ import scipy.sparse.linalg
 
 from warp_lcp.files.archive import DEFLATED
 from warp_lcp.files.size_limits import ClaimError, check_claim
-from warp_lcp.gallery.contact_models import ContactSystem
+from warp_lcp.rigid.contact_models import ContactSystem
 
 UNWRITTEN = 2**24  # most bytes of a dataset that was never written, which is read as zeros
 

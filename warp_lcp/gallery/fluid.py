@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.gallery.problem import M_MATRIX, Problem
+from warp_lcp.host_problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
 from warp_lcp.problem.lcp import LCP

@@ -10,7 +10,7 @@ import scipy.linalg
 import scipy.sparse
 
 from warp_lcp.gallery.planted import Plant, planted
-from warp_lcp.gallery.problem import M_MATRIX, Problem
+from warp_lcp.host_problem import M_MATRIX, Problem
 
 
 def spectrum_matrix(eigenvalues: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.gallery.problem import M_MATRIX, Problem
+from warp_lcp.host_problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 
 RADIUS = 0.697965148223374  # a, where the membrane leaves the ball: a^2 (log 2 - log a) = 1 - a^2

@@ -14,8 +14,8 @@ import warp as wp
 from warp_lcp.default import solve
 from warp_lcp.gallery.heston import Heston
 from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
-from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.shallow_ice import IceDome
+from warp_lcp.host_problem import Problem
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
 

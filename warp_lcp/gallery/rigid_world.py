@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.gallery.contact_models import ContactSystem
 from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.rigid.body import BodyStates, RigidBody
 from warp_lcp.rigid.contact_detection import NONE, ContactDetection
+from warp_lcp.rigid.contact_models import ContactSystem
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
 from warp_lcp.rigid.contacts import Contacts

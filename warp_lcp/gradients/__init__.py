@@ -1,1 +1,1 @@
-"""Derivatives of solutions, for Warp tapes, PyTorch and JAX."""
+"""Derivatives of solutions."""

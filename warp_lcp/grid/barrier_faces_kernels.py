@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_lcp.grid.barrier_geometry import (
     CENTERS,
+    INSIDE,
     REACH,
     SHIFTS,
     TURNS,
@@ -30,6 +31,9 @@ from warp_lcp.grid.cell_kernel import (
     next_to,
     spline,
 )
+from warp_lcp.grid.cut_cells_kernels import corner
+from warp_lcp.grid.solids_kernels import FAR
+from warp_lcp.grid.thin_walls_kernels import MESH, into_group
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 MODULE = "warp_lcp.grid.barriers.faces"
@@ -44,6 +48,31 @@ def near_kernel(k, j, i, B: Barrier, near: U8):
     """Mark the cells that a thin solid is near."""
     found, _n, _d = nearest_wall(B, place_of(B, CENTERS, k, j, i), REACH * B.dx)
     near[k, j, i] = wp.where(found > 0, wp.uint8(1), wp.uint8(0))
+
+
+@wp.func
+def mesh_around(B: Barrier, x: wp.vec3):
+    """Return the number of the solid whose mesh a point lies in, 0 if it lies in none."""
+    result = int(0)
+    for g in range(B.groups.shape[0]):
+        group = B.groups[g]
+        p = into_group(group.turn, group.shift, wp.vec3d(x))
+        for s in range(group.first, group.end):
+            shape = B.shapes[s]
+            if shape.kind == MESH:
+                q = wp.vec3((shape.turn * (p - shape.shift)) / shape.radius)
+                query = wp.mesh_query_point_sign_winding_number(shape.mesh, q, FAR, 2.0, 0.5)
+                if query.result and query.sign < 0.0:
+                    result = shape.solid
+    return result
+
+
+@cell_kernel("warp_lcp.grid.barriers.meshes")
+def inside_kernel(k, j, i, B: Barrier, near: U8):
+    """Mark those cells near thin solids whose center lies in a mesh, by INSIDE."""
+    if near[k, j, i] != wp.uint8(0):
+        if mesh_around(B, place_of(B, CENTERS, k, j, i)) > 0:
+            near[k, j, i] = wp.uint8(INSIDE)
 
 
 @cell_kernel(MODULE)
@@ -63,6 +92,40 @@ def apart_kernel(k, j, i, B: Barrier, axis: int, apart: U8):
     apart[k, j, i] = wp.uint8(bits)
 
 
+@wp.func
+def open_center(B: Barrier, axis: int, nodes: F32, k: int, j: int, i: int):
+    """Return the center [m] of the open part of a lower face that another solid cuts.
+
+    The open part is the polygon of the open corners and of the zeros of the distance along the
+    edges. The center is the mean of these points. `nodes` is the distance of the solids that cut
+    cells, at the cells' lower nodes [cells].
+    """
+    # From the first corner; a corner is shifted along the two axes of the face.
+    total = wp.vec3()
+    count = float(0.0)
+    for n in range(4):
+        # Corners 0, 1, 3, 2 follow each other around the face.
+        dk, dj, di = corner(axis, B.planes, n ^ (n >> 1))
+        m = (n + 1) % 4
+        ek, ej, ei = corner(axis, B.planes, m ^ (m >> 1))
+        here = nodes[k + dk, j + dj, i + di]
+        there = nodes[k + ek, j + ej, i + ei]
+        start = wp.vec3(float(di), float(dj), float(dk))
+        if here > 0.0:
+            total += start
+            count += 1.0
+        if here * there < 0.0:
+            way = wp.vec3(float(ei), float(ej), float(ek)) - start
+            total += start + here / (here - there) * way
+            count += 1.0
+    middle = wp.vec3(0.5, 0.5, 0.5 * float(B.planes - 1))
+    middle[axis] = 0.0
+    result = place_of(B, axis, k, j, i)
+    if count > 0.0:
+        result += B.dx * (total / count - middle)
+    return result
+
+
 @cell_kernel(MODULE)
 def cross_kernel(
     k,
@@ -71,19 +134,41 @@ def cross_kernel(
     B: Barrier,
     axis: int,
     apart: U8,
+    nodes: F32,
     open: F32,
     wall: I16,
     number: I16,
     below: F32,
     above: F32,
 ):
-    """Close the lower faces between cells whose centers a solid separates.
+    """Close the lower faces that a solid crosses.
 
+    It separates the centers of the two cells, or one of the centers lies in a mesh. On a face that
+    another solid cuts the centers may lie in that solid, below the edge of the thin one. Then the
+    path through the open part decides.
     Faces of the domain keep their state. `below` and `above` are the distances [cells] to the solid
     from the centers of the cells below and above a face.
     """
     crossed = int(0)
-    if (int(apart[k, j, i]) >> axis) & 1 != 0:
+    is_apart = (int(apart[k, j, i]) >> axis) & 1 != 0
+    if not is_apart and open[k, j, i] > 0.0 and B.near[k, j, i] != wp.uint8(0):
+        if wall[k, j, i] != wp.int16(0):
+            found = int(0)
+            c, b, a = next_to(axis, -1, k, j, i)
+            if B.near[k, j, i] == wp.uint8(INSIDE) or B.near[c, b, a] == wp.uint8(INSIDE):
+                found, _n, _d = nearest_wall(B, place_of(B, axis, k, j, i), REACH * B.dx)
+            elif open[k, j, i] < 1.0:
+                middle = open_center(B, axis, nodes, k, j, i)
+                half = wp.vec3()
+                half[axis] = 0.5 * B.dx
+                found, _t = wall_between(B, middle - half, middle + half)
+            if found > 0:
+                crossed = found
+                above[k, j, i] = 1.0
+                below[k, j, i] = 1.0
+                wall[k, j, i] = wp.int16(found)
+                open[k, j, i] = 0.0
+    if is_apart:
         if wall[k, j, i] != wp.int16(0):
             x = place_of(B, CENTERS, k, j, i)
             c, b, a = next_to(axis, -1, k, j, i)
@@ -184,10 +269,31 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
     share[k, j, i] = result
 
 
+@cell_kernel("warp_lcp.grid.barriers.room")
+def room_kernel(k, j, i, B: Barrier, room: F32):
+    """Limit the distance of a cell to solids [cells] by that to thin solids.
+
+    These count as thicker by half a cell on each side: then each line of cell centers that crosses
+    one has a center in it.
+    """
+    reach = wp.max(room[k, j, i] + 0.5, 0.0)
+    if reach > 0.0:
+        reach = wp.min(reach, REACH)
+        found, _n, d = nearest_wall(B, place_of(B, CENTERS, k, j, i), reach * B.dx)
+        if found > 0:
+            room[k, j, i] = wp.min(room[k, j, i], d / B.dx - 0.5)
+
+
 @cell_kernel(MODULE)
-def capacity_kernel(k, j, i, share: F32, capacity: F32):
-    """Reduce the open share of a cell's kernel to what its center sees."""
-    capacity[k, j, i] = capacity[k, j, i] * share[k, j, i]
+def capacity_kernel(k, j, i, share: F32, cuts: bool, capacity: F32):
+    """Reduce the open share of a cell's kernel to what its center sees.
+
+    Solids that are thin in parts also cut cells (`cuts`): both shares leave out their inside.
+    """
+    both = capacity[k, j, i] * share[k, j, i]
+    if cuts:
+        both = wp.min(capacity[k, j, i], share[k, j, i])
+    capacity[k, j, i] = both
 
 
 @cell_kernel(MOVING)

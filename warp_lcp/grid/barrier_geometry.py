@@ -10,6 +10,7 @@ CENTERS = 3  # the `axis` of a field at cell centers
 # Cells from a cell's center to a solid that may stand between a particle in the cell and a face
 # that it touches, or an end of the cell's kernel.
 REACH = 2.8
+INSIDE = 2  # value of `near` where a cell's center lies in a mesh
 # Cells. Points within this distance of a surface count as in the solid; particles keep a larger
 # distance.
 SURFACE = 1.0e-6
@@ -24,7 +25,7 @@ class Barrier:
 
     shapes: SHAPES
     groups: GROUPS
-    near: U8  # whether one is within REACH of a cell's center
+    near: U8  # not 0 where one is within REACH of a cell's center; INSIDE: the center is in a mesh
     planes: int
     dx: float
     origin: wp.vec3i  # cells of a larger grid before the first one of this

@@ -60,7 +60,7 @@ class Barriers:
         cut: cut cells of the other solids; it has the velocities of all solids.
 
     Attributes:
-        near: uint8, 1 in cells near one of the solids.
+        near: uint8, not 0 in cells near one of the solids: 1, INSIDE if their center is in a mesh.
         apart: uint8 for the faces of each component and, last, the cells: bit d is set where a
             solid stands between a place and the one before it along axis d.
         number: int16, one field a component: the solid that crosses a lower face, 0 if none does.
@@ -78,23 +78,23 @@ class Barriers:
         self.number, self._share, self._scratch = grid.faces(wp.int16), grid.field(), grid.faces()
         self.below, self.above = grid.faces(), grid.faces()
         self._share.fill_(1.0)
-        self._barrier = Barrier()
-        self._barrier.shapes, self._barrier.groups, self._barrier.near = (
-            walls.shapes,
-            walls.groups,
-            self.near,
-        )
-        self._barrier.planes, self._barrier.dx, self._barrier.origin = (
-            grid.planes,
-            grid.spacing,
-            wp.vec3i(*grid.origin),
-        )
+        self._barrier = self._barrier_of(grid, walls.shapes)
+        # Barriers are only near the thin parts of solids.
+        self._thin = self._barrier_of(grid, walls.thin_shapes)
         margin = np.full(3, MARGIN * grid.spacing)
         self._sides = wp.vec3(*margin), wp.vec3(*(grid.extent - margin))
         self.calm = grid.field(wp.int8)
         self._window: Window | None = None
         self._aim = wp.empty(0, dtype=wp.vec3, device=grid.device)
         self._place()
+
+    def _barrier_of(self, grid: StaggeredGrid, shapes: wp.array) -> Barrier:
+        """Return shapes of the solids and a grid, as kernels take them."""
+        barrier = Barrier()
+        barrier.shapes, barrier.groups, barrier.near = shapes, self.walls.groups, self.near
+        barrier.planes, barrier.dx = grid.planes, grid.spacing
+        barrier.origin = wp.vec3i(*grid.origin)
+        return barrier
 
     def place(self, time: float) -> None:
         """Move the solids to a time [s], after those of the cut cells."""
@@ -110,7 +110,9 @@ class Barriers:
         before, self._window = self._window or now, now
         low, high = [*map(min, now.low, before.low)], [*map(max, now.high, before.high)]
         self._all = Window.of(low, high, grid.device)
-        self._all.launch(faces_kernels.near_kernel, [barrier, self.near])
+        self._all.launch(faces_kernels.near_kernel, [self._thin, self.near])
+        if self.walls.has_meshes:
+            self._all.launch(faces_kernels.inside_kernel, [barrier, self.near])
         for axis, apart in enumerate(self.apart):
             self._all.launch(
                 faces_kernels.apart_kernel,
@@ -142,7 +144,7 @@ class Barriers:
                 self._all.launch(faces_kernels.forget_kernel, [number, cut.velocity[axis]])
             self._all.launch(
                 faces_kernels.cross_kernel,
-                [barrier, axis, self.apart[-1], open_, wall, number, *gaps],
+                [barrier, axis, self.apart[-1], cut.distance, open_, wall, number, *gaps],
             )
         inner = self._all.common(self.grid.domain)
         if inner is not None:
@@ -151,7 +153,10 @@ class Barriers:
             )
         self.grid.everywhere.launch(faces_kernels.calm_kernel, [self.near, cut.base, self.calm])
         if cut.capacity is not None:
-            self._all.launch(faces_kernels.capacity_kernel, [self._share, cut.capacity])
+            self._all.launch(
+                faces_kernels.capacity_kernel,
+                [self._share, bool(self.walls.in_parts), cut.capacity],
+            )
 
     def set_velocity(self) -> None:
         """Set the velocity of the crossed faces, after those of the cut cells."""
@@ -163,6 +168,16 @@ class Barriers:
                 faces_kernels.wall_velocity_kernel,
                 [self._barrier, axis, number, cut.turn, cut.shift, velocity],
             )
+
+    def limit_room(self, lattice: StaggeredGrid, room: wp.array) -> None:
+        """Limit the distance to solids by that to the thin ones, which count as thicker.
+
+        Args:
+            lattice: a finer grid of the same region.
+            room: distance at its cells' centers [lattice cells], float32 (updated).
+        """
+        barrier = self._barrier_of(lattice, self.walls.shapes)
+        lattice.domain.launch(faces_kernels.room_kernel, [barrier, room])
 
     def enter(self, index: wp.array) -> None:
         """Mark whole cells as the solids' cells.

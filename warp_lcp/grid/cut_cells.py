@@ -56,6 +56,7 @@ class CutCells:
         remarks: write notes about faces, and refuse a grid without open cells; False for a part of
             a larger grid.
         left_out: numbers of solids that cut no cells; their velocities are still computed.
+        held: numbers of solids that may be thinner than cells without a note.
         open_sides: bits of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no
             solid closes them, and the ring is air.
 
@@ -100,6 +101,7 @@ class CutCells:
         open_sides: int = 0,
         remarks: bool = True,
         left_out: Collection[int] = (),
+        held: Collection[int] = (),
     ) -> None:
         self.grid, self.solids, self.open_sides, self._left_out = (
             grid,
@@ -131,7 +133,7 @@ class CutCells:
             HostArray(1 + len(solids), of, grid.device) for of in (wp.mat33, wp.vec3)
         )
         self.turn, self.shift = self._turn.array, self._shift.array
-        notes = start_notes(self.solids, grid, self._left_out)
+        notes = start_notes(self.solids, grid, held)
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
         self.nearest = self._nodes.arrays[1:] if self.moves else []

@@ -504,6 +504,10 @@ class TriangleMesh(_Shape):
         """
         return self.surface.thin_fraction(thickness / self.placement.scale, device)
 
+    def thin_part(self, thickness: float, device: wp.Device) -> wp.Mesh:
+        """Return the part of the surface where the solid is thinner than `thickness` [m]."""
+        return self.surface.thin_part(thickness / self.placement.scale, device)
+
     def origin(self) -> np.ndarray:
         """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return self.surface.center

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import surface_mesh_kernels as kernels
+from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
 from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
@@ -61,12 +62,15 @@ class Obstacles:
         shapes: returns the solids' shapes where they are; the surface then ends
             `mesh_walls.OVERLAP` inside them. None: it ends where `distance`, or the cells, have the
             walls.
+        thin: solids that `distance` does not have, as they are thinner than cells; None if there
+            are none.
     """
 
     base: wp.array
     distance: wp.array | None
     moves: bool
     shapes: Callable[[], Sequence[Geometry]] | None = None
+    thin: Barriers | None = None
 
 
 @dataclass(frozen=True)
@@ -303,6 +307,8 @@ class SurfaceMesh:
             domain.launch(
                 kernels.whole_cell_room_kernel, [lattice.planes, self._parts, obstacles.base, room]
             )
+        if obstacles.thin is not None:
+            obstacles.thin.limit_room(lattice, room)
         self._mirror(room)
         lattice.everywhere.launch(kernels.open_share_kernel, [room, capacity])
         passes = self._passes + 1  # a cell's own extent widens the kernel by about as much

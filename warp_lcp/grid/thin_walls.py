@@ -31,6 +31,8 @@ STRIDE_ROOM = 0.5  # cells by which a moving solid must be thicker than its larg
 # Cells by which shapes are enlarged, so that there is no crack between shapes that touch.
 SKIN = 1e-4
 THIN_SHARE = 1e-3  # least share of a mesh's surface that is thin, for the mesh to be thin
+# Share of a mesh's surface above which the mesh is a shell: thin everywhere but at its rims.
+SHELL_SHARE = 0.8
 COST = 32  # work of a particle, in cells of a usual pass
 Simple = Box | Sphere | Capsule | TriangleMesh
 
@@ -59,6 +61,18 @@ def _is_thin(shape: Geometry, thickness: float, device: wp.Device) -> bool:
         return shape.thin_fraction(thickness, device) > THIN_SHARE
     least = shape.half_extents().min() if isinstance(shape, Box) else shape.radius
     return bool(2.0 * least * shape.placement.scale < thickness)
+
+
+def is_thin_in_parts(geometry: Geometry, thickness: float, device: wp.Device) -> bool:
+    """Return whether only a part of each thin mesh is thinner than `thickness` [m].
+
+    Such a solid has a thick body and thin limbs. Boxes, balls and capsules are thin everywhere.
+    """
+    thin = [part for part in parts_of(geometry) if _is_thin(part, thickness, device)]
+    return bool(thin) and all(
+        isinstance(part, TriangleMesh) and part.thin_fraction(thickness, device) <= SHELL_SHARE
+        for part in thin
+    )
 
 
 def is_sheet(geometry: Geometry, thickness: float, dimension: int) -> bool:
@@ -104,11 +118,17 @@ class ThinWalls:
         thin: numbers of the thin ones.
         open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there,
             for good or to the other end of an axis.
+        in_parts: whether each solid is thin in parts only; none if empty.
+        thickness: the solids are thin where they are thinner [m]; used with `in_parts`.
         endless: periodic axes; solids near one side have images beyond the other.
 
     Attributes:
         numbers: numbers of these solids.
+        in_parts: numbers of those that are thin in parts only.
+        everywhere: numbers of the others.
+        has_meshes: whether one of the shapes is a mesh.
         moves: whether one of them moves.
+        thin_shapes: the shapes, of the solids in `in_parts` only the thin parts of their surface.
         least: smallest coordinates of particles [m], -inf where they may leave.
         most: largest coordinates, likewise.
     """
@@ -120,9 +140,13 @@ class ThinWalls:
         thin: Sequence[bool],
         open_sides: int,
         endless: Sequence[int] = (),
+        in_parts: Sequence[bool] = (),
+        thickness: float = 0.0,
     ) -> None:
         self.grid = grid
         self.numbers = [number for number, is_one in enumerate(thin, start=1) if is_one]
+        self.in_parts = [number for number, is_one in enumerate(in_parts, start=1) if is_one]
+        self.everywhere = [number for number in self.numbers if number not in self.in_parts]
         self.moves = any(solids[number - 1].motion is not None for number in self.numbers)
         groups: list[tuple[Motion | None, list[tuple[int, Geometry]]]] = []
         for number in self.numbers:
@@ -141,6 +165,7 @@ class ThinWalls:
         # Parts of the solids, which own the meshes on the device.
         self._geometries = [part for _, of in groups for _, part in of]
         ends = np.cumsum([0, *(len(of) for _, of in groups)])
+        self.has_meshes = any(isinstance(part, TriangleMesh) for part in self._geometries)
         self._groups = list[kernels.ThinGroup]()
         self._moving: list[tuple[int, int, np.ndarray]] = []
         moving = 0
@@ -155,6 +180,7 @@ class ThinWalls:
                 self._groups.append(group)
             moving += motion is not None
         self.shapes = wp.array(shapes, dtype=kernels.ThinShape, device=grid.device)
+        self.thin_shapes, self._thin_parts = self._only_thin(shapes, thickness)
         self.groups = wp.array(self._groups, dtype=kernels.ThinGroup, device=grid.device)
         margin = MARGIN * grid.spacing
         low, high = np.full(3, margin), grid.extent - margin
@@ -171,6 +197,32 @@ class ThinWalls:
         self._start = wp.empty(0, dtype=wp.vec3, device=grid.device)
         self.place(0.0)
         self.place(0.0)
+
+    def _only_thin(
+        self, shapes: Sequence[kernels.ThinShape], thickness: float
+    ) -> tuple[wp.array[Any], list[wp.Mesh]]:
+        """Return the shapes with thin parts of meshes, and these meshes.
+
+        Shapes are those of all solids, in the order of `_geometries`.
+        """
+        if not self.in_parts:
+            return self.shapes, []
+        device, parts, result = self.grid.device, list[wp.Mesh](), list[kernels.ThinShape]()
+        for shape, geometry in zip(shapes, self._geometries, strict=True):
+            if shape.solid not in self.in_parts:
+                result.append(shape)
+            elif (
+                isinstance(geometry, TriangleMesh)
+                and geometry.thin_fraction(thickness, device) > THIN_SHARE
+            ):
+                parts.append(geometry.thin_part(thickness, device))
+                result.append(_shape(shape.solid, geometry, device, 0.0))
+                result[-1].mesh = parts[-1].id
+            else:
+                # A thick part has no thin surface: its bounding box is far away from all points.
+                result.append(_shape(shape.solid, geometry, device, 0.0))
+                result[-1].low = result[-1].high = wp.vec3d(*np.full(3, kernels.ENDLESS))
+        return wp.array(result, dtype=kernels.ThinShape, device=device), parts
 
     def place(self, time: float) -> None:
         """Move the solids to a time [s].

@@ -301,12 +301,14 @@ def free_way(
     aim: wp.vec3d,
     margin: wp.float64,
     planes: int,
+    slides_on: bool,
 ):
     """Return the end of a path from `start` towards `aim` among shapes at rest.
 
     Also returns whether a shape was in its way. The particle slides along the surface of each shape
     that it meets, at a distance of `margin` [m]. Each piece of its path is checked. If no further
-    piece is free, it stops at the end of the last free one.
+    piece is free, it stops at the end of the last free one. Unless it `slides_on`, it stops at the
+    first shape.
     """
     # Loops with variable counts are not unrolled: a twelfth of the code.
     pushes = int(PUSHES)
@@ -328,10 +330,15 @@ def free_way(
             if which >= 0:
                 met = True
                 p = x + t * way + margin * n
+                # The other shapes, which are convex, and all of a mesh, which may have folds.
                 blocked, _n, _which = first_hit(shapes, first, end, x + t * way, p, which)
+                if shapes[which].kind == MESH:
+                    folds, _n = hit(shapes[which], x, p)
+                    blocked = wp.min(blocked, folds)
                 room = wp.float64(ROOM) * margin
                 if (
-                    blocked <= _ONE
+                    not slides_on
+                    or blocked <= _ONE
                     or not has_room(shapes, first, end, p, room)
                     or wp.dot(n, n) < wp.float64(0.5)
                 ):
@@ -382,6 +389,10 @@ def stop_kernel(
     new one. This is exact for translations. Beside a solid that turns, the path differs from the
     true one by its bend, while its ends are exact. With `still` the solids have not moved. `low`
     and `high` are the corners of the box that particles may not leave.
+
+    A particle may slide out of the box between a solid and a side of the box. The point of the box
+    that is nearest may lie in the solid, so the path to that point is traced again. If this happens
+    twice, the particle stops where it first meets a solid.
     """
     x = wp.vec3d(start[i])
     y = wp.vec3d(position[i])
@@ -389,6 +400,7 @@ def stop_kernel(
     agreed = int(0)  # groups that leave the end as it is, since it was last changed
     changed = bool(False)
     g = int(0)
+    wedged = int(0)  # times that the path had to be shortened at a side of the box
     for _look in range(ROUNDS * count):
         if agreed < count:
             group = groups[g]
@@ -399,17 +411,20 @@ def stop_kernel(
                 shift = group.shift
             a = into_group(turn, shift, x)
             b = into_group(group.turn, group.shift, y)
-            end, met = free_way(shapes, group.first, group.end, a, b, margin, planes)
+            end, met = free_way(shapes, group.first, group.end, a, b, margin, planes, wedged < 2)
             agreed += 1
             if met:
-                y = group.turn * end + group.shift
+                slid = group.turn * end + group.shift
                 y = wp.vec3d(
-                    wp.clamp(y[0], low[0], high[0]),
-                    wp.clamp(y[1], low[1], high[1]),
-                    wp.clamp(y[2], low[2], high[2]),
+                    wp.clamp(slid[0], low[0], high[0]),
+                    wp.clamp(slid[1], low[1], high[1]),
+                    wp.clamp(slid[2], low[2], high[2]),
                 )
                 changed = True
                 agreed = 1
+                if y[0] != slid[0] or y[1] != slid[1] or y[2] != slid[2]:
+                    wedged += 1
+                    agreed = 0
             g = (g + 1) % count
     if changed:
         if planes == 1:

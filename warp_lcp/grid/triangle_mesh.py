@@ -169,6 +169,22 @@ class ClosedSurface:
 
         Thinner than `thickness`, by area, in the mesh's units.
         """
+        area = np.linalg.norm(_double_areas(self.vertices, self.triangles), axis=1)
+        return float(area[self._is_thin(thickness, device)].sum() / area.sum())
+
+    def thin_part(self, thickness: float, device: wp.Device) -> wp.Mesh:
+        """Return the triangles on thin parts as a mesh for Warp queries.
+
+        Parts are thin if the solid is thinner than `thickness`, in the mesh's units.
+
+        Coordinates are those of `on_device`. At least one triangle must be thin.
+        """
+        points = wp.array((self.vertices - self.center) / self.size, dtype=wp.vec3, device=device)
+        thin = self.triangles[self._is_thin(thickness, device)]
+        return wp.Mesh(points, wp.array(thin.ravel(), dtype=wp.int32, device=device))
+
+    def _is_thin(self, thickness: float, device: wp.Device) -> np.ndarray:
+        """Return a mask of the triangles where the solid is thinner than `thickness`."""
         faces = len(self.triangles)
         out = wp.empty(faces, dtype=wp.float32, device=device)
         reach = thickness / self.size
@@ -179,8 +195,7 @@ class ClosedSurface:
             outputs=[out],
             device=device,
         )
-        area = np.linalg.norm(_double_areas(self.vertices, self.triangles), axis=1)
-        return float(area[out.numpy() < np.float32(reach)].sum() / area.sum())
+        return np.asarray(out.numpy() < np.float32(reach))
 
 
 def load_surface(file: str, folder: Path | None = None) -> ClosedSurface:

@@ -29,6 +29,7 @@ from warp_lcp.grid.thin_walls import (
     fills_cells,
     is_sheet,
     is_thin,
+    is_thin_in_parts,
 )
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.ballistic_fragments import BallisticFragments
@@ -46,7 +47,7 @@ from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
 from warp_lcp.rigid.obstacles import domain_walls, obstacle
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import SolidProperties
+from warp_lcp.scene.shapes import Shape, SolidProperties
 
 
 def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
@@ -173,14 +174,14 @@ def make_boundary(
         thin, crossing = (
             make_thin_walls(scene, grid, placed, passed, crossing=c) for c in (False, True)
         )
-        numbers = crossing.numbers if crossing is not None else ()
         cut = CutCells(
             grid,
             placed,
             wall_separating=separating,
             open_sides=sides,
             remarks=not covered,
-            left_out=numbers,
+            left_out=crossing.everywhere if crossing is not None else (),
+            held=crossing.numbers if crossing is not None else (),
         )
         # On other ranks solids may cut cells.
         if not cut.whole_cells or (covered and placed) or thin is not None:
@@ -233,6 +234,8 @@ def make_thin_walls(
         most = walls[solid.motion is not None]
         if crossing:
             most = SHEET if is_body else BARRIER
+            if is_body and is_thin_in_parts(shape, most * dx, grid.device):
+                return False
         fills = solid.motion is None and fills_cells(shape, grid, DEEP)
         return is_thin(shape, most * dx, grid.device) and not fills
 
@@ -240,7 +243,21 @@ def make_thin_walls(
     if not any(thin):
         return None
     ends = side_bits(periodic_sides(scene.endless))
-    return ThinWalls(grid, placed, thin, open_sides | ends, scene.endless)
+    in_parts = [
+        crossing
+        and is_one
+        and is_thin_in_parts(solid.geometry, BARRIER * grid.spacing, grid.device)
+        for solid, is_one in zip(placed, thin, strict=True)
+    ]
+    return ThinWalls(
+        grid,
+        placed,
+        thin,
+        open_sides | ends,
+        scene.endless,
+        in_parts=in_parts,
+        thickness=BARRIER * grid.spacing,
+    )
 
 
 @dataclass(frozen=True)
@@ -301,7 +318,9 @@ def make_surface_mesh(
         per_axis=scene.particles.per_axis,
         resolution=scene.output.surface_resolution,
         smoothing=scene.output.surface_smoothing,
-        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves, boundary.shapes)
+        obstacles=Obstacles(
+            boundary.base, boundary.distance, boundary.moves, boundary.shapes, grid.barriers
+        )
         if scene.solid
         else None,
     )
@@ -507,7 +526,7 @@ def start_band(
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
     """Return a mask of stored cells near a source or a drain; None without both."""
-    regions = [*scene.source, *scene.drain]
+    regions: list[Shape] = [*scene.source, *scene.drain]
     if not regions:
         return None
     near = np.zeros(grid.shape, dtype=bool)

@@ -142,12 +142,6 @@ class ParticleSimulation(ParticleCheckpoints):
         self.allocate(grid, parts)
         self._laid = vars(self).keys() - others  # attributes that belong to a grid
         self._notes = [*notes, *self.rearrangement.notes()]
-        if grid.barriers is not None and scene.output.surface:
-            thin = ", ".join(grid.barriers.names)
-            self._notes.append(
-                f"output.surface goes through {thin}, thinner than a cell, where material is on "
-                "both sides"
-            )
         if self.sources is not None:
             self.sources.emit(particles, None, self.time)
         particles.sort()

@@ -18,6 +18,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.program_optimality import PROVABLE
 from warp_lcp.problem.protocol import HasRows, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
@@ -26,10 +27,6 @@ from warp_lcp.problem.solve import EPS, Precision, Step, WorkspaceBase
 # Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.
 SEMIDEFINITE = 1e-10
 SIDE = 4096  # largest number of unknowns of a dense matrix that is examined
-# Largest number of entries of A for a linear program that looks for a proof of infeasibility: it
-# takes seconds. With 84,000 entries and costs from 1e-4 to 1e12 HiGHS (SciPy 1.17) recurses until
-# the process crashes, with 31,000 in none of 20 cases.
-PROVABLE = 40_000
 PROOF_SECONDS = 10.0  # time limit of such a program: a longer one proves nothing
 # Tolerance of such a program, the least that HiGHS accepts; its optimum is a vertex, whose
 # equations hold to rounding.

@@ -66,7 +66,7 @@ class RunRequest:
         resume: continue the run in the folder, from any number of ranks.
         force: delete the run in the folder.
         force_memory: run even if the estimated memory exceeds the device's free memory.
-        record_problems: folder for the problem of each step, see `warp_lcp.gallery.recorded`; not
+        record_problems: folder for the problem of each step, see `warp_lcp.recorded_problem`; not
             on ranks.
     """
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.files.atomic import make_folder, replacing, write_text
-from warp_lcp.gallery.recorded import DESCRIPTION, files
+from warp_lcp.recorded_problem import DESCRIPTION, files
 from warp_lcp.run.folder import OutputError
 from warp_lcp.simulation import InputError
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import operator
+import sys
 from abc import abstractmethod
-from functools import cached_property
+from functools import cache, cached_property, reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import (
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    create_model,
+)
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.scene.motions import Motion
@@ -61,6 +69,7 @@ class Shape(Table):
     fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
     """
 
+    noun: ClassVar[str] = "Shape"  # what a table fills: begins its description
     if TYPE_CHECKING:
         shape: str  # value of the file's key, unique for each kind of shape
     translate: Vector | None = Field(default=None, description="translation [m]")
@@ -155,6 +164,9 @@ class Shape(Table):
     @property
     def _about_idles(self) -> bool:
         return self.about is not None and self.rotate is None and self.scale == 1.0
+
+
+Properties = TypeVar("Properties", bound=Shape)
 
 
 class BoxTable(Shape):
@@ -282,12 +294,48 @@ class MeshTable(Shape):
         return None
 
 
+SHAPES = (BoxTable, SphereTable, CapsuleTable, PlaneTable, MeshTable)
+
+
+@cache
+def shaped(properties: type[Properties], shape: type[Shape]) -> type[Properties]:
+    """Return the table of a shape with properties, such as SolidBox.
+
+    SolidBox has the keys of SolidProperties and BoxTable. Like a written class it is a name of the
+    module of its properties, by which it is pickled.
+    """
+    name = properties.__name__.removesuffix("Properties") + shape.__name__.removesuffix("Table")
+    kind = (shape.__doc__ or "").partition("\n")[0]
+    table: Any = create_model(
+        name,
+        __base__=(properties, shape),
+        __module__=properties.__module__,
+        __doc__=f"{properties.noun}: {kind[0].lower()}{kind[1:]}",
+    )
+    setattr(sys.modules[properties.__module__], name, table)
+    return table
+
+
+if TYPE_CHECKING:
+    OfAnyShape = Annotated[Properties, "of any shape"]
+else:
+
+    class OfAnyShape:
+        """Union of the tables of all shapes with the same properties, chosen by the key `shape`."""
+
+        def __class_getitem__(cls, properties: type[Shape]) -> Any:
+            """Return the union: `OfAnyShape[SolidProperties]`."""
+            tables = tuple(shaped(properties, shape) for shape in SHAPES)
+            return Annotated[reduce(operator.or_, tables), Field(discriminator="shape")]
+
+
 class SolidProperties(Shape):
     """Properties of a solid besides its shape.
 
-    Solids with more properties have classes derived from SolidBox, SolidSphere and so on.
+    Solids with more properties have a class derived from this one.
     """
 
+    noun: ClassVar[str] = "Solid"
     rubs: ClassVar[bool] = False  # whether the material has friction with solids at rest
     wall: Wall | None = Field(default=None, description="boundary condition; default: domain.wall")
     slip_length: float | None = Field(
@@ -404,6 +452,7 @@ class MaterialProperties(Shape):
 class LiquidProperties(MaterialProperties):
     """Properties of a liquid besides its shape."""
 
+    noun: ClassVar[str] = "Liquid"
     viscosity: float | None = Field(
         default=None,
         gt=0,
@@ -411,46 +460,6 @@ class LiquidProperties(MaterialProperties):
         allow_inf_nan=False,
         description="viscosity [Pa s]; default: viscosity.value",
     )
-
-
-class SolidBox(SolidProperties, BoxTable):
-    """Solid box."""
-
-
-class SolidSphere(SolidProperties, SphereTable):
-    """Solid ball."""
-
-
-class SolidCapsule(SolidProperties, CapsuleTable):
-    """Solid capsule."""
-
-
-class SolidPlane(SolidProperties, PlaneTable):
-    """Solid half space."""
-
-
-class SolidMesh(SolidProperties, MeshTable):
-    """Solid inside a triangle mesh."""
-
-
-class LiquidBox(LiquidProperties, BoxTable):
-    """Box of liquid."""
-
-
-class LiquidSphere(LiquidProperties, SphereTable):
-    """Ball of liquid."""
-
-
-class LiquidCapsule(LiquidProperties, CapsuleTable):
-    """Capsule of liquid."""
-
-
-class LiquidPlane(LiquidProperties, PlaneTable):
-    """Half space of liquid."""
-
-
-class LiquidMesh(LiquidProperties, MeshTable):
-    """Liquid inside a triangle mesh."""
 
 
 class Schedule(Table):
@@ -469,6 +478,7 @@ class Schedule(Table):
 class SourceProperties(Schedule, Shape):
     """Properties of a source besides its shape."""
 
+    noun: ClassVar[str] = "Source"
     velocity: Vector = Field(description="inflow velocity [m/s]")
     viscosity: float | None = Field(
         default=None,
@@ -491,62 +501,14 @@ class SourceProperties(Schedule, Shape):
 class DrainProperties(Schedule, Shape):
     """Properties of a drain besides its shape."""
 
+    noun: ClassVar[str] = "Drain"
+
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the drain in a scene of 2 or 3 dimensions."""
         return super().complaints(dimension) + self.schedule_complaints()
 
 
-class SourceBox(SourceProperties, BoxTable):
-    """Source in a box."""
-
-
-class SourceSphere(SourceProperties, SphereTable):
-    """Source in a ball."""
-
-
-class SourceCapsule(SourceProperties, CapsuleTable):
-    """Source in a capsule."""
-
-
-class SourcePlane(SourceProperties, PlaneTable):
-    """Source in a half space."""
-
-
-class SourceMesh(SourceProperties, MeshTable):
-    """Source inside a triangle mesh."""
-
-
-class DrainBox(DrainProperties, BoxTable):
-    """Drain in a box."""
-
-
-class DrainSphere(DrainProperties, SphereTable):
-    """Drain in a ball."""
-
-
-class DrainCapsule(DrainProperties, CapsuleTable):
-    """Drain in a capsule."""
-
-
-class DrainPlane(DrainProperties, PlaneTable):
-    """Drain in a half space."""
-
-
-class DrainMesh(DrainProperties, MeshTable):
-    """Drain inside a triangle mesh."""
-
-
-Solid = Annotated[
-    SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")
-]
-Liquid = Annotated[
-    LiquidBox | LiquidSphere | LiquidCapsule | LiquidPlane | LiquidMesh,
-    Field(discriminator="shape"),
-]
-Source = Annotated[
-    SourceBox | SourceSphere | SourceCapsule | SourcePlane | SourceMesh,
-    Field(discriminator="shape"),
-]
-Drain = Annotated[
-    DrainBox | DrainSphere | DrainCapsule | DrainPlane | DrainMesh, Field(discriminator="shape")
-]
+Solid = OfAnyShape[SolidProperties]
+Liquid = OfAnyShape[LiquidProperties]
+Source = OfAnyShape[SourceProperties]
+Drain = OfAnyShape[DrainProperties]

@@ -94,7 +94,7 @@ class QuadraticProgramWorkspace(DenseWorkspace):
         Raises:
             ValueError: A is not positive semi-definite.
         """
-        if not is_convex(self.read().scaled()[0].A):
+        if not is_convex_program(self.problem):
             raise ValueError(
                 "A is not positive semi-definite: QuadraticProgram needs a convex objective; Lemke "
                 "does not"
@@ -142,6 +142,11 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             else SolveStatus.MAX_ITERATIONS
         )
         return iterations
+
+
+def is_convex_program(problem: LCP) -> bool:
+    """Return whether the matrix of a symmetric problem is positive semi-definite."""
+    return is_convex(DenseProblem.read(problem, keep_sparse=True).scaled()[0].A)
 
 
 def is_convex(A: Any) -> bool:

@@ -8,14 +8,14 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.gallery.contact_models import (
+from warp_lcp.gallery.contact_scenes import box_stack, contact_scene, incline, motor_arm
+from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactSystem,
     FrozenBoxModel,
     StewartTrinkleModel,
     proximal_sweeps,
 )
-from warp_lcp.gallery.contact_scenes import box_stack, contact_scene, incline, motor_arm
 
 # [m/s] Friction turns the slip by a thousandth at most, so that it is almost never shared by two
 # vectors.

@@ -19,10 +19,8 @@ from typer.testing import CliRunner
 
 from small_runs import MINIMAL, ball, write_run
 from warp_lcp.cli import commands as cli
-from warp_lcp.frames.frames import FrameFolder
-from warp_lcp.frames.vtu import read_vtu
-from warp_lcp.render import live
-from warp_lcp.render.live import (
+from warp_lcp.extras import live
+from warp_lcp.extras.live import (
     LOOPBACK,
     MOST_ANSWERED,
     MOST_CONNECTIONS,
@@ -30,6 +28,8 @@ from warp_lcp.render.live import (
     LiveServer,
     live_server,
 )
+from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.render.recording import RenderError
 from warp_lcp.simulation import Points
 

@@ -13,15 +13,15 @@ import warp as wp
 from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledProxy
 
+from warp_lcp.extras.newton.bodies import WorldBodies
+from warp_lcp.extras.newton.shapes import geometries, reaches_into, united
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 from warp_lcp.fluids.scene import COUPLED_METHODS
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.particle_assembly import placed_solids
 from warp_lcp.material.particle_log import Row
-from warp_lcp.newton.bodies import WorldBodies
-from warp_lcp.newton.shapes import geometries, reaches_into, united
 from warp_lcp.scene.scene_file import SceneSource, load_scene
-from warp_lcp.scene.shapes import SolidSphere
+from warp_lcp.scene.shapes import SolidProperties, SphereTable, shaped
 from warp_lcp.simulation import StepFailed
 
 RETRIES = 6  # halvings of the time step after a failure
@@ -274,9 +274,9 @@ class SolverLiquid(SolverBase, CouplingInterface):
                 for body, shape, motion in movers
             ]
         # Placeholders in the list of solids, of which only the wall conditions matter.
+        ball = shaped(SolidProperties, SphereTable)
         stand, move = (
-            SolidSphere(shape="sphere", center=[0.0] * 3, radius=1.0, mass=mass)
-            for mass in (None, 1.0)
+            ball(shape="sphere", center=[0.0] * 3, radius=1.0, mass=mass) for mass in (None, 1.0)
         )
         solids = [*scene.solid, *[stand] * len(standing), *[move] * len(held)]
         whole = scene.model_copy(update={"solid": solids})

@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.gradients import jax as with_jax
-from warp_lcp.gradients import pytorch, tape
+from warp_lcp.extras.gradients import jax as with_jax
+from warp_lcp.extras.gradients import pytorch, tape
 
 SEED = 127
 OPTIONS = {"stopping": wl.StoppingCriteria(rtol=1e-12), "adjoint": wl.StoppingCriteria(rtol=1e-12)}

@@ -11,8 +11,8 @@ from typing import Any
 import newton
 import numpy as np
 
+from warp_lcp.extras.newton.shapes import rotation_of
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.newton.shapes import rotation_of
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody
 from warp_lcp.rigid.mass_properties import MassProperties

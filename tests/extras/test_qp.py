@@ -11,7 +11,7 @@ import pytest
 import scipy.sparse
 from scipy.optimize import lsq_linear
 
-from warp_lcp import qp
+from warp_lcp.extras import qp
 
 qpsolvers = pytest.importorskip("qpsolvers")
 USES = {
@@ -174,5 +174,5 @@ def test_names_are_there_once_and_nothing_is_imported_unasked():
     qp.register()
     for names in (qpsolvers.available_solvers, qpsolvers.dense_solvers, qpsolvers.sparse_solvers):
         assert names.count("warp_lcp") == 1
-    code = "import sys, warp_lcp, warp_lcp.qp; sys.exit('qpsolvers' in sys.modules)"
+    code = "import sys, warp_lcp, warp_lcp.extras.qp; sys.exit('qpsolvers' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

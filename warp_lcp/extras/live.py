@@ -273,7 +273,7 @@ class LiveServer(ThreadingHTTPServer):
         self._open: dict[socket.socket, None] = {}  # connections, the oldest first
         self._answered = 0  # requests in progress
         self._counting = Lock()
-        self.page = files("warp_lcp.render").joinpath("live.html").read_bytes()
+        self.page = files("warp_lcp.extras").joinpath("live.html").read_bytes()
         super().__init__((LOOPBACK, port), Answers)
 
     @property

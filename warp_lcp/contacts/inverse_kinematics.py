@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.contacts.articulated_figure import ArticulatedFigure
 from warp_lcp.default_chain import default_chain
-from warp_lcp.gallery.articulated_figure import ArticulatedFigure
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
@@ -146,7 +146,7 @@ class InverseKinematics(Settings):
         ValueError: an argument is outside its range.
 
     Example:
-        >>> from warp_lcp.gallery.articulated_figure import planar_chain
+        >>> from warp_lcp.contacts.articulated_figure import planar_chain
         >>> lower, upper = np.array([-3.0, 0.0]), np.array([3.0, 2.5])  # the elbow bends one way
         >>> arm = planar_chain([1.0, 1.0], lower=lower, upper=upper)
         >>> solver = InverseKinematics(device="cpu")

@@ -12,9 +12,9 @@ from command_line import invoke
 from mesh_checks import assert_closed, enclosed
 from small_liquids import GRAVITY, scene
 from small_runs import ball, box, run_into, write_run
+from warp_lcp.extras.usd import INSTALL, export_run, usd_suffix
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.recording import RenderError, Show
-from warp_lcp.render.usd import INSTALL, export_run, usd_suffix
 from warp_lcp.simulation import Points, Surface
 
 pytest.importorskip("pxr", reason="export needs usd-core, the extra `usd`")

@@ -15,6 +15,7 @@ from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.program_optimality import (
+    PROVABLE,
     ProgramPoint,
     ProgramUnits,
     ProgramWithRows,
@@ -27,10 +28,9 @@ from warp_lcp.problem.program_optimality import (
 )
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.reduced.dense_problem import PROVABLE, DenseProblem
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
-from warp_lcp.solvers.quadratic_program import is_convex
+from warp_lcp.solvers.quadratic_program import is_convex_program
 
 if TYPE_CHECKING:
     from qpsolvers import Problem, Solution
@@ -56,7 +56,7 @@ def register() -> None:
         import qpsolvers.solvers as there
     except ImportError as missing:
         raise ImportError(
-            "warp_lcp.qp needs qpsolvers: pip install 'warp-lcp[qpsolvers]' (or pip install "
+            "warp_lcp.extras.qp needs qpsolvers: pip install 'warp-lcp[qpsolvers]' (or pip install "
             "qpsolvers)"
         ) from missing
     there.solve_function[NAME] = solve_problem
@@ -364,5 +364,5 @@ def _check_convex(P: Any, q: np.ndarray) -> None:
     Only then do the first-order conditions hold at minimizers alone.
     """
     problem = LCP(as_operator(P, "cpu"), np.zeros_like(q), -np.inf)
-    if not is_convex(DenseProblem.read(problem, keep_sparse=True).scaled()[0].A):
+    if not is_convex_program(problem):
         raise ValueError("P is not positive semi-definite: the program is not convex")

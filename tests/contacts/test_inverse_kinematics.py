@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import warp_lcp as wl
 from kinematics_targets import MODELS, OUTSIDE, compare, targets
-from warp_lcp.gallery.articulated_figure import (
+from warp_lcp.contacts.articulated_figure import (
     ArticulatedFigure,
     branching_figure,
     planar_chain,
     spatial_chain,
 )
-from warp_lcp.gallery.inverse_kinematics import InverseKinematics, StepProblem
+from warp_lcp.contacts.inverse_kinematics import InverseKinematics, StepProblem
 from warp_lcp.problem.protocol import families
 
 FIGURES = {

@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 from small_runs import ball, write_run
 from warp_lcp.cli import commands as cli
+from warp_lcp.extras.viewer import Viewer
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import INSTALL
-from warp_lcp.render.viewer import Viewer
 
 
 class Clock:

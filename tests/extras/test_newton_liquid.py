@@ -10,7 +10,7 @@ newton = pytest.importorskip("newton", reason="newton is missing: the extra newt
 
 from newton.solvers import SolverXPBD  # noqa: E402
 
-from warp_lcp.newton.solver import SolverLiquid  # noqa: E402
+from warp_lcp.extras.newton.solver import SolverLiquid  # noqa: E402
 
 GRAVITY, WATER = 9.81, 1000.0
 pytestmark = pytest.mark.filterwarnings("default")  # newton's own warnings

@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_lcp.files.archive import Archive
 from warp_lcp.files.size_limits import check_claim
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.host_problem import Problem
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
 from warp_lcp.problem.lcp import LCP
 
@@ -49,7 +49,7 @@ archives of plain arrays (`numpy.load`, no pickles). Cells are indexed [z, y, x]
 cell touches. r is the 2-norm of d (x - clip(x - y / d, lower, upper)) with d the diagonal of A.
 `absolute_tolerance` has the unit of y.
 
-`warp_lcp.gallery.recorded.load(file)` gives the problem to Python;
+`warp_lcp.recorded_problem.load(file)` gives the problem to Python;
 `warp-lcp solve FILE --method NAME` solves it.
 """
 

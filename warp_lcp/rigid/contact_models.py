@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.host_problem import Problem
 from warp_lcp.problem.affine_bounds import AffineBounds
 
 

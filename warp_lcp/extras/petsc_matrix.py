@@ -29,7 +29,7 @@ from warp_lcp.problem.protocol import HasStencil
 if TYPE_CHECKING:
     from petsc4py import PETSc
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/petsc_matrix.h")
 ENTER = KERNELS["vector_copies.enter"]
 LEAVE = KERNELS["vector_copies.leave"]
 TRUE_RESIDUAL = frozenset(

@@ -1,0 +1,4 @@
+"""Extras: what connects warp_lcp to other programs and libraries.
+
+Only the command line imports them. They use documented modules.
+"""

@@ -1,0 +1,1 @@
+"""Gradients of solves in Warp's tape, PyTorch and JAX."""
