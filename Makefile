@@ -8,7 +8,7 @@ OUT ?= out/dam-break
 # Processes that run the tests.
 WORKERS ?= 2
 
-.PHONY: demo films test check test-distributed emulated-cuda slow fuzz mutants docs wheel-check dist-check clean
+.PHONY: demo films test check test-distributed emulated-cuda slow fuzz mutants docs docs-version wheel-check dist-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -69,6 +69,12 @@ films: $(VENV)/.dev
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The site as one of several versions, by mike: a commit on the local branch gh-pages, nothing is pushed.
+docs-version: $(VENV)/.docs
+	version=$$($(BIN)/python -c "import tomllib; print(tomllib.load(open('pyproject.toml', 'rb'))['project']['version'])"); \
+		DOCS_VERSIONS=mike NO_MKDOCS_2_WARNING=1 $(BIN)/mike deploy --update-aliases "$${version%.*}" latest
+	$(BIN)/mike set-default latest
 
 # A wheel holds everything a run needs, and nothing beside `warp_lcp`: install it alone, with the oldest versions that pyproject.toml allows
 # (those of the oldest Python), and away from the source tree run a built-in scene of each simulator, and let mypy see its types.
