@@ -11,6 +11,7 @@ import warp as wp
 from pydantic import ValidationError
 from scipy.linalg import eigvalsh_tridiagonal
 
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, scene
 from viscous_scenes import stirred_scene, viscous_scene
 from warp_lcp.fluids.viscosity import Viscosity
@@ -276,8 +277,7 @@ def test_any_liquid_stirred_by_any_solids_is_solved(seed: int) -> None:
     assert most <= 40
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("slip", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize(("slip", "dimension"), covering([0.0, 0.02, 0.3], [2, 3]))
 def test_liquid_that_turns_with_its_wall_feels_no_force(dimension: int, slip: float) -> None:
     """Rigid rotation of liquid with its wall: no force.
 
@@ -339,8 +339,7 @@ def test_liquid_that_falls_as_fast_as_its_source_feels_no_force() -> None:
     assert prepared(simulation, [np.zeros(shape), np.full(shape, -1.0)]).iterations == 0
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("viscosity", [1.0, 100.0, 1e4])
+@pytest.mark.parametrize(("viscosity", "dimension"), covering([1.0, 100.0, 1e4], [2, 3]))
 def test_a_block_leaves_a_ceiling_that_separates(dimension: int, viscosity: float) -> None:
     """Separation of a block from a ceiling.
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from default_run import chosen
 from warp_lcp.contacts.methods import BOXED, JOINTED, STEWART_TRINKLE, MethodOfChoice
 from warp_lcp.grid.solids import Box
 from warp_lcp.rigid.bodies import RigidBodies
@@ -233,7 +234,9 @@ def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
     assert bodies.row()["joint0_torque"] == pytest.approx(weight, rel=0.02)
 
 
-@pytest.mark.parametrize("method", [*BOXED, *STEWART_TRINKLE])
+@pytest.mark.parametrize(
+    "method", chosen([*BOXED, *STEWART_TRINKLE], ["nncg", "psor", "staggering", "lemke"])
+)
 def test_every_method_takes_the_equations_of_joints(method):
     """Equations of joints by every method.
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import boxed, natural_residual
 from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
@@ -90,8 +91,7 @@ def test_too_many_unknowns_are_refused():
         DirectEnumeration().init(wl.LCP(wl.DenseOperator(np.eye(5), device="cpu"), np.ones(5)))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
-@pytest.mark.parametrize("dtype", [wp.float64, wp.float32])
+@pytest.mark.parametrize(("n", "dtype"), covering([1, 2, 3, 4], [wp.float64, wp.float32]))
 def test_batch(n, dtype, device):
     rng = np.random.default_rng(300 + n)
     m, exact = 400, dtype is wp.float64

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.problem.residual import NaturalResidual
@@ -97,10 +98,10 @@ def test_conjugate_gradients_stop_without_a_right_hand_side():
     assert not system.e.numpy().any()
 
 
-@pytest.mark.parametrize("form", FACES, ids=str)
-@pytest.mark.parametrize("upper", [np.inf, 0.4])
-@pytest.mark.parametrize("share", [1.0, 0.9])
-@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+@pytest.mark.parametrize(
+    ("form", "upper", "share", "real"),
+    covering(list(FACES), [np.inf, 0.4], [1.0, 0.9], [wp.float32, wp.float64], count=8),
+)
 def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, share, real):
     """Fischer step: its move, its residual and its system.
 

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from drawn_stencils import SINGULAR, drawn_dominant, drawn_singular, natural_residual
 from warp_lcp.operators.grid_matrix import grid_matrix
 
@@ -91,8 +92,7 @@ def check_singular(seed, kind):
             assert found <= 1e-5 * np.linalg.norm(right)
 
 
-@pytest.mark.parametrize("kind", SINGULAR)
-@pytest.mark.parametrize("seed", [2, 18, 23])
+@pytest.mark.parametrize(("seed", "kind"), covering([2, 18, 23], list(SINGULAR)))
 def test_singular_stencils_are_solved_or_infeasible(seed, kind):
     check_singular(seed, kind)
 
