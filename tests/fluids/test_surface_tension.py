@@ -442,7 +442,7 @@ def test_the_pressure_in_a_drop(across: int, dimension: int, error: float) -> No
     )
 
 
-@pytest.mark.parametrize(("times", "bound"), [(1.0, 1e-2), (10.0, 1e-2)])
+@pytest.mark.parametrize(("times", "bound"), [slow((1.0, 1e-2)), (10.0, 1e-2)])
 def test_a_drop_at_rest_stays_so(times: float, bound: float) -> None:
     simulation = drop(16)
     rows = advance(simulation, 12.0 * TIME, times * capillary_step(simulation))

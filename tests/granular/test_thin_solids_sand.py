@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from default_run import covering
+from default_run import covering, slow
 from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
@@ -71,7 +71,7 @@ def test_no_grain_passes_the_sides_of_a_funnel() -> None:
     assert not ((y > 0.4) & ((x + y < 0.8) | (x - y > 0.2))).any()
 
 
-@pytest.mark.parametrize("thickness", [0.25, 1.28])
+@pytest.mark.parametrize("thickness", [0.25, slow(1.28)])
 def test_a_shaken_box_keeps_its_sand(thickness: float) -> None:
     low, high = 0.23, 0.77
     motion = {"kind": "sinusoid", "period": 0.5, "amplitude": [0.1, 0.03]}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from default_run import chosen
+from default_run import chosen, slow
 from warp_lcp.contacts.methods import BOXED, JOINTED, STEWART_TRINKLE, MethodOfChoice
 from warp_lcp.grid.solids import Box
 from warp_lcp.rigid.bodies import RigidBodies
@@ -147,7 +147,7 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
     assert 2 * np.diff(zeros).mean() == pytest.approx(period, rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["ball", "hinge", "fixed"])
+@pytest.mark.parametrize("kind", ["ball", slow("hinge"), "fixed"])
 def test_joined_bodies_in_flight_keep_both_momenta(kind):
     bodies = system(
         tuple(

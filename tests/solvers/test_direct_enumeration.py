@@ -33,7 +33,7 @@ def random_bounds(rng, n):
     return lower, upper
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 4))
 def test_any_matrix_any_bounds(seed, n):
     """Any matrix with any bounds.

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from default_run import covering
+from default_run import covering, slow
 from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.problem.residual import NaturalResidual
@@ -337,8 +337,7 @@ def test_a_bad_guess_is_left_by_shorter_steps_or_projected_cycles(method):
 
 
 @pytest.mark.parametrize(
-    ("precision", "seeds"),
-    [("mixed", 12), ("single", 4), pytest.param("single", 12, marks=pytest.mark.slow)],
+    ("precision", "seeds"), [("mixed", 4), ("single", 4), slow(("mixed", 12)), slow(("single", 12))]
 )
 @pytest.mark.parametrize("periodic", [False, True])
 def test_the_best_iterate_is_returned_however_the_solve_is_cut_short(precision, seeds, periodic):

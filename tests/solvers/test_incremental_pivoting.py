@@ -47,7 +47,7 @@ def test_semidefinite_problems(zeros):
         assert natural_residual(A, b, 0.0, np.inf, x) <= 100 * rounding
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 6))
 def test_boxes_and_equations(seed, n):
     rng = np.random.default_rng(seed)

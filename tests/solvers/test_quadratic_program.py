@@ -28,7 +28,7 @@ def solve(A, b, lower=0.0, upper=np.inf, solver=None):
 @pytest.mark.parametrize("sparse", [False, True])
 def test_boxes_and_equations(sparse):
     rng = np.random.default_rng(901)
-    for _ in range(100):
+    for _ in range(40):
         n = int(rng.integers(1, 7))
         B = rng.standard_normal((n, n))
         A, b, kind = B @ B.T + 0.1 * np.eye(n), rng.standard_normal(n), rng.integers(0, 5, n)
