@@ -50,9 +50,10 @@ def ball(dimension: int, **more: Any) -> dict[str, Any]:
     return {"shape": "sphere", "center": [0.41, 0.27, 0.37][:dimension], "radius": 0.15, **more}
 
 
-@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
-@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    ("dimension", "solids", "surface"),
+    covering([2, 3], ["cut-cell", "voxel"], ["ghost-fluid", "voxel"], count=4),
+)
 def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, surface: str) -> None:
     """Archimedes' principle, and the weight on the floor.
 

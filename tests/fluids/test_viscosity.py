@@ -100,8 +100,7 @@ def force_of_energy(simulation, u, tau: float, relative=None):
     return result, volume
 
 
-@pytest.mark.parametrize("varies", [False, True])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("dimension", "varies"), covering([2, 3], [False, True]))
 def test_the_equations_are_the_energys(dimension: int, varies: bool) -> None:
     simulation, rng = blob(dimension, own=100.0 if varies else None), np.random.default_rng(3)
     grid, viscosity = simulation.grid, simulation.viscosity
@@ -182,8 +181,7 @@ def test_the_surface_bears_no_shear_however_short_the_step(above: float) -> None
     assert max(shear.values()) < 0.15
 
 
-@pytest.mark.parametrize("shape", ["tank", "drops"])
-@pytest.mark.parametrize("viscosity", [1e-3, 1.0, 1e3, 1e5])
+@pytest.mark.parametrize(("viscosity", "shape"), covering([1e-3, 1.0, 1e3, 1e5], ["tank", "drops"]))
 def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> None:
     drops = [
         {"shape": "sphere", "center": [x, y], "radius": r}

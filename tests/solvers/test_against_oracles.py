@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import assemble, boxed, lemke, natural_residual
 
 METHODS = {
@@ -51,8 +52,9 @@ def test_dense_planted(name, device):
 
 
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("shape", [(7, 6, 9), (13, 11), (1, 9, 8), (5, 1)])
-@pytest.mark.parametrize("arrays", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "arrays"), covering([(7, 6, 9), (13, 11), (1, 9, 8), (5, 1)], [False, True])
+)
 def test_grid_planted(name, shape, arrays, device):
     rng = np.random.default_rng(23)
     cells = rng.choice(3, shape, p=[0.15, 0.75, 0.1])

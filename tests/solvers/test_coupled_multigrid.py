@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from default_run import slow
+from default_run import covering, slow
 from method_steps import begun
 from oracle import assemble, lemke, natural_residual
 from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
@@ -36,13 +36,14 @@ def small(device, dtype=wp.float64):
     )
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
 @pytest.mark.parametrize(
-    "weights", [np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 0.0]), np.full((3, 3), 1.0)]
-)
-@pytest.mark.parametrize(
-    "solver",
-    [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()],
+    ("solver", "weights", "scale"),
+    covering(
+        [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()],
+        [np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 0.0]), np.full((3, 3), 1.0)],
+        [1e-3, 1.0, 30.0],
+        count=9,
+    ),
 )
 def test_the_dense_oracle_agrees(solver, weights, scale, device):
     """Agreement with the dense oracle.
