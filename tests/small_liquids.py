@@ -1,15 +1,17 @@
 """Scenes of a small liquid, and functions to run them."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import stepping
 from scene_tables import box
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 GRAVITY = 9.81
-STEPS = 2000
+advance = partial(stepping.advance, dt_max=0.02)
 
 
 def scene(
@@ -48,18 +50,6 @@ def dam(dimension: int = 2, device: str = "cpu", **tables: Any) -> LiquidSimulat
     return create(
         scene(size=size[:dimension], resolution=16, liquid=liquid, **tables), device=device
     )
-
-
-def advance(
-    simulation: LiquidSimulation, until: float, dt_max: float = 0.02
-) -> list[dict[str, Any]]:
-    """Step to a time and return the rows of the log."""
-    rows: list[dict[str, Any]] = []
-    while simulation.time < until - 1e-9:
-        assert len(rows) < STEPS, "the time step has become too small to get anywhere"
-        dt = min(simulation.stable_dt(), dt_max, until - simulation.time)
-        rows.append({"dt": dt, **simulation.step(dt)})
-    return rows
 
 
 def random_tank(seed: int) -> dict[str, Any]:

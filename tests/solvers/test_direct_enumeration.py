@@ -1,6 +1,7 @@
 """Direct enumeration against exhaustive search and by hand; batches."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from default_run import covering
+from matrices import solve_matrix
 from oracle import boxed, natural_residual
 from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
@@ -17,12 +19,7 @@ from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, 
 TIGHT = wl.StoppingCriteria(rtol=1e-12)
 
 
-def solve(A, b, lower=0.0, upper=np.inf):
-    return wl.solve(
-        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
-        DirectEnumeration(),
-        stopping=TIGHT,
-    )
+solve = partial(solve_matrix, solver=DirectEnumeration(), stopping=TIGHT)
 
 
 def random_bounds(rng, n):
