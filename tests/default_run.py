@@ -4,6 +4,7 @@
 """
 
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -27,18 +28,31 @@ def chosen(values: Iterable[Any], default: Iterable[Any]) -> list[Any]:
 def covering(*axes: Sequence[Any], count: int | None = None) -> list[Any]:
     """Return all combinations of the values of several arguments.
 
-    As many as the longest axis has, or `count`, run by default. Each value occurs among them if
-    `count` is at least that length, and two axes do not go in step.
+    As many as the longest axis has, or `count`, run by default: first those with new values, then
+    those with new pairs of values, then those with values that are rare so far.
     """
-    sizes = [len(axis) for axis in axes]
-    default = set()
-    for k in range(count or max(sizes)):
-        # An axis that has been passed once is shifted, each axis by another amount.
-        default.add(tuple((k + j * (k // n)) % n for j, n in enumerate(sizes)))
+    rest = list(itertools.product(*(range(len(axis)) for axis in axes)))
+    default: list[tuple[int, ...]] = []
+    seen: Counter[Any] = Counter()
+
+    def news(places: tuple[int, ...]) -> tuple[int, int, int]:
+        values = list(enumerate(places))
+        pairs = itertools.combinations(values, 2)
+        return (
+            sum(seen[value] == 0 for value in values),
+            sum(seen[pair] == 0 for pair in pairs),
+            -sum(seen[value] for value in values),
+        )
+
+    for _ in range(min(count or max(map(len, axes)), len(rest))):
+        default.append(max(rest, key=news))
+        rest.remove(default[-1])
+        values = list(enumerate(default[-1]))
+        seen.update([*values, *itertools.combinations(values, 2)])
     found = []
-    for places in itertools.product(*map(range, sizes)):
-        values = tuple(axis[place] for axis, place in zip(axes, places, strict=True))
-        found.append(values if places in default else slow(values))
+    for places in itertools.product(*(range(len(axis)) for axis in axes)):
+        combined = tuple(axis[place] for axis, place in zip(axes, places, strict=True))
+        found.append(combined if places in default else slow(combined))
     return found
 
 

@@ -88,7 +88,7 @@ def enumerate_contacts(A, b, mu):
     return found
 
 
-@pytest.mark.parametrize(("name", "sparse"), covering(list(SWEEPING), [False, True]))
+@pytest.mark.parametrize(("name", "sparse"), covering(list(SWEEPING), [True, False]))
 def test_planar_contacts_have_the_enumerated_solution(name, sparse, device):
     if sparse and name == "greedy":
         pytest.skip("the greedy order reads the same rows from both")
