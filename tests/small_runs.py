@@ -51,7 +51,7 @@ def run_into(
     )
 
 
-def run_scene(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
+def run_scene_file(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
     """Run the scene of a file with overrides into a folder; options as of `run_into`."""
     return run_into(load_scene(scene, overrides), out, **options)
 

@@ -4,7 +4,7 @@ import meshio
 import pytest
 
 from mesh_checks import assert_closed, enclosed
-from small_runs import run_scene
+from small_runs import run_scene_file
 from warp_lcp.scene.scene_file import load_scene
 
 SCENE = """
@@ -30,7 +30,9 @@ surface = true
 def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
     (tmp_path / "dam.toml").write_text(SCENE)
     out = tmp_path / "out"
-    assert run_scene(tmp_path / "dam.toml", out, "output.surface_ply=true").status == "finished"
+    assert (
+        run_scene_file(tmp_path / "dam.toml", out, "output.surface_ply=true").status == "finished"
+    )
     names = [f"surface_{index:06d}.{suffix}" for index in range(3) for suffix in ("ply", "vtu")]
     assert sorted(file.name for file in (out / "frames").iterdir()) == names
     assert (out / "surface.pvd").read_text().count("DataSet") == 3
@@ -50,9 +52,9 @@ def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
 def test_an_interrupted_run_writes_the_same_surfaces(tmp_path):
     (tmp_path / "dam.toml").write_text(SCENE)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    run_scene(tmp_path / "dam.toml", whole)
-    run_scene(tmp_path / "dam.toml", parts, last_frame=1)
-    run_scene(tmp_path / "dam.toml", parts, resume=True)
+    run_scene_file(tmp_path / "dam.toml", whole)
+    run_scene_file(tmp_path / "dam.toml", parts, last_frame=1)
+    run_scene_file(tmp_path / "dam.toml", parts, resume=True)
     for index in range(3):
         file = f"frames/surface_{index:06d}.vtu"
         assert (parts / file).read_bytes() == (whole / file).read_bytes()
@@ -62,7 +64,7 @@ def test_a_run_that_shows_nothing_asks_for_no_frame(dots, scene_file, tmp_path, 
     asked = []
     kind = type(dots.create(load_scene(scene_file), device="cpu", folder=tmp_path))
     monkeypatch.setattr(kind, "frame", lambda self: asked.append(self.time) or [])
-    run_scene(scene_file, tmp_path / "out", "output.particles=false", "output.grid=false")
+    run_scene_file(scene_file, tmp_path / "out", "output.particles=false", "output.grid=false")
     assert asked == []
-    run_scene(scene_file, tmp_path / "more", "output.grid=false")
+    run_scene_file(scene_file, tmp_path / "more", "output.grid=false")
     assert len(asked) > 5
