@@ -194,7 +194,7 @@ def test_sweep(name, first, monkeypatch):
     outcomes, found = sweep(name, cls, [first + sum(map(ord, name))])
     assert not found, "\n".join(found)
     if "most_unknowns" not in vars(cls) or cls.most_unknowns > 100:
-        assert sum(outcomes.values()) >= (1 if families(cls) == {"grid"} else len(FAMILIES))
+        assert sum(outcomes.values()) >= (1 if families(cls) == {"grid"} else len(FAMILIES) // 2)
 
 
 @pytest.mark.slow
