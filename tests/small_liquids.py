@@ -1,6 +1,5 @@
 """Scenes of a small liquid, and functions to run them."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from scene_tables import box
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 GRAVITY = 9.81
-advance = partial(stepping.advance, dt_max=0.02)
 
 
 def scene(
@@ -83,3 +81,10 @@ def random_tank(seed: int) -> dict[str, Any]:
         "liquid": [box([0.0] * dimension, top)],
         **tables,
     }
+
+
+def advance(
+    simulation: LiquidSimulation, until: float, dt_max: float = 0.02
+) -> list[dict[str, Any]]:
+    """Step to a time and return the rows of the log."""
+    return stepping.advance(simulation, until, dt_max)

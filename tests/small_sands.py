@@ -1,6 +1,5 @@
 """Scenes of a small amount of sand, and functions to run them."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
 GRAVITY = 9.81
-advance = partial(stepping.advance, dt_max=5e-3)
 
 
 def scene(
@@ -47,3 +45,8 @@ def column(dimension: int = 2, device: str = "cpu", **tables: Any) -> SandSimula
     size, high = [1.0, 0.5, 0.25], [0.375, 0.375, 0.25]
     sand = [box([0.0] * dimension, high[:dimension])]
     return create(scene(size=size[:dimension], resolution=16, sand=sand, **tables), device=device)
+
+
+def advance(simulation: SandSimulation, until: float, dt_max: float = 5e-3) -> list[dict[str, Any]]:
+    """Step to a time and return the rows of the log."""
+    return stepping.advance(simulation, until, dt_max)
