@@ -24,6 +24,15 @@ def run(code: str, page: Path) -> None:
     exec(compile(code, page.name, "exec"), {"__name__": f"block_of_{page.stem}"})
 
 
+def sponge() -> type:
+    """Return the class of the page of a user's own model, without its final run."""
+    page = Path(__file__).parents[1] / "docs" / "own-model.md"
+    code = blocks(page, "python")[0].split("scene = load_scene")[0]
+    names: dict[str, type] = {}
+    exec(compile(code, page.name, "exec"), names)
+    return names["Sponge"]
+
+
 def links(page: Path) -> list[str]:
     """Return the targets of a page's links and pictures."""
     return re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", prose(page)))

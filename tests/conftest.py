@@ -30,7 +30,7 @@ UNHURRIED = {
     "database": None,
     "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large],
 }
-settings.register_profile("few", max_examples=40, derandomize=True, **UNHURRIED)
+settings.register_profile("few", max_examples=20, derandomize=True, **UNHURRIED)
 settings.register_profile(
     "fuzz", max_examples=int(os.environ.get("FUZZ_EXAMPLES", "10000")), **UNHURRIED
 )

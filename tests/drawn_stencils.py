@@ -302,9 +302,3 @@ def drawn_dominant(seed, side=40, side_in_space=10):
         0.0 if bounded else -np.inf,
         upper,
     )
-
-
-def natural_residual(matrix, diagonal, x, b, lower, upper):
-    """Return ||d (x - clip(x - (A x + b)/d, l, u))||."""
-    y = matrix @ x + b
-    return float(np.linalg.norm(diagonal * (x - np.clip(x - y / diagonal, lower, upper))))

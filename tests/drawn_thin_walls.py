@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from scene_tables import box
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.scene.table import validate
 
@@ -68,16 +69,6 @@ class Outcome:
     load: float | None
     density: float
     failures: Counter[str] = field(default_factory=Counter)
-
-
-def box(low: Any, high: Any, **more: Any) -> Tables:
-    """Return a box."""
-    return {
-        "shape": "box",
-        "min": np.asarray(low).tolist(),
-        "max": np.asarray(high).tolist(),
-        **more,
-    }
 
 
 def scene(

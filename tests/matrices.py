@@ -50,12 +50,28 @@ def dense_and_sparse(A, device):
 
 def posed(A, b, kind, lower=0.0, upper=np.inf):
     """Return the LCP of a matrix, as an operator of kind "dense" or "sparse"."""
-    operator = (
-        wl.DenseOperator(A, device="cpu")
-        if kind == "dense"
-        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
-    )
-    return wl.LCP(operator, b, lower, upper)
+    return wl.LCP(operator_of(A, kind), b, lower, upper)
+
+
+def posed_dense(A, b, lower=0.0, upper=np.inf):
+    """Return the LCP of a dense matrix."""
+    return posed(A, b, "dense", lower, upper)
+
+
+def operator_of(A, kind, device="cpu"):
+    """Return the operator of a matrix, of kind "dense" or "sparse"."""
+    if kind == "dense":
+        return wl.DenseOperator(A, device=device)
+    return wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
+
+
+def solve_matrix(A, b, lower=0.0, upper=np.inf, solver=None, **options):
+    """Solve the LCP of a matrix on the CPU, sparse as a SciPy matrix and dense as an array.
+
+    `solver` is the method; `options` are those of `wl.solve`.
+    """
+    kind = "sparse" if scipy.sparse.issparse(A) else "dense"
+    return wl.solve(posed(A, b, kind, lower, upper), solver, **options)
 
 
 def planted_solution(A, rng, share):

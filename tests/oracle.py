@@ -127,8 +127,11 @@ def natural_scale(A):
     return q * np.array([row.max() or 1.0 for row in size / q])
 
 
-def natural_residual(A, b, lower, upper, x):
-    """Return the norm of the natural residual, from its definition."""
-    d = natural_scale(A)
+def natural_residual(A, b, lower, upper, x, d=None):
+    """Return the norm of the natural residual, from its definition.
+
+    Its scale d is by default that of a dense matrix.
+    """
+    d = natural_scale(A) if d is None else d
     y = A @ x + b
     return np.linalg.norm(d * (x - np.clip(x - y / d, lower, upper)))

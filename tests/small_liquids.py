@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+import stepping
 from scene_tables import box
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 GRAVITY = 9.81
-STEPS = 2000
 
 
 def scene(
@@ -50,18 +50,6 @@ def dam(dimension: int = 2, device: str = "cpu", **tables: Any) -> LiquidSimulat
     )
 
 
-def advance(
-    simulation: LiquidSimulation, until: float, dt_max: float = 0.02
-) -> list[dict[str, Any]]:
-    """Step to a time and return the rows of the log."""
-    rows: list[dict[str, Any]] = []
-    while simulation.time < until - 1e-9:
-        assert len(rows) < STEPS, "the time step has become too small to get anywhere"
-        dt = min(simulation.stable_dt(), dt_max, until - simulation.time)
-        rows.append({"dt": dt, **simulation.step(dt)})
-    return rows
-
-
 def random_tank(seed: int) -> dict[str, Any]:
     """Return the tables of a pool with a few solids in 2-D or 3-D.
 
@@ -93,3 +81,10 @@ def random_tank(seed: int) -> dict[str, Any]:
         "liquid": [box([0.0] * dimension, top)],
         **tables,
     }
+
+
+def advance(
+    simulation: LiquidSimulation, until: float, dt_max: float = 0.02
+) -> list[dict[str, Any]]:
+    """Step to a time and return the rows of the log."""
+    return stepping.advance(simulation, until, dt_max)

@@ -1,5 +1,6 @@
 """Hand-written run folders with surfaces and bodies, for tests of images."""
 
+import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,6 +49,11 @@ def run_into(
         observer=observer or Lines(Console(quiet=True)),
         **options,
     )
+
+
+def run_scene_file(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
+    """Run the scene of a file with overrides into a folder; options as of `run_into`."""
+    return run_into(load_scene(scene, overrides), out, **options)
 
 
 def write_run(
@@ -149,6 +155,23 @@ def sphere() -> tuple[np.ndarray, np.ndarray]:
 def read_record(folder: Path) -> dict[str, Any]:
     """Return what `run.json` in a run's folder holds."""
     return json.loads((folder / "run.json").read_text())
+
+
+def run_contents(folder: Path) -> dict[str, Any]:
+    """Return what equal runs have in common.
+
+    They are frames, collections, the log without seconds, the scene, and the arrays of checkpoints.
+    """
+    files = [*folder.glob("frames/*"), *folder.glob("*.pvd"), folder / "scene.toml"]
+    found: dict[str, Any] = {str(p.relative_to(folder)): p.read_bytes() for p in files}
+    with open(folder / "log.csv", newline="") as file:
+        found["log"] = [
+            {key: value for key, value in row.items() if key != "seconds"}
+            for row in csv.DictReader(file)
+        ]
+    for path in folder.glob("checkpoints/step_*.npz"):
+        found[path.name] = {name: array.tobytes() for name, array in np.load(path).items()}
+    return found
 
 
 def written_files(folder: Path) -> dict[str, bytes]:

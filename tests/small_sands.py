@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+import stepping
 from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
 GRAVITY = 9.81
-STEPS = 3000
 
 
 def scene(
@@ -49,9 +49,4 @@ def column(dimension: int = 2, device: str = "cpu", **tables: Any) -> SandSimula
 
 def advance(simulation: SandSimulation, until: float, dt_max: float = 5e-3) -> list[dict[str, Any]]:
     """Step to a time and return the rows of the log."""
-    rows: list[dict[str, Any]] = []
-    while simulation.time < until - 1e-9:
-        assert len(rows) < STEPS, "the time step has become too small to get anywhere"
-        dt = min(simulation.stable_dt(), dt_max, until - simulation.time)
-        rows.append({"dt": dt, **simulation.step(dt)})
-    return rows
+    return stepping.advance(simulation, until, dt_max)

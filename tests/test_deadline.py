@@ -12,6 +12,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import by_turns
 from oracle import natural_residual
 from warp_lcp import deadline
 from warp_lcp.problem.protocol import families
@@ -83,7 +84,9 @@ def solve(monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "family"),
-    [(name, family) for name, cls in wl.METHODS.items() for family in sorted(families(cls))],
+    by_turns(
+        [(name, family) for name, cls in wl.METHODS.items() for family in sorted(families(cls))]
+    ),
 )
 def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
     if name == "quadratic-program":

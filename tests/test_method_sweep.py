@@ -17,6 +17,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import slow
 from oracle import natural_residual
 from warp_lcp.gallery import FAMILIES
 from warp_lcp.problem.protocol import families
@@ -184,15 +185,17 @@ def some(name):
     return METHODS[name]
 
 
+@pytest.mark.parametrize("firsts", [[1000], slow([1000, 2000])])
 @pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if families(cls)])
-def test_sweep(name, monkeypatch):
+def test_sweep(name, firsts, monkeypatch):
     # Many of these would otherwise run to the full sweep's limit.
     monkeypatch.setitem(LIMITS, "max_iterations", 150)
     cls = some(name)
-    outcomes, found = sweep(name, cls, [1000 + sum(map(ord, name)), 2000 + sum(map(ord, name))])
+    outcomes, found = sweep(name, cls, [first + sum(map(ord, name)) for first in firsts])
     assert not found, "\n".join(found)
     if "most_unknowns" not in vars(cls) or cls.most_unknowns > 100:
-        assert sum(outcomes.values()) >= (1 if families(cls) == {"grid"} else len(FAMILIES))
+        expected = len(firsts) * len(FAMILIES) // 2
+        assert sum(outcomes.values()) >= (1 if families(cls) == {"grid"} else expected)
 
 
 @pytest.mark.slow

@@ -7,10 +7,9 @@ import shlex
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from code_blocks import blocks, run
-from warp_lcp.cli.commands import app
+from command_line import succeed
 
 TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorial.md"
 SCENES = blocks(TUTORIAL, "toml")
@@ -22,12 +21,6 @@ COMMANDS = [
 ]
 # The text's films take longer.
 SHORTER = ["--set", "time.duration=0.05", "--set", "domain.resolution=24"]
-
-
-def invoke(*words):
-    outcome = CliRunner().invoke(app, list(words))
-    assert outcome.exit_code == 0, outcome.output
-    return outcome.output
 
 
 @pytest.mark.parametrize("code", blocks(TUTORIAL, "python"))
@@ -51,8 +44,8 @@ def test_there_are_scenes_of_both_materials():
 def test_scenes_run(text, tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text(text)
-    invoke("check", str(scene))
-    invoke("run", str(scene), "--out", str(tmp_path / "out"), *SHORTER)
+    succeed("check", str(scene))
+    succeed("run", str(scene), "--out", str(tmp_path / "out"), *SHORTER)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["status"] == "finished"
     with (tmp_path / "out" / "log.csv").open() as log:
         assert list(csv.DictReader(log))
@@ -81,7 +74,7 @@ def test_commands_work(tmp_path, monkeypatch):
     for words in COMMANDS:
         if words[0] == "render":
             pytest.importorskip("pyvista")
-        invoke(*words, *(SHORTER if words[0] == "run" else []))
+        succeed(*words, *(SHORTER if words[0] == "run" else []))
     assert {path.name for path in tmp_path.iterdir()} == {
         "dam",
         "crate",
@@ -98,7 +91,7 @@ def test_the_scene_with_a_body_has_one(tmp_path):
     """Scene with a body, at the text's resolution, until the crate meets the water."""
     scene = tmp_path / "crate.toml"
     scene.write_text(SCENES[0])
-    invoke("run", str(scene), "--out", str(tmp_path / "out"), "--frames", "3")
+    succeed("run", str(scene), "--out", str(tmp_path / "out"), "--frames", "3")
     with (tmp_path / "out" / "log.csv").open() as log:
         rows = list(csv.DictReader(log))
     assert float(rows[-1]["body0_y"]) < 0.35 - 0.04

@@ -11,6 +11,7 @@ import warp as wp
 from typer.testing import CliRunner
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import bounds, broken, case, matrices, refused, shapes
@@ -64,8 +65,9 @@ def test_there_are_enough_cases_of_every_kind():
     )
 
 
-@pytest.mark.parametrize("name", broken.SOLVERS)
-@pytest.mark.parametrize("precision", case.PRECISIONS)
+@pytest.mark.parametrize(
+    ("name", "precision"), covering(list(broken.SOLVERS), list(case.PRECISIONS))
+)
 def test_a_wrong_solver_is_caught(name, precision):
     """Expected to solve the problem, as a right one is, see below."""
     for _, make, method in broken.RIGHT:

@@ -1,5 +1,6 @@
 """Host time of a step by stage: counts, and exact replays of native calls."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -89,14 +90,19 @@ def test_a_replayed_call_leaves_what_it_would_leave_once(addition):
     assert recorder.native["sum"] > 0.0
 
 
-def test_stages_exclude_those_within_them():
+def test_stages_exclude_those_within_them(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "process_time", lambda: now[0])
     timer = StageTimer()
     with timer.stage("whole"):
+        now[0] += 0.25
         with timer.stage("part"):
-            sum(range(200_000))
+            now[0] += 2.0
+        now[0] += 0.5
         assert timer.current == "whole"
     assert timer.current == OUTSIDE
-    assert timer.seconds["part"] > 5 * timer.seconds["whole"]
+    assert timer.seconds["part"] == 2.0
+    assert timer.seconds["whole"] == 0.75
 
 
 def test_a_measured_step_is_the_step():

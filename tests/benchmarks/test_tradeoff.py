@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from default_run import slow
 from warp_lcp.benchmarks import tradeoff
 from warp_lcp.benchmarks.harness import report
 from warp_lcp.benchmarks.harness.timing import Options
@@ -103,7 +104,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solves.Steps, "tried", ("accelerated-projection",))
 
 
-@pytest.mark.parametrize("scene", ["dam-break-2d", "column-collapse-2d"])
+@pytest.mark.parametrize("scene", ["dam-break-2d", slow("column-collapse-2d")])
 def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> None:
     asked = options(scene=scene)
     results = tradeoff.measure(asked, tmp_path)

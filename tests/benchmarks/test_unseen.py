@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import boxed, lemke
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import broken, unseen
@@ -149,8 +150,10 @@ def test_hard_matrices_have_a_solution_by_lemke(kind):
             assert np.minimum(np.abs(x), np.abs(y)).max() <= size
 
 
-@pytest.mark.parametrize("name", [name for name in broken.SOLVERS if name != "steps backwards"])
-@pytest.mark.parametrize("kind", MUTATED)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    covering(list(MUTATED), [name for name in broken.SOLVERS if name != "steps backwards"]),
+)
 def test_a_wrong_solver_is_caught(kind, name):
     """Where `test_default_method` finds nothing wrong."""
     assert kind in unseen.KINDS

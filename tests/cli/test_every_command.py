@@ -14,6 +14,7 @@ import pytest
 import tomli_w
 
 from command_line import succeed
+from default_run import few
 from particle_scenes import particle_scenes
 from scenes_of_every_table import MOTIONS, SHAPES, SIDES, scene_of_every_table
 from warp_lcp.cli import view_commands as shown
@@ -112,17 +113,12 @@ def test_every_built_in_scene_is_checked(name: str) -> None:
     assert told in succeed("check", name, "--device", "cpu", "--set", small(name))
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [*FEW[:10], *(pytest.param(seed, marks=pytest.mark.slow) for seed in (*FEW[10:], *MORE))],
-)
+@pytest.mark.parametrize("seed", few((*FEW, *MORE), 4))
 def test_drawn_scenes_are_checked(seed: int, tmp_path: Path) -> None:
     assert "whole run" in succeed("check", written(seed, tmp_path), "--device", "cpu")
 
 
-@pytest.mark.parametrize(
-    "seed", [3, 7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4))]
-)
+@pytest.mark.parametrize("seed", few((3, 7, 2, 4), 1))
 def test_every_command_on_drawn_scenes(seed: int, tmp_path: Path, nobody_waits: None) -> None:
     every_command(written(seed, tmp_path), tmp_path)
 

@@ -13,6 +13,7 @@ import pytest
 import scipy.optimize
 
 from command_line import succeed
+from default_run import few
 from every_step import differences_by_step
 from warp_lcp.contacts.kinematics import KinematicSimulation
 from warp_lcp.contacts.methods import JOINTED, KINEMATIC
@@ -133,7 +134,7 @@ def test_a_run_goes_on_bit_for_bit_after_every_step(more: dict[str, Any]) -> Non
     assert differences_by_step(loaded(tables(JOINTS, **more)), 6, 2) == {}
 
 
-@pytest.mark.parametrize("method", KINEMATIC)
+@pytest.mark.parametrize("method", few(KINEMATIC))
 def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
     """Reach of an arm within its joint limits.
 

@@ -14,7 +14,7 @@ import warp as wp
 
 import small_liquids
 import small_sands
-from code_blocks import blocks
+from code_blocks import sponge
 from small_liquids import box
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.interruptible_wait import waiting
@@ -447,16 +447,6 @@ def own_model(ranks: Ranks, folder: Path) -> None:
         ranks.agree("the log", rows)
         if ranks.is_root:
             (folder / f"own_{name}_{ranks.size}.json").write_text(json.dumps(rows))
-
-
-def sponge() -> type:
-    """Return the model of the documentation's page, without its final run."""
-    page = Path(__file__).parents[2] / "docs/own-model.md"
-    names: dict[str, type] = {}
-    exec(
-        compile(blocks(page, "python")[0].split("scene = load_scene")[0], page.name, "exec"), names
-    )
-    return names["Sponge"]
 
 
 WRAPPED = {

@@ -5,13 +5,13 @@ The center of mass moves along a parabola.
 
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
 
 import small_liquids
 import small_sands
+from scene_tables import ball
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
@@ -19,10 +19,6 @@ RIM = 2.0  # [m/s] of spinning drops: three quarters of a turn of a drop of 0.17
 FLIGHT = 0.4  # [s]
 
 Chosen = Callable[[np.ndarray], np.ndarray]
-
-
-def ball(center: list[float], radius: float) -> dict[str, Any]:
-    return {"shape": "sphere", "center": center, "radius": radius}
 
 
 def in_order(simulation: LiquidSimulation) -> LiquidSimulation:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from small_liquids import GRAVITY, STEPS, box, create, scene
+from small_liquids import GRAVITY, box, create, scene
+from stepping import STEPS
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.material import boundary
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import slow
 from small_liquids import box, create, scene
 from small_runs import StepCounter, run_into, written_files
 from warp_lcp.scene.scene_file import load_scene
@@ -25,11 +26,11 @@ OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_eve
     ("name", "overrides"),
     [
         ("dam-break-2d", OVERRIDES),
-        ("dam-break", [*OVERRIDES, "time.duration=0.1"]),
+        slow(("dam-break", [*OVERRIDES, "time.duration=0.1"])),
         ("splash-in-circle", [*OVERRIDES, "particles.transfer=flip", "pressure.surface=voxel"]),
-        ("retracting-wall", MOVING),
+        slow(("retracting-wall", MOVING)),
         ("retracting-wall", [*MOVING, "density_correction.every=2", "particles.reseed.every=1"]),
-        ("stirred-tank", TANK),
+        slow(("stirred-tank", TANK)),
         ("tap-and-drain", [*OVERRIDES, "time.duration=1.2"]),
         ("splash-unilateral", ["domain.resolution=40", *OVERRIDES[1:]]),
     ],
@@ -56,11 +57,20 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
     ("dimension", "tables"),
     [
         (2, {}),
-        (2, {"solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
+        slow(
+            (
+                2,
+                {
+                    "solid": [
+                        BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}
+                    ]
+                },
+            )
+        ),
         # A level set that reaches farther than a step.
         (2, {"pressure": {"smoothing": 8}, "cfl": 0.5}),
         (2, {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}}),
-        (3, {"pressure": {"smoothing": 1}}),
+        slow((3, {"pressure": {"smoothing": 1}})),
         (3, {"pressure": {"model": "unilateral"}, "solid": [BALL]}),
         (2, {"density_correction": {}, "particles": {"reseed": {"min": 4, "max": 4}}}),
         (
@@ -70,8 +80,8 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
                 "solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}],
             },
         ),
-        (3, {"density_correction": {}, "solids": "voxel"}),
-        (3, {"solids": "voxel", "cfl": 4.0}),
+        slow((3, {"density_correction": {}, "solids": "voxel"})),
+        slow((3, {"solids": "voxel", "cfl": 4.0})),
     ],
 )
 def test_nothing_but_the_state_is_remembered(dimension: int, tables: dict[str, Any]) -> None:

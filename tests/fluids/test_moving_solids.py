@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.grid.motion import Pose
 from warp_lcp.simulation import SimulationFailed
@@ -58,8 +59,7 @@ def piston(*, wall, speed, surface, dimension=2, floor=None):
     return create(scene(size=size, resolution=32 if deep else 64, liquid=liquid, **tables))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
+@pytest.mark.parametrize(("dimension", "surface"), covering([2, 3], ["ghost-fluid", "voxel"]))
 @pytest.mark.parametrize(
     ("wall", "speed", "expected"),
     [

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.grid.sides import SIDES
@@ -20,9 +21,9 @@ def opened(model: LiquidScene, sides: list[str]) -> LiquidScene:
     return LiquidScene.model_validate(data)
 
 
-@pytest.mark.parametrize("cut", [False, True])
-@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
-@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(
+    ("side", "surface", "cut"), covering(SIDES, ["ghost-fluid", "voxel"], [False, True])
+)
 def test_the_pressure_is_that_of_the_depth_below_an_open_side(
     side: str, surface: str, cut: bool
 ) -> None:
@@ -66,9 +67,10 @@ def test_the_pressure_is_that_of_the_depth_below_an_open_side(
     np.testing.assert_allclose(away / scale, wanted / scale, atol=0.01 if cut else 2e-3)
 
 
-@pytest.mark.parametrize("cut", [False, True])
-@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
-@pytest.mark.parametrize("side", ["left", "right", "bottom", "top"])
+@pytest.mark.parametrize(
+    ("side", "solids", "cut"),
+    covering(["left", "right", "bottom", "top"], ["cut-cell", "voxel"], [False, True]),
+)
 def test_a_block_leaves_as_if_there_were_no_side(side: str, solids: str, cut: bool) -> None:
     axis, sign = SIDES.index(side) >> 1, 2 * (SIDES.index(side) & 1) - 1
     velocity = [0.0, 0.0]

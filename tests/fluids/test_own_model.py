@@ -5,19 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from code_blocks import blocks
+from code_blocks import sponge
 from small_liquids import box, scene
 from warp_lcp.fluids import SIMULATOR
 
 PAGE = Path(__file__).parents[2] / "docs/own-model.md"
-
-
-def sponge() -> type:
-    """Return the class of the page, without its final run."""
-    code = blocks(PAGE, "python")[0].split("scene = load_scene")[0]
-    names: dict[str, type] = {}
-    exec(compile(code, PAGE.name, "exec"), names)
-    return names["Sponge"]
 
 
 def test_a_sponge_slows_liquid_by_its_rate_and_tells_the_energy():

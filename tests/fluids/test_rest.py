@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
@@ -111,9 +112,10 @@ BALLS: dict[str, list[dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("wall", ["separating", "free-slip"])
-@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
-@pytest.mark.parametrize("ball", BALLS)
+@pytest.mark.parametrize(
+    ("ball", "surface", "wall"),
+    covering(list(BALLS), ["ghost-fluid", "voxel"], ["separating", "free-slip"], count=4),
+)
 def test_a_gap_of_less_than_a_cell_above_the_floor_is_no_sink(
     ball: str, surface: str, wall: str
 ) -> None:

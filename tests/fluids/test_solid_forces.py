@@ -11,6 +11,7 @@ import warp as wp
 from pydantic import ValidationError
 
 import small_sands
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from small_runs import run_into
 from warp_lcp.fluids import LiquidSimulation
@@ -49,9 +50,10 @@ def ball(dimension: int, **more: Any) -> dict[str, Any]:
     return {"shape": "sphere", "center": [0.41, 0.27, 0.37][:dimension], "radius": 0.15, **more}
 
 
-@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
-@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    ("dimension", "solids", "surface"),
+    covering([2, 3], ["cut-cell", "voxel"], ["ghost-fluid", "voxel"], count=4),
+)
 def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, surface: str) -> None:
     """Archimedes' principle, and the weight on the floor.
 
@@ -80,8 +82,7 @@ def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, sur
     assert abs(found["domain"][0]) < 0.01 * WATER * filled
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
+@pytest.mark.parametrize(("dimension", "solids"), covering([2, 3], ["voxel", "cut-cell"]))
 def test_floor_and_walls_bear_the_depth(dimension: int, solids: str) -> None:
     """Hydrostatic forces on floor and walls.
 
@@ -210,8 +211,7 @@ def test_a_body_is_told_what_it_got(dimension: int) -> None:
     assert np.abs(given).max() > 0.0
 
 
-@pytest.mark.parametrize("viscosity", [0.05, 20.0])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("dimension", "viscosity"), covering([2, 3], [0.05, 20.0]))
 def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(
     dimension: int, viscosity: float
 ) -> None:

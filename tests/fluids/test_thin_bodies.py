@@ -1,13 +1,12 @@
 """Rigid bodies with walls thinner than cells float, sink and keep what is in them."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from small_liquids import box, create, scene
-from warp_lcp.fluids import LiquidSimulation
+from stepping import advance
 
 CELLS = 32
 WALL = 0.3 / CELLS
@@ -32,14 +31,6 @@ def cup(folder: Path, bottom: float) -> Path:
     file = folder / "cup.obj"
     file.write_text("\n".join(lines))
     return file
-
-
-def run(simulation: LiquidSimulation, until: float) -> dict[str, Any]:
-    """Step to a time, and return the last row of the log."""
-    row: dict[str, Any] = {}
-    while simulation.time < until - 1e-9:
-        row = simulation.step(min(simulation.stable_dt(), 0.01, until - simulation.time))
-    return row
 
 
 @pytest.mark.parametrize(("density", "bottom", "inner"), [(200.0, 0.31, 0.08), (3000.0, 0.33, 0.0)])
@@ -67,7 +58,7 @@ def test_a_cup_floats_and_keeps_its_water(
         return int(np.count_nonzero(within & (x[:, 1] < bottom + 0.3)))
 
     first, start = held(), body.position[1]
-    run(simulation, 0.4)
+    advance(simulation, 0.4, 0.01)
     assert held() == first
     x, y, _ = simulation.particles.position.numpy().T
     level = np.percentile(y[(x < 0.2) | (x > 0.8)], 99)
@@ -86,7 +77,7 @@ def test_a_plate_sinks_or_rises(density: float, start: float, sinks: bool) -> No
         )
     )
     assert simulation.grid.barriers is not None and simulation.bodies is not None
-    run(simulation, 0.15)
+    advance(simulation, 0.15, 0.01)
     way = simulation.bodies.bodies[0].position[1] - start - 0.5 * WALL
     assert (way < -2e-4) if sinks else (way > 2e-4)
 

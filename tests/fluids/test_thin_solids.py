@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
@@ -53,8 +54,9 @@ def inside(simulation: LiquidSimulation, ends: np.ndarray) -> bool:
     return bool(((x > ends[:, 0] - 1e-3 * CELL) & (x < ends[:, 1] + 1e-3 * CELL)).all())
 
 
-@pytest.mark.parametrize("motion", [None, SHAKEN, TURNED])
-@pytest.mark.parametrize("thickness", [0.05, 0.5, 1.28])
+@pytest.mark.parametrize(
+    ("thickness", "motion"), covering([0.05, 0.5, 1.28], [None, SHAKEN, TURNED])
+)
 def test_a_closed_bottle_keeps_all(thickness: float, motion: dict[str, Any] | None) -> None:
     solids, ends = bottle(2, thickness, motion)
     simulation = create(
@@ -76,8 +78,9 @@ def test_a_closed_bottle_in_space_keeps_all() -> None:
     assert inside(simulation, ends)
 
 
-@pytest.mark.parametrize("thickness", [0.1, 0.5, 0.9])
-@pytest.mark.parametrize("offset", [0.0, 0.3125, 0.5, 0.8125])
+@pytest.mark.parametrize(
+    ("offset", "thickness"), covering([0.0, 0.3125, 0.5, 0.8125], [0.1, 0.5, 0.9])
+)
 def test_a_plate_bears_the_pool_on_it(thickness: float, offset: float) -> None:
     n = 24
     top = (8.0 + offset) / n

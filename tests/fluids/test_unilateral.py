@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import slow
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
@@ -159,8 +160,9 @@ def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
     assert np.abs(velocity - expected).std() < 0.01
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize(
+    ("dimension", "cut"), [(2, False), slow((3, False)), slow((2, True)), (3, True)]
+)
 def test_a_pool_holds_itself(dimension: int, cut: bool) -> None:
     ball = {"shape": "sphere", "center": [0.3, 0.1, 0.1][:dimension], "radius": 0.08}
     tables = {"solid": [ball]} if cut else {}

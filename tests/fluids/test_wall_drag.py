@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
 import small_sands
+from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.fluids.wall_drag_kernels import Drag, fill
@@ -210,8 +211,9 @@ def test_a_viscous_channel_is_dragged_as_its_equation_says() -> None:
     assert middle(simulation) == pytest.approx(exact, rel=0.02)
 
 
-@pytest.mark.parametrize("degrees", [0.0, 7.0, 20.0, 31.0, 45.0, 68.0])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    ("degrees", "dimension"), covering([0.0, 7.0, 20.0, 31.0, 45.0, 68.0], [2, 3])
+)
 def test_walls_at_any_angle_drag_by_their_area(dimension: int, degrees: float) -> None:
     """Drag of walls at any angle by their area.
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from test_pieces import write as write_pieces
 
 import warp_lcp as wl
+from default_run import covering
 from small_runs import ball, run_into
 from warp_lcp.frames import meshio_format
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, frame_bytes
@@ -67,6 +68,9 @@ PARTS = {
     "hexahedra": Cells("grid", np.array([[0, 0, 0], [1, 0, 0], [3, 4, 5]]), 0.1, 3, fields(3)),
     "squares": Cells("grid", np.array([[0, 0, 0], [1, 0, 0], [3, 4, 0]]), 0.1, 2, fields(3)),
 }
+
+
+DAMAGED = {"empty": b"", "zeros": b"\0" * 100, "text": b"nonsense\n1 2 3\n", "half": "half"}
 
 
 def without(part):
@@ -241,18 +245,16 @@ def test_frames_of_every_kind_are_read(tmp_path):
         wl.read_frame(tmp_path / "particles_000001.xdmf")
 
 
-@pytest.mark.parametrize("name", SUFFIXES)
 @pytest.mark.filterwarnings("ignore")  # of NumPy, on files without lines
 @pytest.mark.parametrize(
-    "content",
-    [b"", b"\0" * 100, b"nonsense\n1 2 3\n", "half"],
-    ids=["empty", "zeros", "text", "half"],
+    ("name", "content"), covering(list(SUFFIXES), list(DAMAGED), count=2 * len(SUFFIXES))
 )
 def test_damaged_files_are_named(tmp_path, name, content):
     """Damaged files, named in the message.
 
     meshio must not end the process, as its own `read` does.
     """
+    content = DAMAGED[content]
     part = next(
         (part for part in PARTS.values() if holds(name, *kind_of(part)).dress is not None), None
     )

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 
 TIGHT = wl.StoppingCriteria(rtol=1e-13, atol=1e-13, max_iterations=300)
 STEP = 1e-6
@@ -179,8 +180,7 @@ STENCILS = {
 }
 
 
-@pytest.mark.parametrize("name", STENCILS)
-@pytest.mark.parametrize("outside", [wl.AIR, wl.SOLID])
+@pytest.mark.parametrize(("name", "outside"), covering(list(STENCILS), [wl.AIR, wl.SOLID]))
 def test_stencils_of_arrays_and_numbers(name, outside):
     varying, numbers, center, periodic = STENCILS[name]
     shape = (6, 7) if len(center_of(numbers)) == 2 else (3, 4, 5)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import slow
 from small_sands import GRAVITY, box, create, scene
 from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
 from warp_lcp.granular.simulator import SandSimulation
@@ -34,7 +35,7 @@ def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
-@pytest.mark.parametrize("cells", [32, 64, 96])
+@pytest.mark.parametrize("cells", [32, 64, slow(96)])
 def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction: float) -> None:
     """Iterations of a cold start in deep sand.
 

@@ -8,6 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 import warp_lcp as wl
+from scene_tables import ball, box
+from stepping import advance
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import FAR, GranularSimulator, SandSimulation
 from warp_lcp.granular.stress import Stress
@@ -44,26 +46,6 @@ def start(
     return GranularSimulator().create(SandScene.model_validate(scene), device="cpu", folder=Path())
 
 
-def run(simulation: SandSimulation, until: float) -> list[dict[str, Any]]:
-    """Step to a time [s] and return the log."""
-    rows: list[dict[str, Any]] = []
-    while simulation.time < until - 1e-9:
-        rows.append(
-            simulation.step(
-                min(simulation.stable_dt(), simulation.scene.time.dt_max, until - simulation.time)
-            )
-        )
-    return rows
-
-
-def ball(center: list[float], radius: float, density: float, **more: Any) -> dict[str, Any]:
-    return {"shape": "sphere", "center": center, "radius": radius, "density": density, **more}
-
-
-def box(low: list[float], high: list[float], density: float, **more: Any) -> dict[str, Any]:
-    return {"shape": "box", "min": low, "max": high, "density": density, **more}
-
-
 def height(simulation: SandSimulation) -> float:
     assert simulation.bodies is not None
     return float(simulation.bodies.bodies[0].position[1])
@@ -79,15 +61,15 @@ def test_a_light_ball_stays_on_top_and_a_heavy_one_digs_in_and_stops() -> None:
     for density in (0.2 * DENSITY, 5.0 * DENSITY):
         sand = {"friction_angle": 26.565}  # sand of 30 degrees bears twice as much
         simulation = start(
-            [ball([0.3, 0.28], 0.06, density)],
+            [ball([0.3, 0.28], 0.06, density=density)],
             size=[0.6, 0.4],
             depth=0.2,
             resolution=48,
             material=sand,
         )
-        run(simulation, 0.35)
+        advance(simulation, 0.35, simulation.scene.time.dt_max)
         before = height(simulation)
-        run(simulation, 0.4)
+        advance(simulation, 0.4, simulation.scene.time.dt_max)
         depths.append(0.2 - (height(simulation) - 0.06))
         speeds.append((before - height(simulation)) / 0.05)
     assert 0.0 <= depths[0] < 0.016  # a cell is 0.0125 m
@@ -102,11 +84,11 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
     block.
     """
     loads, forces, simulations = [], [], []
-    for solids in ([box([0.2, 0.2], [0.4, 0.3], 2.0 * DENSITY, friction=0.5)], []):
+    for solids in ([box([0.2, 0.2], [0.4, 0.3], density=2.0 * DENSITY, friction=0.5)], []):
         simulation = start(
             solids, size=[0.6, 0.4], depth=0.2, resolution=48, domain={"friction": 0.0}
         )
-        run(simulation, 0.3)
+        advance(simulation, 0.3, simulation.scene.time.dt_max)
         floor, given = [], []
         for _ in range(20):
             simulation.step(simulation.scene.time.dt_max)
@@ -147,7 +129,7 @@ def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float)
     """
     slope = np.radians(25.0)
     gravity = [G * float(np.sin(slope)), -G * float(np.cos(slope))]
-    block = box([0.1, 0.15], [0.4, 0.25], DENSITY, friction=friction)
+    block = box([0.1, 0.15], [0.4, 0.25], density=DENSITY, friction=friction)
     simulation = start(
         [block],
         size=[0.9, 0.35],
@@ -156,10 +138,10 @@ def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float)
         physics={"gravity": gravity, "density": DENSITY},
         material={"friction_angle": 37.5},
     )
-    run(simulation, 0.06)  # it falls a part of a cell first
+    advance(simulation, 0.06, simulation.scene.time.dt_max)  # it falls a part of a cell first
     assert simulation.bodies is not None
     before = simulation.bodies.bodies[0].velocity[0]
-    run(simulation, 0.2)
+    advance(simulation, 0.2, simulation.scene.time.dt_max)
     gained = (simulation.bodies.bodies[0].velocity[0] - before) / 0.14
     expected = G * (np.sin(slope) - friction * np.cos(slope))
     if expected > 0.0:
@@ -175,7 +157,7 @@ def test_densities_from_a_thousandth_of_sands_to_a_thousand_times_it() -> None:
     """
     iterations, sunk = {}, {}
     for ratio in (None, 1e-3, 1.0, 1e3):
-        solid = ball([0.3, 0.2], 0.06, DENSITY * (ratio or 1.0))
+        solid = ball([0.3, 0.2], 0.06, density=DENSITY * (ratio or 1.0))
         if ratio is None:
             del solid["density"]
         simulation = start([solid], size=[0.6, 0.4], depth=0.2, resolution=48)
@@ -194,7 +176,7 @@ def test_momentum_of_sand_and_body_without_gravity() -> None:
 
     A block of sand that flies into a free body gives it the momentum that it loses.
     """
-    target = ball([0.42, 0.2], 0.06, DENSITY)
+    target = ball([0.42, 0.2], 0.06, density=DENSITY)
     simulation = start(
         [target],
         size=[0.8, 0.4],
@@ -211,7 +193,7 @@ def test_momentum_of_sand_and_body_without_gravity() -> None:
         return float(sand[0] + body[0]), float(body[0])
 
     first, _ = momentum()
-    run(simulation, 0.16)
+    advance(simulation, 0.16, simulation.scene.time.dt_max)
     last, taken = momentum()
     assert taken > 0.2 * first
     assert last == pytest.approx(first, rel=0.05)
@@ -220,12 +202,12 @@ def test_momentum_of_sand_and_body_without_gravity() -> None:
 def test_three_dimensions() -> None:
     """Bodies in 3-D: a light ball rests on sand, a pushed one rolls forward."""
     simulation = start(
-        [ball([0.12, 0.128, 0.1], 0.05, 400.0, velocity=[0.5, 0.0, 0.0], friction=0.8)],
+        [ball([0.12, 0.128, 0.1], 0.05, density=400.0, velocity=[0.5, 0.0, 0.0], friction=0.8)],
         size=[0.3, 0.2, 0.2],
         depth=0.08,
         resolution=24,
     )
-    run(simulation, 0.1)
+    advance(simulation, 0.1, simulation.scene.time.dt_max)
     assert simulation.bodies is not None
     body = simulation.bodies.bodies[0]
     assert 0.115 < body.position[1] < 0.13
@@ -242,7 +224,7 @@ def test_three_dimensions() -> None:
 
 def test_continues_bit_for_bit() -> None:
     """Resumed simulation, equal bit for bit."""
-    solids = [ball([0.3, 0.26], 0.05, 3000.0), box([0.4, 0.21], [0.5, 0.28], 500.0)]
+    solids = [ball([0.3, 0.26], 0.05, density=3000.0), box([0.4, 0.21], [0.5, 0.28], density=500.0)]
 
     def make() -> SandSimulation:
         return start(solids, size=[0.6, 0.4], depth=0.2, resolution=30)
@@ -264,7 +246,9 @@ def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.Mo
 
     The stresses of the step are not finite.
     """
-    simulation = start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
+    simulation = start(
+        [ball([0.3, 0.27], 0.05, density=3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30
+    )
     simulation.step(0.004)
     assert simulation.bodies is not None
     before = simulation.bodies.state()["bodies"].copy()
@@ -305,7 +289,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
     are accepted.
     """
     twins = [
-        start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
+        start([ball([0.3, 0.27], 0.05, density=3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
         for _ in range(2)
     ]
     for simulation in twins:
@@ -336,7 +320,13 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
 )
 def test_scenes_that_bodies_do_not_go_with(table: dict[str, Any], key: str) -> None:
     with pytest.raises(ValidationError, match=key):
-        start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30, **table)
+        start(
+            [ball([0.3, 0.27], 0.05, density=3000.0)],
+            size=[0.6, 0.4],
+            depth=0.2,
+            resolution=30,
+            **table,
+        )
 
 
 @pytest.mark.parametrize("name", ["balls-on-sand-2d", "carried-box-2d"])

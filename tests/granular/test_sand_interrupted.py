@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import slow
 from small_runs import StepCounter, run_into, written_files
 from small_sands import box, create, scene
 from warp_lcp.scene.scene_file import load_scene
@@ -33,9 +34,9 @@ DISC = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
                 "particles.reseed.every=1",
             ],
         ),
-        ("hourglass-2d", ["domain.resolution=48", "time.duration=0.1"]),
+        slow(("hourglass-2d", ["domain.resolution=48", "time.duration=0.1"])),
         ("pouring-pile", ["domain.resolution=16", "time.duration=0.12", "source.0.stop=0.08"]),
-        ("sand-on-mesh", ["domain.resolution=16", "time.duration=0.12"]),
+        slow(("sand-on-mesh", ["domain.resolution=16", "time.duration=0.12"])),
     ],
 )
 def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
@@ -55,7 +56,7 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
     ("dimension", "tables"),
     [
         (2, {}),
-        (2, {"friction_model": "box"}),
+        slow((2, {"friction_model": "box"})),
         # A simulation that is created after the solid has moved away.
         (2, {"solid": [SLIDER], "density_correction": {}}),
         (2, {"solver": {"method": "interleaved-sweeps", "max_iterations": 60}}),
@@ -66,8 +67,17 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
                 "density_correction": {"every": 2},
             },
         ),
-        (2, {"solids": "voxel", "solid": [DISC]}),
-        (3, {"solid": [DISC | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
+        slow((2, {"solids": "voxel", "solid": [DISC]})),
+        slow(
+            (
+                3,
+                {
+                    "solid": [
+                        DISC | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}
+                    ]
+                },
+            )
+        ),
         (3, {"density_correction": {}}),
     ],
 )

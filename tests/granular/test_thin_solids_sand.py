@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import covering, slow
 from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
@@ -30,8 +31,7 @@ def simulate(
     return simulation, rows
 
 
-@pytest.mark.parametrize("thickness", [0.1, 0.5])
-@pytest.mark.parametrize("offset", [0.0, 0.3, 0.7])
+@pytest.mark.parametrize(("offset", "thickness"), covering([0.0, 0.3, 0.7], [0.1, 0.5]))
 def test_sand_rests_on_a_plate(thickness: float, offset: float) -> None:
     top = (8.0 + offset) / CELLS
     simulation, rows = simulate(
@@ -71,7 +71,7 @@ def test_no_grain_passes_the_sides_of_a_funnel() -> None:
     assert not ((y > 0.4) & ((x + y < 0.8) | (x - y > 0.2))).any()
 
 
-@pytest.mark.parametrize("thickness", [0.25, 1.28])
+@pytest.mark.parametrize("thickness", [0.25, slow(1.28)])
 def test_a_shaken_box_keeps_its_sand(thickness: float) -> None:
     low, high = 0.23, 0.77
     motion = {"kind": "sinusoid", "period": 0.5, "amplitude": [0.1, 0.03]}

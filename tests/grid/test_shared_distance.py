@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from default_run import covering
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.node_distance_kernels import FAR
 from warp_lcp.grid.part import GridPart
@@ -39,8 +40,7 @@ def part_of(rank, size, everyone):
     return grid
 
 
-@pytest.mark.parametrize("size", [2, 3, 5])
-@pytest.mark.parametrize("seed", [311, 312])
+@pytest.mark.parametrize(("size", "seed"), covering([2, 3, 5], [311, 312]))
 def test_ranks_have_the_distances_of_one_process(size, seed):
     rng = np.random.default_rng(seed)
     angles = rng.uniform(0.0, 360.0, 3).tolist()

@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from cut_cell_tools import placed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,10 +15,6 @@ from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 
 SPOT = Path(__file__).resolve().parents[2] / "../shared/data/spot.obj"
-
-
-def placed(geometry, separating=True, name="solid[0]"):
-    return PlacedSolid(geometry=geometry, separating=separating, name=name)
 
 
 def cells(counts, spacing, dimension, *solids):
@@ -39,7 +36,9 @@ def test_empty_domain_has_a_ring_of_wall():
 def test_index_order_and_the_first_claim():
     floor = Plane(point=[0.0, 0.2, 0.0], normal=[0.0, 1.0, 0.0])
     box = Box(lower=[0.3, 0.0, 0.1], upper=[0.5, 0.4, 0.2])
-    voxels = cells((6, 5, 4), 0.1, 3, placed(floor, False, "floor"), placed(box, True, "box"))
+    voxels = cells(
+        (6, 5, 4), 0.1, 3, placed(floor, separating=False, name="floor"), placed(box, name="box")
+    )
     expected = np.zeros((6, 7, 8), dtype=np.int32)
     expected[1:-1, 1:-1, 1:-1] = -1
     expected[1:-1, 1:3, 1:-1] = 1

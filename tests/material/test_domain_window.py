@@ -8,6 +8,7 @@ import pytest
 
 import small_liquids
 import small_sands
+from default_run import chosen
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.grid import active_rows as vicinity
@@ -82,7 +83,7 @@ def run(simulation: ParticleSimulation, steps: int) -> list[Mapping[str, Any]]:
     return [simulation.step(0.008 if n % 3 else 0.004) for n in range(steps)]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", chosen(CASES, CASES[::3]))
 def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small: None) -> None:
     """Moving window against a grid of the domain.
 
@@ -104,7 +105,7 @@ def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small:
     assert np.array_equal(np.unique(cells, axis=0), np.unique(whole.frame()[1].index, axis=0))  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", chosen(CASES, CASES[2::3]))
 def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, small: None) -> None:
     through, later, whole = (
         made(name, follow=True),
@@ -134,7 +135,7 @@ def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, sm
 
 
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", chosen(CASES, CASES[1::3]))
 def test_visiting_what_particles_reach_leaves_the_same_bits(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,6 @@
 """Scene of a user-defined material: inherited and replaced tables."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
+from scene_tables import scene_error
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.particle_assembly import (
     make_boundary,
@@ -16,7 +18,7 @@ from warp_lcp.material.particle_assembly import (
     seed_materials,
 )
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.scene.scene import Domain, SceneError, validate
+from warp_lcp.scene.scene import Domain, validate
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.shapes import BoxTable, MaterialProperties, PlaneTable, SolidProperties
 
@@ -79,10 +81,7 @@ def build(**tables: Any) -> GrainScene:
     return validate(GrainScene, data | {"domain": domain} | tables, "grains.toml")
 
 
-def complaint(**tables: Any) -> str:
-    with pytest.raises(SceneError) as caught:
-        build(**tables)
-    return str(caught.value)
+complaint = partial(scene_error, build)
 
 
 def test_its_own_tables_take_the_place_of_the_general_ones() -> None:

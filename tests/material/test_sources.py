@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from default_run import slow
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.material.sources import Sources
@@ -109,7 +110,7 @@ def pour(
     return simulation
 
 
-@pytest.mark.parametrize("cells", [0.25, 1.0, 3.0])
+@pytest.mark.parametrize("cells", [0.25, slow(1.0), 3.0])
 # One cell thick, and four.
 @pytest.mark.parametrize(
     ("low", "high"), [([0.25, 0.5], [0.28125, 0.625]), ([0.125, 0.5], [0.25, 0.59375])]

@@ -1,14 +1,10 @@
 """Runs that write surfaces, from a scene file to the folder."""
 
-from pathlib import Path
-
 import meshio
 import pytest
-from rich.console import Console
 
 from mesh_checks import assert_closed, enclosed
-from small_runs import run_into
-from warp_lcp.run.progress import Lines
+from small_runs import run_scene_file
 from warp_lcp.scene.scene_file import load_scene
 
 SCENE = """
@@ -31,16 +27,12 @@ surface = true
 """
 
 
-def go(scene: Path, out: Path, *overrides: str, **options):
-    return run_into(
-        load_scene(scene, overrides), out, observer=Lines(Console(quiet=True)), **options
-    )
-
-
 def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
     (tmp_path / "dam.toml").write_text(SCENE)
     out = tmp_path / "out"
-    assert go(tmp_path / "dam.toml", out, "output.surface_ply=true").status == "finished"
+    assert (
+        run_scene_file(tmp_path / "dam.toml", out, "output.surface_ply=true").status == "finished"
+    )
     names = [f"surface_{index:06d}.{suffix}" for index in range(3) for suffix in ("ply", "vtu")]
     assert sorted(file.name for file in (out / "frames").iterdir()) == names
     assert (out / "surface.pvd").read_text().count("DataSet") == 3
@@ -60,9 +52,9 @@ def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
 def test_an_interrupted_run_writes_the_same_surfaces(tmp_path):
     (tmp_path / "dam.toml").write_text(SCENE)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    go(tmp_path / "dam.toml", whole)
-    go(tmp_path / "dam.toml", parts, last_frame=1)
-    go(tmp_path / "dam.toml", parts, resume=True)
+    run_scene_file(tmp_path / "dam.toml", whole)
+    run_scene_file(tmp_path / "dam.toml", parts, last_frame=1)
+    run_scene_file(tmp_path / "dam.toml", parts, resume=True)
     for index in range(3):
         file = f"frames/surface_{index:06d}.vtu"
         assert (parts / file).read_bytes() == (whole / file).read_bytes()
@@ -72,7 +64,7 @@ def test_a_run_that_shows_nothing_asks_for_no_frame(dots, scene_file, tmp_path, 
     asked = []
     kind = type(dots.create(load_scene(scene_file), device="cpu", folder=tmp_path))
     monkeypatch.setattr(kind, "frame", lambda self: asked.append(self.time) or [])
-    go(scene_file, tmp_path / "out", "output.particles=false", "output.grid=false")
+    run_scene_file(scene_file, tmp_path / "out", "output.particles=false", "output.grid=false")
     assert asked == []
-    go(scene_file, tmp_path / "more", "output.grid=false")
+    run_scene_file(scene_file, tmp_path / "more", "output.grid=false")
     assert len(asked) > 5

@@ -11,6 +11,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from multigrid.test_aggregates import convection_diffusion
 from multigrid.test_hierarchy import aggregation, masked_hierarchy
 from oracle import assemble
@@ -73,9 +74,9 @@ class Plain:
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["apart", "in one launch"])
-@pytest.mark.parametrize("bounded", [False, True])
-@pytest.mark.parametrize("gamma", [1, 2])
-@pytest.mark.parametrize("shape", [(13, 22), (6, 5, 9)])
+@pytest.mark.parametrize(
+    ("shape", "gamma", "bounded"), covering([(13, 22), (6, 5, 9)], [1, 2], [False, True], count=4)
+)
 def test_a_grids_cycle_is_the_plain_loop(shape, gamma, bounded, together, device):
     rng = np.random.default_rng([*shape, gamma])
     cells, free = rng.choice(3, shape, p=[0.15, 0.8, 0.05]), rng.random(shape) < 0.9

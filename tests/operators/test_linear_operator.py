@@ -14,6 +14,7 @@ from scipy.sparse.linalg import LaplacianNd, aslinearoperator
 from scipy.sparse.linalg import LinearOperator as Linear
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import boxed, lemke
 from warp_lcp.problem.protocol import families, takes
 
@@ -66,9 +67,15 @@ METHODS = [
 ]
 
 
-@pytest.mark.parametrize("symmetric", [True, False])
-@pytest.mark.parametrize("kind", ["bare", "with rmatvec", "function", "said", "product", "own"])
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("name", "kind", "symmetric"),
+    covering(
+        METHODS,
+        ["bare", "with rmatvec", "function", "said", "product", "own"],
+        [True, False],
+        count=4 * len(METHODS),
+    ),
+)
 def test_methods_that_need_products_only_take_it(name, kind, symmetric):
     if name == "quadratic-program":
         pytest.importorskip("piqp")

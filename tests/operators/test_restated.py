@@ -8,6 +8,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import covering
 from matrices import laplacian
 from oracle import natural_residual
 from warp_lcp.operators import renumbering
@@ -32,8 +33,7 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("seed", [5101, 5102])
-@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize(("name", "seed"), covering(list(FORMS), [5101, 5102]))
 def test_solutions_and_starts_are_those_of_the_given_problem(name, seed, monkeypatch):
     monkeypatch.setattr(renumbering, "SMALLEST", 100)
     form, make = FORMS[name]

@@ -12,6 +12,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from warp_lcp.problem.protocol import families
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.nncg import NNCG
@@ -87,8 +88,7 @@ def enumerate_contacts(A, b, mu):
     return found
 
 
-@pytest.mark.parametrize("name", SWEEPING)
-@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize(("name", "sparse"), covering(list(SWEEPING), [True, False]))
 def test_planar_contacts_have_the_enumerated_solution(name, sparse, device):
     if sparse and name == "greedy":
         pytest.skip("the greedy order reads the same rows from both")

@@ -7,6 +7,7 @@ import warp as wp
 from scipy.optimize import linprog
 
 import warp_lcp as wl
+from matrices import operator_of
 from oracle import lemke, natural_scale
 from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import NaturalResidual
@@ -43,14 +44,6 @@ class Shown:
     def masked(self, free, shift=None):
         p, d = np.diag(free.numpy() != 0), 0.0 if shift is None else np.diag(shift.numpy())
         return Shown(p @ (self._A + d) @ p)
-
-
-def operator(A, kind):
-    made = {
-        "dense": wl.DenseOperator,
-        "sparse": lambda A, device: wl.SparseOperator(scipy.sparse.csr_array(A), device=device),
-    }
-    return made[kind](A, device="cpu")
 
 
 def program(seed, m=20, n=20):
@@ -92,7 +85,7 @@ def unscaled(M, b, x):
 def test_a_tiny_diagonal_hides_nothing(method, kind):
     M, b = TINY
     try:
-        problem = wl.LCP(operator(M, kind), b)
+        problem = wl.LCP(operator_of(M, kind), b)
         result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
     except ValueError:
         assert method not in SOLVE_IT
@@ -107,7 +100,7 @@ def test_a_tiny_diagonal_hides_nothing(method, kind):
 def test_linear_programs_have_their_optimum_or_are_not_solved(method, kind):
     for seed in range(4):
         M, b, c, G, h = program(seed)
-        problem = wl.LCP(operator(M, kind), b)
+        problem = wl.LCP(operator_of(M, kind), b)
         result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
         assert result or (method, kind) in {
             ("fischer-newton", "dense"),
@@ -133,7 +126,7 @@ def test_units_of_rows_and_columns_are_the_users(method):
             10.0 ** rng.uniform(-4, 4, 40) if seed % 2 else np.ones(40),
             10.0 ** rng.uniform(-8, 8, 40),
         )
-        problem = wl.LCP(operator(R[:, None] * M * C, "dense"), R * b)
+        problem = wl.LCP(operator_of(R[:, None] * M * C, "dense"), R * b)
         result = wl.solve(problem, wl.default_chain(wl.METHODS[method](), problem))
         assert result, (seed, result.status)
         assert unscaled(M, b, C * result.x.numpy()) < 1e-4
@@ -178,7 +171,7 @@ def test_semidefinite_matrices_keep_their_diagonal(rank):
         single = A.astype(np.float32).astype(np.float64)
         np.testing.assert_array_equal(scale_of_matrix(single), np.diag(single))
         for kind in ("dense", "sparse"):
-            problem = wl.LCP(operator(A, kind), np.ones(n))
+            problem = wl.LCP(operator_of(A, kind), np.ones(n))
             np.testing.assert_array_equal(NaturalResidual(problem).diagonal.numpy(), np.diag(A))
 
 

@@ -12,6 +12,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import few
 from warp_lcp.problem import spare_workspace
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.spare_workspace import KEPT, MOST_CELLS
@@ -99,7 +100,7 @@ def ready(problem, method):
     assert KEPT.workspace is not None
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", few(range(12), 5))
 def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
     """Bits of a solve with a spare workspace: those of a new one.
 

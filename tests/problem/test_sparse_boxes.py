@@ -11,6 +11,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from warp_lcp.benchmarks.harness.machine import resident_bytes
 from warp_lcp.benchmarks.tank import Tank, record
 from warp_lcp.kernels import Rows
@@ -68,16 +69,18 @@ def solves(up, method, *, in_place):
 
 
 @pytest.mark.cpu_form("boxes that are partly in use are the CPU's")
-@pytest.mark.parametrize("in_place", [False, True])
-@pytest.mark.parametrize("up", [0, 1])
 @pytest.mark.parametrize(
-    "method",
-    [
-        wl.ProjectedMultigrid(),
-        wl.ProjectedMultigrid(precision="double"),
-        wl.MinimumMapNewton(),
-        wl.MPRGP(),
-    ],
+    ("method", "up", "in_place"),
+    covering(
+        [
+            wl.ProjectedMultigrid(),
+            wl.ProjectedMultigrid(precision="double"),
+            wl.MinimumMapNewton(),
+            wl.MPRGP(),
+        ],
+        [0, 1],
+        [False, True],
+    ),
 )
 def test_bits_are_those_of_a_problem_that_looks_through_its_box(method, up, in_place, monkeypatch):
     monkeypatch.setattr(grid_operator, "LARGE", 1 << 40)

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from matrices import posed
 from oracle import boxed, lemke
 from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
@@ -37,8 +38,11 @@ def matrix(kind, rng):
 
 
 @pytest.mark.cpu_form("the CPU factors so few unknowns")
-@pytest.mark.parametrize("method", METHODS, ids=name)
-@pytest.mark.parametrize("kind", ["dense", "sparse"])
+@pytest.mark.parametrize(
+    ("method", "kind"),
+    covering(METHODS, ["dense", "sparse"]),
+    ids=lambda value: value if isinstance(value, str) else name(value),
+)
 def test_extreme_rows(kind, method):
     """Extreme rows.
 

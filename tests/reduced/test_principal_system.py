@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import assemble
 from warp_lcp.reduced.diagonal_system import DiagonalSystem
 from warp_lcp.reduced.low_rank_system import CoupledGridSystem
@@ -76,9 +77,10 @@ def families(device):
 NAMES = list(families("cpu"))
 
 
-@pytest.mark.parametrize("real", [wp.float32, wp.float64])
-@pytest.mark.parametrize("shifted", [False, True])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "shifted", "real"),
+    covering(NAMES, [False, True], [wp.float32, wp.float64], count=2 * len(NAMES)),
+)
 def test_solves_the_masked_and_shifted_system(name, shifted, real, device):
     A, dense, unknown = families(device)[name]
     problem = wl.LCP(A, np.zeros(A.shape))

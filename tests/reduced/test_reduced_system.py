@@ -8,6 +8,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from method_steps import begun
 from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.fused_grid_system import FusedGridSystem
 from warp_lcp.reduced.host_system import HostSystem
@@ -33,16 +34,6 @@ def matrix(rng, n=12, width=None):
         else np.where(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width, 0.1 * A, 0.0)
         + np.eye(n)
     )
-
-
-def begun(problem, method, x0):
-    """Return a workspace at x0 whose solve has begun."""
-    work = method.init(problem)
-    work.residual.start(work.x, keep=False)
-    work.x.assign(x0)
-    work.residual.evaluate(work.x)
-    work.start(warm=True, tolerance=0.0)
-    return work
 
 
 @pytest.mark.parametrize("lengths", [(1.0,), (1.0, 0.5, 0.25)])
@@ -73,11 +64,9 @@ def test_a_step_by_the_protocol(form, direct, width, lengths):
             1.5 * rng.random(n),
         )
         x0 = np.clip(rng.standard_normal(n), lower, upper)
-        work = begun(
-            wl.LCP(FORMS[form](A), b, lower, upper),
-            wl.MinimumMapNewton(direct=direct, **SETTINGS),
-            x0,
-        )
+        problem = wl.LCP(FORMS[form](A), b, lower, upper)
+        method = wl.MinimumMapNewton(direct=direct, **SETTINGS)
+        work = begun(problem, method.init(problem), x0)
         system, d = work.system, work.residual.scale if direct else work.residual.diagonal.numpy()
         target = x0 - (A @ x0 + b) / d
         held, start = (
@@ -169,11 +158,8 @@ def test_a_grid_moves_its_iterate_as_it_solves():
     problem = wl.LCP(A, b, -np.inf, np.inf)
 
     def solved(most):
-        work = begun(
-            problem,
-            wl.MinimumMapNewton(precision="double", eta=1e-2, max_linear_iterations=most),
-            np.zeros(problem.layout.size),
-        )
+        method = wl.MinimumMapNewton(precision="double", eta=1e-2, max_linear_iterations=most)
+        work = begun(problem, method.init(problem), np.zeros(cells.shape))
         first = work.residual.norm
         assert work.system.classify() is None
         assert work.system.restrict()

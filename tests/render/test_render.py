@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from command_line import invoke
+from default_run import covering
 from small_runs import ball
 from warp_lcp.extras.live import Live
 from warp_lcp.frames.frames import FrameFolder
@@ -446,9 +447,9 @@ TURN = (
 )
 
 
-@pytest.mark.parametrize("time", [0.0, 0.37])
-@pytest.mark.parametrize("invert", [False, True])
-@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize(
+    ("name", "invert", "time"), covering(list(SOLIDS), [False, True], [0.0, 0.37])
+)
 def test_surfaces_lie_where_the_solver_has_them(pyvista, make_run, name, invert, time):
     text = f"[[solid]]\n{SOLIDS[name]}\ninvert = {str(invert).lower()}\n{TURN}"
     shape = load_scene(make_run([], text, size=ROOM, solids="cut-cell") / "scene.toml").solid[0]

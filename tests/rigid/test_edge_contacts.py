@@ -9,6 +9,7 @@ from bodies_at_hand import GRAVITY, SIDES, bodies_of, run
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from default_run import slow
 from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.solids import Box, Capsule, Placement, TriangleMesh
 from warp_lcp.grid.triangle_mesh import close_surface
@@ -114,11 +115,11 @@ def across(kind, bottom):
     [
         ("capsule", "capsule"),
         ("capsule", "box"),
-        ("box", "capsule"),
+        slow(("box", "capsule")),
         ("mesh", "mesh"),
-        ("capsule", "mesh"),
+        slow(("capsule", "mesh")),
         ("mesh", "capsule"),
-        ("mesh", "box"),
+        slow(("mesh", "box")),
         ("mesh", "edge"),
     ],
 )

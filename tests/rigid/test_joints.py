@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from default_run import chosen, slow
 from warp_lcp.contacts.methods import BOXED, JOINTED, STEWART_TRINKLE, MethodOfChoice
 from warp_lcp.grid.solids import Box
 from warp_lcp.rigid.bodies import RigidBodies
@@ -146,7 +147,7 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
     assert 2 * np.diff(zeros).mean() == pytest.approx(period, rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["ball", "hinge", "fixed"])
+@pytest.mark.parametrize("kind", ["ball", slow("hinge"), "fixed"])
 def test_joined_bodies_in_flight_keep_both_momenta(kind):
     bodies = system(
         tuple(
@@ -233,7 +234,9 @@ def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
     assert bodies.row()["joint0_torque"] == pytest.approx(weight, rel=0.02)
 
 
-@pytest.mark.parametrize("method", [*BOXED, *STEWART_TRINKLE])
+@pytest.mark.parametrize(
+    "method", chosen([*BOXED, *STEWART_TRINKLE], ["nncg", "psor", "staggering", "lemke"])
+)
 def test_every_method_takes_the_equations_of_joints(method):
     """Equations of joints by every method.
 

@@ -1,6 +1,5 @@
 """Runs driven from Python: bits of the command line's, callbacks, refusals."""
 
-import csv
 import json
 import signal
 import threading
@@ -12,6 +11,7 @@ import warp as wp
 from typer.testing import CliRunner
 
 import warp_lcp as wl
+from small_runs import run_contents
 from warp_lcp.cli.commands import app
 from warp_lcp.run.api import RunError
 from warp_lcp.run.folder import OutputError
@@ -34,24 +34,6 @@ CRATE = {
 SHORT = {"duration": 0.1, "resolution": 32}
 
 
-def contents(folder: Path) -> dict:
-    """Return the common contents of equal runs.
-
-    They are frames, collections, the log without times, and checkpoints.
-    """
-    found = {
-        str(p.relative_to(folder)): p.read_bytes()
-        for p in [*folder.glob("frames/*"), *folder.glob("*.pvd"), folder / "scene.toml"]
-    }
-    with open(folder / "log.csv", newline="") as file:
-        found["log"] = [
-            {k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)
-        ]
-    for file in folder.glob("checkpoints/*.npz"):
-        found[file.name] = {name: array.tobytes() for name, array in np.load(file).items()}
-    return found
-
-
 def by_command(scene: str, folder: Path) -> None:
     words = ["run", scene, "--out", str(folder), "--device", "cpu"]
     words += [
@@ -68,7 +50,7 @@ def test_frames_log_and_checkpoints_are_those_of_the_command_line(scene, tmp_pat
     by_command(scene, tmp_path / "command")
     run = wl.Run(scene, folder=tmp_path / "python", device="cpu", **SHORT)
     frames = [(frame.index, frame.time) for frame in run]
-    assert contents(tmp_path / "python") == contents(tmp_path / "command")
+    assert run_contents(tmp_path / "python") == run_contents(tmp_path / "command")
     assert [index for index, _ in frames] == list(range(run.scene.time.frame_count + 1))
     assert [time for _, time in frames] == pytest.approx(
         [run.scene.time.frame_time(index) for index, _ in frames]
@@ -132,7 +114,7 @@ def test_a_loop_that_is_left_resumes_bit_for_bit(tmp_path):
         "stopped by the program after frame 4",
     )
     assert [frame.index for frame in wl.Run.resume(parts, device="cpu")] == [5, 6, 7, 8, 9, 10]
-    one, other = contents(whole), contents(parts)
+    one, other = run_contents(whole), run_contents(parts)
     assert {name: one[name] for name in other.keys() & one.keys() if "step" not in name} == {
         name: value for name, value in other.items() if "step" not in name
     }
@@ -150,7 +132,7 @@ def test_a_loop_with_an_error_leaves_a_run_that_can_be_resumed(tmp_path):
 
 
 def without_checkpoints(folder: Path) -> dict:
-    return {name: value for name, value in contents(folder).items() if "step" not in name}
+    return {name: value for name, value in run_contents(folder).items() if "step" not in name}
 
 
 def failing_at(step: int, action):
@@ -395,7 +377,7 @@ def test_added_material_is_in_the_checkpoint(tmp_path):
     drive(tmp_path / "whole", leave=False)
     drive(tmp_path / "parts", leave=True)
     wl.Run.resume(tmp_path / "parts", device="cpu").finish()
-    one, other = contents(tmp_path / "whole"), contents(tmp_path / "parts")
+    one, other = run_contents(tmp_path / "whole"), run_contents(tmp_path / "parts")
     assert one["log"] == other["log"]
     assert all(one[name] == other[name] for name in one if name.startswith("frames"))
 

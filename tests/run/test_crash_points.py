@@ -1,6 +1,5 @@
 """Runs killed before any file operation and resumed: equal to uninterrupted ones."""
 
-import csv
 import json
 import os
 import shutil
@@ -10,11 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rich.console import Console
 
-from small_runs import run_into
+from small_runs import run_contents, run_into
 from warp_lcp.files.atomic import SUFFIX
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.progress import Lines
@@ -37,23 +35,8 @@ def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: boo
 
 
 def contents(out: Path) -> dict[str, Any]:
-    """Return the common contents of equal runs.
-
-    They are frames, collections, the log without seconds, checkpoints, and the scene.
-    """
-    found: dict[str, Any] = {
-        str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]
-    }
-    with open(out / "log.csv", newline="") as file:
-        found["log"] = [
-            {key: value for key, value in row.items() if key != "seconds"}
-            for row in csv.DictReader(file)
-        ]
-    for path in out.glob("checkpoints/step_*.npz"):
-        found[path.name] = {name: array.tobytes() for name, array in np.load(path).items()}
-    found["scene"] = (out / "scene.toml").read_text()
-    found["hidden"] = sorted(path.name for path in out.rglob(".*"))
-    return found
+    """Return the common contents of equal runs, and the names of hidden files."""
+    return {**run_contents(out), "hidden": sorted(path.name for path in out.rglob(".*"))}
 
 
 def killed(run: Callable[[], Any], folder: Path, operation: int) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from small_runs import read_record, run_into
+from small_runs import read_record, run_contents, run_into
 from warp_lcp.frames import vtu as vtu_module
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.run import loop as run_module
@@ -55,16 +55,9 @@ def contents(out: Path) -> dict[str, Any]:
 
     They are every frame, collection and log row, and the last checkpoint.
     """
-    found: dict[str, Any] = {
-        str(p.relative_to(out)): p.read_bytes() for p in [*out.glob("frames/*"), *out.glob("*.pvd")]
-    }
-    found["log"] = [{k: v for k, v in row.items() if k != VOLATILE} for row in rows(out)]
-    newest = max(out.glob("checkpoints/*.npz"))
-    found["checkpoint"] = (
-        newest.name,
-        {name: array.tobytes() for name, array in np.load(newest).items()},
-    )
-    return found
+    found = run_contents(out)
+    kept = sorted(name for name in found if name.startswith("step_"))
+    return {name: value for name, value in found.items() if name not in kept[:-1]}
 
 
 def stop_at(step: int) -> Any:

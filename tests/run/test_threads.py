@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
+from default_run import slow
 from particle_scenes import particle_scenes
 from warp_lcp.kernels import thread_pool as team
 from warp_lcp.scene.scene_file import load_scene
@@ -51,8 +52,8 @@ LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in LONG else ())
-        for name in particle_scenes()
+        slow(name) if name in LONG or number % 2 else name
+        for number, name in enumerate(particle_scenes())
     ],
 )
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):

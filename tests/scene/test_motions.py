@@ -1,11 +1,13 @@
 """Key `motion` of a solid: accepted values, messages of refusals, positions."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from scene_tables import scene_error
 from warp_lcp.cli import commands as cli
 from warp_lcp.grid import motion as motions
 from warp_lcp.scene.scene import Scene, SceneError, validate
@@ -26,10 +28,7 @@ def build(motion: object, dimension: int = 2, solids: str = "cut-cell") -> Scene
     return validate(Scene, data, "dam.toml")
 
 
-def complaint(motion: object, dimension: int = 2, solids: str = "cut-cell") -> str:
-    with pytest.raises(SceneError) as caught:
-        build(motion, dimension, solids)
-    return str(caught.value)
+complaint = partial(scene_error, build)
 
 
 def place(motion: dict, time: float, point: list[float]) -> list[float]:

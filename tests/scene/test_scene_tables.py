@@ -3,10 +3,12 @@
 import copy
 import math
 import pickle
+from functools import partial
 from typing import Any
 
 import pytest
 
+from scene_tables import scene_error
 from warp_lcp.scene.scene import Scene, SceneError, validate
 from warp_lcp.scene.shapes import BoxTable, SolidProperties, shaped
 
@@ -30,11 +32,7 @@ def build(changes: dict[str, Any]) -> Scene:
     return validate(Scene, data, "dam.toml")
 
 
-def complaint(changes: dict[str, Any]) -> str:
-    """Return the text of the error that the changes cause."""
-    with pytest.raises(SceneError) as caught:
-        build(changes)
-    return str(caught.value)
+complaint = partial(scene_error, build)
 
 
 def test_defaults_and_derived_numbers():

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
+from default_run import covering
+from matrices import planted_solution
 from oracle import assemble, boxed, lemke, natural_residual
 
 METHODS = {
@@ -27,23 +29,12 @@ METHODS = {
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 
 
-def planted(A, rng, active=0.3):
-    """Return a right-hand side with a known solution x >= 0, y >= 0, x'y = 0.
-
-    It is strictly complementary.
-    """
-    held = rng.random(len(A)) < active
-    x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))
-    y = np.where(held, rng.uniform(0.1, 1.0, len(A)), 0.0)
-    return y - A @ x, x
-
-
 @pytest.mark.parametrize("name", [name for name in METHODS if not name.startswith("multigrid")])
 def test_dense_planted(name, device):
     rng = np.random.default_rng(17)
     B = rng.standard_normal((40, 40))
     A = B @ B.T / 40 + np.eye(40)
-    b, x = planted(A, rng)
+    b, x = planted_solution(A, rng, 0.3)
     result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b), METHODS[name], stopping=TIGHT)
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), x, atol=1e-8)
@@ -51,8 +42,9 @@ def test_dense_planted(name, device):
 
 
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("shape", [(7, 6, 9), (13, 11), (1, 9, 8), (5, 1)])
-@pytest.mark.parametrize("arrays", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "arrays"), covering([(7, 6, 9), (13, 11), (1, 9, 8), (5, 1)], [False, True])
+)
 def test_grid_planted(name, shape, arrays, device):
     rng = np.random.default_rng(23)
     cells = rng.choice(3, shape, p=[0.15, 0.75, 0.1])
@@ -72,7 +64,7 @@ def test_grid_planted(name, shape, arrays, device):
         dtype=wp.float64,
     )
     b, x = np.zeros(cells.size), np.zeros(cells.size)
-    b[fluid], x[fluid] = planted(dense[np.ix_(fluid, fluid)], rng)
+    b[fluid], x[fluid] = planted_solution(dense[np.ix_(fluid, fluid)], rng, 0.3)
     result = wl.solve(wl.LCP(A, b.reshape(shape)), METHODS[name], stopping=TIGHT)
     assert result, result.status
     assert result.relative_residual <= 1e-10

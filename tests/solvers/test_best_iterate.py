@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from warp_lcp.reduced import grid_step_kernels as kernels
 
 
@@ -31,10 +32,10 @@ def started(precision="mixed", faces=None, closed=False):
     return problem, solver, work
 
 
-@pytest.mark.parametrize("precision", ["mixed", "double", "single"])
-@pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("beyond", [1, 2, 4])
-@pytest.mark.parametrize("before", [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    ("before", "beyond", "closed", "precision"),
+    covering([0, 1, 2, 3], [1, 2, 4], [False, True], ["mixed", "double", "single"], count=24),
+)
 def test_the_best_iterate_comes_back(before, beyond, closed, precision):
     problem, solver, work = started(precision, closed=closed)
     for _ in range(before):

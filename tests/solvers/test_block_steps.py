@@ -11,6 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from matrices import dense_and_sparse, spd
+from method_steps import iterates
 from oracle import assemble, boxed
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.staggering import Staggering
@@ -60,18 +61,6 @@ def sliding_block(A, b, normal):
     return None
 
 
-def steps_of(problem, method, count):
-    """Return iterates from clip(0, l, u)."""
-    work = method.init(problem)
-    problem.bounds.refresh()
-    work.residual.start(work.x, keep=False)
-    work.residual.evaluate(work.x)
-    work.start(warm=False, tolerance=0.0)
-    for _ in range(count):
-        method.step(problem, work, work.x)
-        yield work.x.numpy().copy()
-
-
 @pytest.mark.parametrize("direction", list(ORDERS))
 @pytest.mark.parametrize("omega", [1.0, 0.7, 1.4])
 def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device):
@@ -101,7 +90,7 @@ def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device)
         if operator.device.is_cuda:
             continue  # in colors, another order
         for got, x in zip(
-            steps_of(wl.LCP(operator, b, lower, upper), method, 4), expected, strict=True
+            iterates(wl.LCP(operator, b, lower, upper), method, 4), expected, strict=True
         ):
             np.testing.assert_allclose(got, x, atol=1e-11)
 
@@ -123,7 +112,7 @@ def test_contacts_with_friction_are_blocks_whose_limits_are_part_of_them(omega, 
         problem = wl.LCP(
             wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
         )
-        for got in steps_of(problem, BlockedGaussSeidel(blocks=3, omega=omega), 4):
+        for got in iterates(problem, BlockedGaussSeidel(blocks=3, omega=omega), 4):
             for first in (0, 3, 6):
                 block = np.arange(first, first + 3)
                 solution = sliding_block(*held_others(A, b, x, block), np.array([-1, 0, 0]))
@@ -173,7 +162,7 @@ def test_rounds_over_subproblems_are_those_of_the_algorithm(method, direction, d
         )
     for operator in dense_and_sparse(A, device):
         for got, x in zip(
-            steps_of(wl.LCP(operator, b, lower, upper), solver, 3), expected, strict=True
+            iterates(wl.LCP(operator, b, lower, upper), solver, 3), expected, strict=True
         ):
             np.testing.assert_allclose(got, x, atol=1e-9)
 
@@ -198,7 +187,7 @@ def test_normal_and_tangential_forces_in_turn(device):
             solvers=[wl.Lemke(), wl.MinimumMapNewton(direct=True)],
             eta=1e-12,
         )
-        for got in steps_of(problem, method, 4):
+        for got in iterates(problem, method, 4):
             for block in (normals, tangential):
                 x[block] = boxed(
                     *held_others(A, b, x, block),
@@ -227,7 +216,7 @@ def test_grid_blocks_see_the_others_cells_as_boundary_values(device):
     )
     place = problem.layout.places()[fluid]
     solver = Staggering(blocks=blocks, solvers=wl.ProjectedMultigrid(precision="double"), eta=1e-12)
-    for got in steps_of(problem, solver, 3):
+    for got in iterates(problem, solver, 3):
         for block in blocks:
             x[block] = boxed(
                 *held_others(dense, b, x, block), np.zeros(len(block)), np.full(len(block), 0.6)

@@ -8,6 +8,8 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering, slow
+from method_steps import begun
 from oracle import assemble, lemke, natural_residual
 from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
 from warp_lcp.reduced.multigrid_coupled import CoupledWorkspace
@@ -34,13 +36,14 @@ def small(device, dtype=wp.float64):
     )
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
 @pytest.mark.parametrize(
-    "weights", [np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 0.0]), np.full((3, 3), 1.0)]
-)
-@pytest.mark.parametrize(
-    "solver",
-    [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()],
+    ("solver", "weights", "scale"),
+    covering(
+        [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton()],
+        [np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 0.0]), np.full((3, 3), 1.0)],
+        [1e-3, 1.0, 30.0],
+        count=9,
+    ),
 )
 def test_the_dense_oracle_agrees(solver, weights, scale, device):
     """Agreement with the dense oracle.
@@ -198,11 +201,7 @@ def test_a_plain_preconditioner_is_not_enough(device):
 def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(device):
     cells, _, A, _ = tank(12, 2, 1e-2, device)
     problem = wl.LCP(A, np.where(cells == wl.FLUID, -1.0, 0.0), -np.inf)
-    work = wl.ProjectedMultigrid(precision="double").init(problem)
-    x = work.x
-    work.residual.start(x, keep=False)
-    work.residual.evaluate(x)
-    work.start(warm=False, tolerance=0.0)
+    work = begun(problem, wl.ProjectedMultigrid(precision="double").init(problem))
     work.rebuild(classify=work.residual.classified)
     correction: WoodburyCorrection = work.correction
     finest = work.hierarchy.finest
@@ -284,7 +283,9 @@ def test_bodies_may_come_and_go_in_place(device):
     np.testing.assert_allclose(result.x.numpy(), fresh.x.numpy(), atol=1e-4)
 
 
-@pytest.mark.parametrize(("weight", "precision"), [(1e4, "mixed"), (1e6, "mixed"), (1e8, "double")])
+@pytest.mark.parametrize(
+    ("weight", "precision"), [slow((1e4, "mixed")), (1e6, "mixed"), slow((1e8, "double"))]
+)
 def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision):
     """Very light bodies with separating walls.
 

@@ -1,6 +1,7 @@
 """Direct enumeration against exhaustive search and by hand; batches."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
+from default_run import covering
+from matrices import solve_matrix
 from oracle import boxed, natural_residual
 from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
@@ -16,12 +19,7 @@ from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, 
 TIGHT = wl.StoppingCriteria(rtol=1e-12)
 
 
-def solve(A, b, lower=0.0, upper=np.inf):
-    return wl.solve(
-        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
-        DirectEnumeration(),
-        stopping=TIGHT,
-    )
+solve = partial(solve_matrix, solver=DirectEnumeration(), stopping=TIGHT)
 
 
 def random_bounds(rng, n):
@@ -32,7 +30,7 @@ def random_bounds(rng, n):
     return lower, upper
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 4))
 def test_any_matrix_any_bounds(seed, n):
     """Any matrix with any bounds.
@@ -90,8 +88,7 @@ def test_too_many_unknowns_are_refused():
         DirectEnumeration().init(wl.LCP(wl.DenseOperator(np.eye(5), device="cpu"), np.ones(5)))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
-@pytest.mark.parametrize("dtype", [wp.float64, wp.float32])
+@pytest.mark.parametrize(("n", "dtype"), covering([1, 2, 3, 4], [wp.float64, wp.float32]))
 def test_batch(n, dtype, device):
     rng = np.random.default_rng(300 + n)
     m, exact = 400, dtype is wp.float64

@@ -10,6 +10,7 @@ import scipy.sparse.linalg
 import warp as wp
 
 import warp_lcp as wl
+from default_run import chosen
 from warp_lcp.reduced.principal_system import principal_system
 
 
@@ -71,7 +72,7 @@ def check(seed, largest):
     return A, b, result
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", chosen(range(16), [2, 10, 11, 12]))  # one of each kind
 def test_cycles_are_solved_by_default(seed):
     """Half of these ended MAX_ITERATIONS or STAGNATED, with relative residuals up to .96."""
     check(seed, 3000)

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import operator_of
 from oracle import lemke, natural_residual
 from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import NaturalResidual
@@ -30,14 +31,6 @@ def chain():
     return A, b
 
 
-def operator(A, sparse, device):
-    return (
-        wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
-        if sparse
-        else wl.DenseOperator(A, device=device)
-    )
-
-
 @pytest.fixture(params=NAMES)
 def method(request):
     if request.param == "quadratic-program":
@@ -48,7 +41,7 @@ def method(request):
 @pytest.mark.parametrize("sparse", [False, True])
 def test_they_go_to_the_bound_that_b_asks_for(method, sparse, device):
     A, b = chain()
-    problem = wl.LCP(operator(A, sparse, device), b, -1.0, 1.0)
+    problem = wl.LCP(operator_of(A, "sparse" if sparse else "dense", device), b, -1.0, 1.0)
     result = wl.solve(problem, method, stopping=wl.StoppingCriteria(max_iterations=300))
     x, l, u = result.x.numpy(), np.full(N, -1.0), np.full(N, 1.0)
     assert result, result.status
@@ -59,13 +52,15 @@ def test_they_go_to_the_bound_that_b_asks_for(method, sparse, device):
 @pytest.mark.parametrize("sparse", [False, True])
 def test_where_that_bound_is_infinite_there_is_no_solution(method, sparse, device):
     A, b = chain()
-    problem = wl.LCP(operator(A, sparse, device), np.where(b == -0.3, 0.3, b))
+    problem = wl.LCP(
+        operator_of(A, "sparse" if sparse else "dense", device), np.where(b == -0.3, 0.3, b)
+    )
     try:
         assert (
             wl.solve(problem, method, stopping=wl.StoppingCriteria(max_iterations=300)).status
             is wl.SolveStatus.CONVERGED
         )
-        problem = wl.LCP(operator(A, sparse, device), b)
+        problem = wl.LCP(operator_of(A, "sparse" if sparse else "dense", device), b)
         assert wl.solve(problem, method).status is wl.SolveStatus.INFEASIBLE
     except ValueError as refusal:  # sweeps refuse it before they start
         assert "unbounded move (row 4, b = -0.3)" in str(refusal)

@@ -13,6 +13,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import few
 from oracle import natural_residual
 from warp_lcp.default_chain import PathCreeps
 from warp_lcp.problem.solve import Step, WorkspaceBase, method_name
@@ -383,7 +384,7 @@ def maze(n=61):
     return wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", few(range(3), 1))
 def test_blocks_of_staggering_have_a_chain_of_their_own(seed):
     """Fallbacks of the blocks of staggering.
 

@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import boxed
 from warp_lcp.problem.protocol import families
 
@@ -97,8 +98,7 @@ def test_many(name):
             check(name, range(7300, 7360), sparse)
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("method", [wl.Lemke(), wl.FischerNewton()])
+@pytest.mark.parametrize(("size", "method"), covering(SIZES, [wl.Lemke(), wl.FischerNewton()]))
 def test_both_sides_far(method, size):
     """Far bounds on both sides.
 

@@ -11,6 +11,8 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering, slow
+from method_steps import iterates, steps_of
 from oracle import assemble
 from plain_fischer import LEAST_Q, PlainMap, armijo
 from warp_lcp.gallery.contact_scenes import contact
@@ -93,31 +95,16 @@ def plain_newton(plain, x, steps, direction, *, drops=False, memory=1):
     return found
 
 
-def steps_of(problem, method, x0, count, read=lambda work: work.x.numpy()):
-    """Return iterates of a method from x0, which is not projected."""
-    work = method.init(problem)
-    work.residual.start(work.x, keep=False)
-    work.x.assign(problem.layout.load(x0, wp.float64))
-    work.residual.evaluate(work.x)
-    work.start(warm=True, tolerance=0.0)
-    out = []
-    for _ in range(count):
-        assert method.step(problem, work, work.x).failure is None
-        if not work.residual.current:
-            work.residual.evaluate(work.x)
-        out.append(np.array(read(work)))
-    return out
-
-
 def operators(A, device):
     return wl.SparseOperator(scipy.sparse.csr_array(A), device=device), wl.LinearOperator(
         lambda x: A @ x, (len(A),), diagonal=np.diag(A)
     )
 
 
-@pytest.mark.parametrize("kink", ["perturbation", "zero"])
-@pytest.mark.parametrize("share", [1.0, 0.6])
-@pytest.mark.parametrize("safeguard", [False, True])
+@pytest.mark.parametrize(
+    ("kink", "share", "safeguard"),
+    covering(["perturbation", "zero"], [1.0, 0.6], [False, True], count=4),
+)
 def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, device):
     """Matrix-free steps against the algorithm.
 
@@ -140,7 +127,7 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
             problem = wl.LCP(operator, b, lower, upper)
             # Unit of the map.
             np.testing.assert_allclose(method.init(problem).residual.diagonal.numpy(), plain.d)
-            for x, (y, _) in zip(steps_of(problem, method, x0, 5), expected, strict=True):
+            for x, (y, _) in zip(iterates(problem, method, 5, x0), expected, strict=True):
                 np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-10)
     assert min(lengths) < 1
 
@@ -171,12 +158,12 @@ def test_unscaled_steps_are_those_of_the_algorithm(kink, share, device):
         assert np.abs(scaled[0][0] - expected[0][0]).max() > 1e-5
         for operator in operators(A, device):
             for x, (y, _) in zip(
-                steps_of(wl.LCP(operator, b, lower, upper), method, x0, 4), expected, strict=True
+                iterates(wl.LCP(operator, b, lower, upper), method, 4, x0), expected, strict=True
             ):
                 np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
         problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper)
         expected = plain_newton(plain, x0, 4, jacobian_direction, drops=kink == "zero")
-        for x, (y, _) in zip(steps_of(problem, method, x0, 4), expected, strict=True):
+        for x, (y, _) in zip(iterates(problem, method, 4, x0), expected, strict=True):
             np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
 
 
@@ -223,7 +210,7 @@ def test_plain_steps_on_the_host_are_those_of_the_algorithm(kink):
         lengths += [t for _, t in expected]
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper)
         for x, (y, _) in zip(
-            steps_of(problem, FischerNewton(kink=kink, safeguard=False), x0, 4),
+            iterates(problem, FischerNewton(kink=kink, safeguard=False), 4, x0),
             expected,
             strict=True,
         ):
@@ -242,12 +229,11 @@ def test_safeguarded_steps_on_the_host_are_those_of_the_algorithm():
         expected = plain_newton(plain, x0, 4, regularized_direction, memory=8)
         lengths += [t for _, t in expected]
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper)
-        for x, (y, _) in zip(
-            steps_of(problem, FischerNewton(), x0, 4, read=lambda w: w._iterate),
-            expected,
-            strict=True,
+        for (work, step), (y, _) in zip(
+            steps_of(problem, FischerNewton(), 4, x0), expected, strict=True
         ):
-            np.testing.assert_allclose(x, y, rtol=1e-7, atol=1e-8)
+            assert step.failure is None
+            np.testing.assert_allclose(work._iterate, y, rtol=1e-7, atol=1e-8)
             outside += int(((y < lower) | (y > upper)).any())
     assert outside > 3
     assert min(lengths) < 1
@@ -345,8 +331,8 @@ def test_gradient_steps_are_those_of_the_algorithm():
             GradientDescent(map=form, memory=3),
         )
         merits, length, last = [], 1.0, None
-        for got in steps_of(
-            wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), method, x, 8
+        for got in iterates(
+            wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), method, 8, x
         ):
             g = plain.jacobian(x).T @ plain.rows(x)[0] / plain.d
             if last is not None:
@@ -384,8 +370,17 @@ def unit_rows(seed, share, n=7):
 
 
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
-@pytest.mark.parametrize("share", [1.0, 0.6])
-@pytest.mark.parametrize(("safeguard", "scaled"), [(False, True), (True, True), (False, False)])
+@pytest.mark.parametrize(
+    ("share", "safeguard", "scaled"),
+    [
+        (1.0, False, True),
+        (0.6, True, True),
+        (1.0, False, False),
+        slow((0.6, False, True)),
+        slow((1.0, True, True)),
+        slow((0.6, False, False)),
+    ],
+)
 def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scaled):
     """Steps on a grid against the algorithm.
 
@@ -421,7 +416,7 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard, scal
     )
     place = problem.layout.places()[fluid]
     for x, (y, _) in zip(
-        steps_of(problem, method, fields[1].reshape(cells.shape), 5), expected, strict=True
+        iterates(problem, method, 5, fields[1].reshape(cells.shape)), expected, strict=True
     ):
         np.testing.assert_allclose(x[place], y, rtol=1e-6, atol=1e-6)
 
@@ -467,7 +462,7 @@ def test_inexact_directions_are_searched_by_their_own_slope():
         -np.inf,
     )
     method = FischerNewton(safeguard=False, max_linear_iterations=1, precision="double")
-    for x, k in zip(steps_of(problem, method, np.zeros(2), 4), range(1, 5), strict=True):
+    for x, k in zip(iterates(problem, method, 4, np.zeros(2)), range(1, 5), strict=True):
         y = A @ x + [1.0, 2.0]
         assert y @ y == pytest.approx(5.0 / (1 + s**2) ** k, rel=1e-9)
 

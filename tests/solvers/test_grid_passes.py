@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering, slow
 from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.problem.residual import NaturalResidual
@@ -97,10 +98,10 @@ def test_conjugate_gradients_stop_without_a_right_hand_side():
     assert not system.e.numpy().any()
 
 
-@pytest.mark.parametrize("form", FACES, ids=str)
-@pytest.mark.parametrize("upper", [np.inf, 0.4])
-@pytest.mark.parametrize("share", [1.0, 0.9])
-@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+@pytest.mark.parametrize(
+    ("form", "upper", "share", "real"),
+    covering(list(FACES), [np.inf, 0.4], [1.0, 0.9], [wp.float32, wp.float64], count=8),
+)
 def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, share, real):
     """Fischer step: its move, its residual and its system.
 
@@ -336,8 +337,7 @@ def test_a_bad_guess_is_left_by_shorter_steps_or_projected_cycles(method):
 
 
 @pytest.mark.parametrize(
-    ("precision", "seeds"),
-    [("mixed", 12), ("single", 4), pytest.param("single", 12, marks=pytest.mark.slow)],
+    ("precision", "seeds"), [("mixed", 4), ("single", 4), slow(("mixed", 12)), slow(("single", 12))]
 )
 @pytest.mark.parametrize("periodic", [False, True])
 def test_the_best_iterate_is_returned_however_the_solve_is_cut_short(precision, seeds, periodic):

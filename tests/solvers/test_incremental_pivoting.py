@@ -4,6 +4,8 @@ Problems are definite and semi-definite, with boxes, equations, and without a so
 costs O(n^2).
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -11,20 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from matrices import planted_solution
+from matrices import planted_solution, solve_matrix
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting, PrincipalInverse
 
 TIGHT = wl.StoppingCriteria(rtol=1e-8, max_iterations=1000)
 
 
-def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT, **options):
-    return wl.solve(
-        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
-        solver or IncrementalPivoting(),
-        stopping=stopping,
-        **options,
-    )
+solve = partial(solve_matrix, solver=IncrementalPivoting(), stopping=TIGHT)
 
 
 def semidefinite(rng, n, zeros):
@@ -47,7 +43,7 @@ def test_semidefinite_problems(zeros):
         assert natural_residual(A, b, 0.0, np.inf, x) <= 100 * rounding
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 6))
 def test_boxes_and_equations(seed, n):
     rng = np.random.default_rng(seed)

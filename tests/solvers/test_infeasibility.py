@@ -9,6 +9,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import covering
 from warp_lcp.reduced.dense_problem import (
     DenseProblem,
     certifies,
@@ -197,9 +198,10 @@ def test_a_full_film(n, eccentricity, method):
     )
 
 
-@pytest.mark.parametrize("dense", [False, True])
-@pytest.mark.parametrize("lower", [0.0, -np.inf])
-@pytest.mark.parametrize("method", [None, wl.InteriorPoint()], ids=["default", "interior point"])
+@pytest.mark.parametrize(
+    ("method", "lower", "dense"),
+    covering([None, wl.InteriorPoint()], [0.0, -np.inf], [False, True], count=4),
+)
 def test_a_ring(method, lower, dense):
     n = 120 if dense else 720
     A, b = ring(n), np.sin(2 * np.pi * np.arange(n) / n)

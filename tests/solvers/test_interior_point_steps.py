@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from method_steps import begun
 from oracle import assemble
 from warp_lcp.solvers.interior_point import InteriorPoint, InteriorPointWorkspace
 
@@ -155,14 +156,6 @@ def boxed_rows(seed, n=11):
     return B @ B.T + n * np.eye(n) + 0.3 * (C - C.T), 4 * rng.standard_normal(n), lower, upper
 
 
-def started(work, problem):
-    """Return the workspace at clip(0, l, u)."""
-    work.residual.start(work.x, keep=False)
-    work.residual.evaluate(work.x)
-    work.start(warm=False, tolerance=0.0)
-    return work
-
-
 def compare(method, work, problem, plain, place, steps, tolerance):
     """Compare x, w, v, s, t and mu after each step."""
     for k in range(steps):
@@ -209,7 +202,7 @@ def test_steps_are_those_of_the_algorithm(kind, settings, device):
             else wl.SparseOperator(scipy.sparse.csr_array(A), device=device)
         )
         problem, method = wl.LCP(operator, b, lower, upper), InteriorPoint(**EXACT | settings)
-        work = started(InteriorPointWorkspace(problem, method), problem)
+        work = begun(problem, InteriorPointWorkspace(problem, method))
         compare(
             method,
             work,
@@ -237,7 +230,7 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(bounds, mehrotra):
     field[fluid] = b
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), field.reshape(cells.shape), *bounds)
     method = InteriorPoint(mehrotra=mehrotra, **EXACT)
-    work = started(method.init(problem), problem)
+    work = begun(problem, method.init(problem))
     plain = PlainPath(A, b, *(np.full(n, side) for side in bounds), mehrotra=mehrotra)
     compare(method, work, problem, plain, problem.layout.places()[fluid], 7, 1e-7)
 
@@ -249,7 +242,7 @@ def test_the_predictor_decides_the_centering():
     """
     A, b, lower, upper = boxed_rows(4521)
     problem, method = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), InteriorPoint()
-    work = started(InteriorPointWorkspace(problem, method), problem)
+    work = begun(problem, InteriorPointWorkspace(problem, method))
     work.begin(work.x)
     mu, pairs = work.mu, work.count
     assert work._center(0.0, 0.0) == 0.0

@@ -1,11 +1,14 @@
 """Lemke's method: any matrix, frictional contacts, boxes by reformulation, rays."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
+from matrices import solve_matrix
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.lemke import Basis, Lemke
@@ -14,12 +17,7 @@ from warp_lcp.solvers.quadratic_program import QuadraticProgram
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=1000)
 
 
-def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT):
-    return wl.solve(
-        wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper),
-        solver or Lemke(),
-        stopping=stopping,
-    )
+solve = partial(solve_matrix, solver=Lemke(), stopping=TIGHT)
 
 
 def contacts(count, rng, friction=0.5):
@@ -94,7 +92,7 @@ def test_against_the_tableau():
         np.testing.assert_allclose(solve(A, b).x.numpy(), lemke(A, b), atol=1e-9)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 6))
 def test_boxes_equations_and_fixed_values(seed, n):
     rng = np.random.default_rng(seed)

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from method_steps import steps_of
 from oracle import assemble
 from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.gallery.obstacle import ball_obstacle
@@ -88,24 +89,6 @@ def with_ties(seed, n=10):
     return A, y - A @ x, lower, upper, x
 
 
-def steps_of(problem, method, x0, count):
-    """Return iterates of a method from x0 and the reports of its steps."""
-    work = method.init(problem)
-    work.residual.start(work.x, keep=False)
-    work.x.assign(problem.layout.load(x0, wp.float64))
-    work.residual.evaluate(work.x)
-    work.start(warm=True, tolerance=0.0)
-    out = []
-    for _ in range(count):
-        step = method.step(problem, work, work.x)
-        if not work.residual.current:
-            work.residual.evaluate(work.x)
-        out.append((work.x.numpy().copy(), step))
-        if work.residual.norm < 1e-12:  # solved
-            break
-    return out
-
-
 @pytest.mark.parametrize("safeguard", [True, False])
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_steps_are_those_of_the_algorithm(kind, safeguard, device):
@@ -127,14 +110,16 @@ def test_steps_are_those_of_the_algorithm(kind, safeguard, device):
             wl.LCP(operator, b, lower, upper),
             MinimumMapNewton(precision="double", eta=1e-14, safeguard=safeguard),
         )
-        for (x, step), (y, held, t) in zip(
-            steps_of(problem, method, x0, 4), expected, strict=False
+        for (work, step), (y, held, t) in zip(
+            steps_of(problem, method, 4, x0), expected, strict=False
         ):
             if t == 0:  # the search fails
                 break
-            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-10)
+            np.testing.assert_allclose(work.x.numpy(), y, rtol=1e-9, atol=1e-10)
             assert (step.name, step.active, step.failure) == ("newton", held, None)
             lengths.append(t)
+            if work.residual.norm < 1e-12:  # solved
+                break
     assert len(lengths) > 10
     assert min(lengths) < 1
 
@@ -149,7 +134,8 @@ def test_ties_are_free(direct):
     below, above = index_sets(np.ones(10), x0, A @ x0 + b, lower, upper)
     assert not (below | above)[:3].any()
     problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper)
-    x, step = steps_of(problem, MinimumMapNewton(direct=direct), x0, 1)[0]
+    ((work, step),) = steps_of(problem, MinimumMapNewton(direct=direct), 1, x0)
+    x = work.x.numpy()
     assert step.active == np.count_nonzero(below | above)
     if direct:  # whole steps
         held, free = np.flatnonzero(below | above), np.flatnonzero(~(below | above))

@@ -6,6 +6,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.gallery import (
     Plant,
@@ -22,17 +23,19 @@ from warp_lcp.solvers.mprgp import MPRGP
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=2000, patience=200)
 
 
-@pytest.mark.parametrize("precision", ["mixed", "double"])
 @pytest.mark.parametrize(
-    "plant",
-    [
-        Plant(),
-        Plant(weak=0.5, active=0.6),
-        Plant(boxed=True, mixed=0.2, active=0.5),
-        Plant(active=1.0),
-    ],
+    ("plant", "shape", "precision"),
+    covering(
+        [
+            Plant(),
+            Plant(weak=0.5, active=0.6),
+            Plant(boxed=True, mixed=0.2, active=0.5),
+            Plant(active=1.0),
+        ],
+        [(17, 13), (7, 6, 8)],
+        ["mixed", "double"],
+    ),
 )
-@pytest.mark.parametrize("shape", [(17, 13), (7, 6, 8)])
 def test_grids_reach_the_planted_solution(shape, plant, precision, device):
     for air, coefficients in ((0.0, "uniform"), (0.15, "random")):
         p = poisson(

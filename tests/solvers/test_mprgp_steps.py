@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from method_steps import begun
 from oracle import assemble
 from warp_lcp.reduced.grid_step_kernels import conjugate
 from warp_lcp.solvers.mprgp import MPRGP
@@ -106,11 +107,7 @@ def problems():
 
 def started(problem, method, x0):
     """Return a workspace at x0."""
-    work = method.init(problem)
-    work.residual.start(work.x, keep=False)
-    work.x.assign(problem.layout.load(x0, wp.float64))
-    work.residual.evaluate(work.x)
-    work.start(warm=True, tolerance=0.0)
+    work = begun(problem, method.init(problem), x0)
     work.keep()
     return work
 

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from method_steps import steps_of
 from oracle import assemble, boxed, lemke
 from warp_lcp.gallery import splash
 from warp_lcp.gallery.obstacle import ball_obstacle
@@ -95,15 +96,11 @@ def test_steps_are_those_of_the_method(kind, device):
     for _ in range(4):
         problem, A, b, lower, upper, inside = as_problem(kind, rng, device)
         method = wl.Penalty(rho=RHO, precision="double", eta=1e-13, monotone_cycles=0)
-        work = method.init(problem)
-        problem.bounds.refresh()
-        work.residual.start(work.x, keep=False)
-        work.residual.evaluate(work.x)
-        work.start(warm=False, tolerance=0.0)
-        for x, _, active in plain_penalty(
-            A, b, lower, upper, np.clip(np.zeros(len(b)), lower, upper), 5, RHO
+        x0 = np.clip(np.zeros(len(b)), lower, upper)
+        expected = plain_penalty(A, b, lower, upper, x0, 5, RHO)
+        for (work, step), (x, _, active) in zip(
+            steps_of(problem, method, 5), expected, strict=True
         ):
-            step = method.step(problem, work, work.x)
             own = problem.layout.unload(work.x).numpy().ravel()[inside]
             np.testing.assert_allclose(own, x, rtol=1e-9, atol=1e-10)
             assert (step.name, step.active) == ("policy", active)

@@ -10,6 +10,7 @@ import scipy.sparse
 from scipy.sparse.linalg import LinearOperator, aslinearoperator, spilu
 
 import warp_lcp as wl
+from default_run import covering
 from warp_lcp.problem.protocol import families
 
 M = 24
@@ -111,9 +112,8 @@ WRONG = {
 
 
 @pytest.mark.parametrize(
-    "operator", [A, wl.LinearOperator(aslinearoperator(A))], ids=["symmetric", "not said to be"]
+    ("kind", "operator"), covering(list(WRONG), [A, wl.LinearOperator(aslinearoperator(A))])
 )
-@pytest.mark.parametrize("kind", WRONG)
 def test_what_is_no_preconditioner_makes_no_success(kind, operator):
     """Invalid preconditioner: no false success.
 

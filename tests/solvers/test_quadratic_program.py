@@ -1,6 +1,7 @@
 """PIQP behind the interface: symmetric problems, refusals, unbounded objectives."""
 
 import importlib.util
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,27 +9,21 @@ import scipy.optimize
 import scipy.sparse
 
 import warp_lcp as wl
+from matrices import solve_matrix
 from oracle import boxed
-from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 
 pytest.importorskip("piqp")
 TIGHT = wl.StoppingCriteria(rtol=1e-8)
 
 
-def solve(A, b, lower=0.0, upper=np.inf, solver=None):
-    operator = (
-        SparseOperator(A, device="cpu")
-        if scipy.sparse.issparse(A)
-        else wl.DenseOperator(A, device="cpu")
-    )
-    return wl.solve(wl.LCP(operator, b, lower, upper), solver or QuadraticProgram(), stopping=TIGHT)
+solve = partial(solve_matrix, solver=QuadraticProgram(), stopping=TIGHT)
 
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_boxes_and_equations(sparse):
     rng = np.random.default_rng(901)
-    for _ in range(100):
+    for _ in range(40):
         n = int(rng.integers(1, 7))
         B = rng.standard_normal((n, n))
         A, b, kind = B @ B.T + 0.1 * np.eye(n), rng.standard_normal(n), rng.integers(0, 5, n)

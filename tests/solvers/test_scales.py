@@ -6,13 +6,14 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import by_turns
 from warp_lcp.problem.protocol import families
 
 N = 20
 GRID = np.array([[0] * 5] + [[1] * 5] * 3)
 SCALES = [(1e8, 1.0), (1.0, 1e8), (1e-8, 1e-8)]  # of A and of x: large and small
 CASES = [
-    pytest.param(name, family, id=f"{name}-{family}")
+    (name, family)
     for name, cls in wl.METHODS.items()
     for family in ("dense", "sparse", "grid")
     if family in families(cls) and name != "direct-enumeration"
@@ -35,7 +36,7 @@ def problem(family, a, x, device):
     return wl.LCP(wl.SparseOperator(T, device=device), b, 0.0, 2 * x)
 
 
-@pytest.mark.parametrize(("name", "family"), CASES)
+@pytest.mark.parametrize(("name", "family"), by_turns(CASES))
 def test_iterations_do_not_depend_on_units(name, family, device):
     if name == "quadratic-program":
         pytest.importorskip("piqp")

@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from matrices import planted_solution
 from oracle import assemble, lemke
 from warp_lcp.gallery.contact_scenes import heavy_on_light
 from warp_lcp.kernels.vectors import rows_of
@@ -17,12 +18,6 @@ from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 from warp_lcp.sweeps.sweep_kernels import CHANGE
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=500)
-
-
-def planted(A, rng, share=0.3):
-    held = rng.random(len(A)) < share
-    x = np.where(held, 0.0, rng.uniform(0.1, 1.0, len(A)))
-    return np.where(held, rng.uniform(0.1, 1.0, len(A)), 0.0) - A @ x, x
 
 
 def test_one_solve_on_the_right_set_is_the_solution(device):
@@ -34,7 +29,7 @@ def test_one_solve_on_the_right_set_is_the_solution(device):
     rng = np.random.default_rng(127)
     B = rng.standard_normal((60, 60))
     A = B @ B.T / 240 + np.eye(60)
-    b, x = planted(A, rng)
+    b, x = planted_solution(A, rng, 0.3)
     result = wl.solve(
         wl.LCP(wl.DenseOperator(A, device=device), b), SubspaceMinimization(), stopping=TIGHT
     )

@@ -8,6 +8,8 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import covering
+from method_steps import begun
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
 FRICTION = 0.4
@@ -90,10 +92,7 @@ class PlainSubspace:
 
 def compare(problem, plain, settings, steps, tolerance=1e-9):
     method = SubspaceMinimization(precision="double", **settings)
-    work = method.init(problem)
-    work.residual.start(work.x, keep=False)
-    work.residual.evaluate(work.x)
-    work.start(warm=False, tolerance=0.0)
+    work = begun(problem, method.init(problem))
     np.testing.assert_array_equal(work.x.numpy(), plain.x)
     for k in range(steps):
         if not work.residual.current:
@@ -112,18 +111,20 @@ def compare(problem, plain, settings, steps, tolerance=1e-9):
 BOXES = [(0.0, np.inf), (-1.0, 1.0), (-np.inf, 0.5), (-np.inf, np.inf)]
 
 
-@pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize(
-    "settings",
-    [
-        {"sweeps": 1, "solves": 3, "omega": 1.0, "backtracks": 5},
-        {"sweeps": 2, "solves": 2, "omega": 1.3, "backtracks": 1},
-        {"sweeps": 1, "solves": 2, "omega": 1.0, "backtracks": -1},
-        {"sweeps": 1, "solves": 1, "omega": 0.8, "backtracks": 0},
-    ],
-    ids=lambda s: "-".join(map(str, s.values())),
+    ("settings", "symmetric", "kind"),
+    covering(
+        [
+            {"sweeps": 1, "solves": 3, "omega": 1.0, "backtracks": 5},
+            {"sweeps": 2, "solves": 2, "omega": 1.3, "backtracks": 1},
+            {"sweeps": 1, "solves": 2, "omega": 1.0, "backtracks": -1},
+            {"sweeps": 1, "solves": 1, "omega": 0.8, "backtracks": 0},
+        ],
+        [True, False],
+        ["dense", "sparse"],
+    ),
+    ids=lambda s: "-".join(map(str, s.values())) if isinstance(s, dict) else None,
 )
-@pytest.mark.parametrize("symmetric", [True, False])
 def test_steps_are_those_of_the_algorithm(kind, settings, symmetric, device):
     """Steps against the algorithm.
 

@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import by_turns
 from oracle import boxed, lemke
 from warp_lcp.problem.protocol import families
 
@@ -38,12 +39,14 @@ def problems(most):
 
 @pytest.mark.parametrize(
     ("name", "family"),
-    [
-        (name, family)
-        for name, cls in wl.METHODS.items()
-        for family in ("dense", "sparse")
-        if family in families(cls)
-    ],
+    by_turns(
+        [
+            (name, family)
+            for name, cls in wl.METHODS.items()
+            for family in ("dense", "sparse")
+            if family in families(cls)
+        ]
+    ),
 )
 def test_on_matrices(name, family):
     if name == "quadratic-program":
