@@ -16,6 +16,7 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, resident_bytes
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
+from warp_lcp.kernels.types import DeviceArray
 
 RTOL = 1e-6
 # A method without fallbacks may need hundreds of steps, and its residual may rise for more steps
@@ -174,7 +175,7 @@ class SolverCase:
         }
         return figures
 
-    def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:
+    def _in_place(self) -> tuple[wl.LCP, DeviceArray]:
         """Return the problem with b in the stored layout, and b.
 
         Time-stepping codes keep b in this layout.
@@ -182,5 +183,5 @@ class SolverCase:
         b = self._stored(self.scene.b)
         return self.scene.lcp(self.bounds, device=self.device, b=b), b
 
-    def _stored(self, values: np.ndarray) -> wp.array[Any]:
+    def _stored(self, values: np.ndarray) -> DeviceArray:
         return wp.array(np.pad(values, 1), dtype=wp.float64, device=self.device)

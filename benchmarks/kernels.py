@@ -25,6 +25,7 @@ from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
 from warp_lcp.benchmarks.problems import Splash, basin
 from warp_lcp.kernels import Rows, StencilKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
+from warp_lcp.kernels.types import DeviceArray
 
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)
@@ -51,7 +52,7 @@ class Heard:
     """Stencil kernel with its fields by name, recorded when it was bound."""
 
     bound: BoundKernel
-    fields: dict[str, wp.array[Any]]
+    fields: dict[str, DeviceArray]
 
     @property
     def name(self) -> str:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.cases import RTOL, SolverCase
@@ -23,6 +22,7 @@ from warp_lcp.benchmarks.harness.machine import COPIED, machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results, shown, spread
 from warp_lcp.benchmarks.harness.timing import Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 
@@ -54,11 +54,11 @@ class ProductsOnly(wl.Operator):
         self.shape, self.dtype, self.device = self._grid.shape, self._grid.dtype, self._grid.device
         self.cells, self.layout = self._grid.cells, self._grid.layout
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x."""
         return self._grid.apply(x, out)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A."""
         return self._grid.diagonal()
 

@@ -17,6 +17,7 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.run.loop import RunRequest, run_scene
@@ -172,7 +173,7 @@ class BothSolves:
         seconds.append(time.perf_counter() - begun)
         return result
 
-    def _start(self, x0: wp.array[Any]) -> wp.array[Any]:
+    def _start(self, x0: DeviceArray) -> DeviceArray:
         """Scale the last linear solution by the ratio of time steps.
 
         The scene scales its own solution in the same way.

@@ -13,6 +13,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import Expected, ExtremeCase, Promise, SolveCase
 from warp_lcp.benchmarks.extremes.shapes import grounded, pool
+from warp_lcp.kernels.types import DeviceArray
 
 CAUGHT = Promise(Expected.CAUGHT)
 RIGHT = (  # problems that the correct methods solve
@@ -31,7 +32,7 @@ class SignFlipped:
         """Return the workspace of the correct method."""
         return self._right.init(problem)
 
-    def step(self, problem: wl.LCP, work: Any, x: wp.array[Any]) -> wl.Step:
+    def step(self, problem: wl.LCP, work: Any, x: DeviceArray) -> wl.Step:
         """Take the negative of the correct step."""
         before = x.numpy().copy()
         done = self._right.step(problem, work, x)

@@ -17,6 +17,7 @@ from warp_lcp.benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+from warp_lcp.kernels.types import DeviceArray
 
 RESOLUTIONS = (16, 32)  # cells along a side
 PER_CELL = 4
@@ -37,11 +38,11 @@ class Cloud:
     """Particles away from the walls, and the fields of their transfers."""
 
     grid: StaggeredGrid
-    position: wp.array[Any]
-    velocity: wp.array[Any]
-    affine: list[wp.array[Any]]
-    fields: list[wp.array[Any]]
-    weights: list[wp.array[Any]]
+    position: DeviceArray
+    velocity: DeviceArray
+    affine: list[DeviceArray]
+    fields: list[DeviceArray]
+    weights: list[DeviceArray]
 
     def round_trip(self) -> None:
         """Transfer to the faces and back."""

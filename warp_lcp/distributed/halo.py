@@ -19,6 +19,7 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.decomposition import Decomposition
@@ -145,7 +146,7 @@ class Halo:
         """Gathering of the fields of all ranks on every rank."""
         return Gathering(self.decomposition)
 
-    def fill(self, field: wp.array[Any] | np.ndarray) -> None:
+    def fill(self, field: DeviceArray | np.ndarray) -> None:
         """Fill the ghost cells of a contiguous field; collective.
 
         The field has shape `shape`, or as many elements.
@@ -157,7 +158,7 @@ class Halo:
             return
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
-    def filling(self, field: wp.array[Any]) -> Task:
+    def filling(self, field: DeviceArray) -> Task:
         """Return the halo exchange of a field, to run now or within a recorded program.
 
         For more than one rank.
@@ -170,7 +171,7 @@ class Halo:
             partial(exchanging, self._forest, field.numpy(), field.numpy()),
         )
 
-    def _fill_through_host(self, field: wp.array[Any]) -> None:
+    def _fill_through_host(self, field: DeviceArray) -> None:
         """Fill a field on a device.
 
         Cells within `width` of the cuts are copied through the host's memory, so that PETSc needs
@@ -227,14 +228,14 @@ class Gathering:
             tuple(n + 2 for n in reversed(decomposition.counts)),
         )
 
-    def collect(self, mine: wp.array[Any], whole: wp.array[Any]) -> None:
+    def collect(self, mine: DeviceArray, whole: DeviceArray) -> None:
         """Write the ranks' cells to the whole grid's field on every rank."""
         source, target = mine.numpy(), whole.numpy()
         exchange(self._forest, source, target)
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def collecting(self, mine: wp.array[Any], whole: wp.array[Any]) -> Task:
+    def collecting(self, mine: DeviceArray, whole: DeviceArray) -> Task:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
             return Task(partial(self.collect, mine, whole))
@@ -243,7 +244,7 @@ class Gathering:
             partial(exchanging, self._forest, mine.numpy(), whole.numpy()),
         )
 
-    def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = launch_now) -> None:
+    def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:
         """Write this rank's part of the whole grid's field to its own, with ghost cells."""
         given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
         launch(take_kernel, self._shape[:2], given, device=mine.device)

@@ -15,6 +15,7 @@ from warp_lcp.grid.particles import MOST_A_CELL, Particles
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.memory import Scalar, Slot
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
@@ -61,7 +62,7 @@ class Buffer:
         self.host[: values.size] = values.ravel()
 
     def _allocate(self, count: int) -> None:
-        self.array: wp.array[Any] = wp.empty(count, dtype=self._dtype, device="cpu")
+        self.array: DeviceArray = wp.empty(count, dtype=self._dtype, device="cpu")
         self.host: np.ndarray = self.array.numpy()
         self._slot.point_to(self.array)
 
@@ -89,7 +90,7 @@ class ParticleMessages:
         self._bounds = bounds_of(part)
         self._end = beyond(part.decomposition.counts, part.grid.spacing)
         self._ends = self._take_boxes()
-        self._copies: dict[str, wp.array[Any]] = {}
+        self._copies: dict[str, DeviceArray] = {}
         # Columns of a GPU are copied to new arrays in each run.
         copied = particles.grid.device.is_cuda
         launches = (
@@ -209,7 +210,7 @@ class ParticleMessages:
         for name, column in self._copies.items():
             self._particles.arrays()[name].assign(column)
 
-    def _columns(self, positions_only: bool = False) -> dict[str, wp.array[Any] | None]:
+    def _columns(self, positions_only: bool = False) -> dict[str, DeviceArray | None]:
         """Return the columns in the host's memory."""
         arrays = self._copies or self._particles.arrays()
         return dict.fromkeys(COLUMNS) | (
@@ -284,7 +285,7 @@ class ParticleMessages:
         self._bind(GIVE_PLACES, given | numbers)
 
     @property
-    def _border_found(self) -> dict[str, wp.array[Any]]:
+    def _border_found(self) -> dict[str, DeviceArray]:
         return {
             "boxes": self._boxes.array,
             "border": self._border.array,

@@ -20,6 +20,7 @@ import warp as wp
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
@@ -72,7 +73,7 @@ class VectorCopies:
         v.setType(PETSc.Vec.Type.STANDARD)
         return v
 
-    def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
+    def enter(self, v: PETSc.Vec, field: DeviceArray, scale: float = 1.0) -> None:
         """Set the field to scale v on the unknowns, and to 0 on the other cells.
 
         Ghost cells keep their values.
@@ -83,7 +84,7 @@ class VectorCopies:
         ).launch()
 
     def leave(
-        self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
+        self, field: DeviceArray, others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
     ) -> None:
         """Set v to scale times the field on the unknowns.
 
@@ -98,7 +99,7 @@ class VectorCopies:
         if self._staging:
             values[:] = target.numpy()
 
-    def _seen(self, values: np.ndarray, buffer: int) -> wp.array[Any]:
+    def _seen(self, values: np.ndarray, buffer: int) -> DeviceArray:
         """Return a vector's memory on the device: itself on the CPU, a copy on a GPU."""
         if not self._staging:
             return wp.array(
@@ -265,7 +266,7 @@ class PetscGrid:
         """Return the values of a vector as a field of A's shape, a copy."""
         return v.getArray(readonly=True).reshape(self._A.shape).copy()
 
-    def hold(self, free: wp.array[Any]) -> None:
+    def hold(self, free: DeviceArray) -> None:
         """Set another free set, a stored uint8 field; other unknowns are held fixed."""
         self.hierarchy.hold(self._A.stencil.d, free)
         self.hierarchy.rebuild_changed()

@@ -29,6 +29,7 @@ from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Task, is_recording, launch, run_table
 from warp_lcp.kernels.thread_pool import Operation, OperationTable, team
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, convert
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
@@ -75,7 +76,7 @@ def _stays(field: wp.array | np.ndarray) -> bool:
     return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
 
 
-def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
+def copy_cells(to: DeviceArray, source: DeviceArray) -> None:
     """Copy cells of a field to another, now or recorded; both may be views."""
     if is_recording():
         launch(copy_kernel, to.shape[:2], [to, source], device=to.device)

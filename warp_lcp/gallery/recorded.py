@@ -16,6 +16,7 @@ import warp as wp
 from warp_lcp.files.archive import Archive
 from warp_lcp.files.size_limits import check_claim
 from warp_lcp.gallery.problem import Problem
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
 from warp_lcp.problem.lcp import LCP
 
@@ -77,7 +78,7 @@ class RecordedProblem(Problem):
     absolute_tolerance: float
 
 
-def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
+def arrays(problem: LCP, x0: DeviceArray) -> dict[str, np.ndarray]:
     """Return the arrays of a recorded problem, on the host.
 
     The caller adds `NUMBERS`.
@@ -115,7 +116,7 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
     return saved
 
 
-def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.ndarray:
+def _inner(field: DeviceArray, A: GridPoisson, axis: int | None = None) -> np.ndarray:
     """Return a stored field without its ring.
 
     A field of faces includes the upper faces of the last cells.

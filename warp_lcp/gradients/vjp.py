@@ -20,6 +20,7 @@ from warp_lcp.default import solve
 from warp_lcp.gradients.names import flat
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, Sums, Tally, rows_of
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.problem.lcp import LCP, as_operator
@@ -73,7 +74,7 @@ class Gradients:
         relative_residual: ||g_F + A_FF'mu_F|| over ||g_F||, recomputed in float64.
     """
 
-    b: wp.array[Any]
+    b: DeviceArray
     lower: Any
     upper: Any
     coefficients: dict[str, Any]
@@ -174,7 +175,7 @@ def _rows(problem: LCP) -> Rows:
     return problem.A.stencil.rows if has(problem.A, HasStencil) else Rows.of_fields(problem.layout)
 
 
-def _as_given(problem: LCP, stored: wp.array[Any]) -> wp.array[Any]:
+def _as_given(problem: LCP, stored: DeviceArray) -> DeviceArray:
     """Return a stored field in the layout of the result's x."""
     return (
         stored.reshape(problem.layout.stored_shape)
@@ -262,7 +263,7 @@ def _classified(
 
 def _adjoint(
     problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stopping: StoppingCriteria
-) -> tuple[SolveResult, wp.array[Any]]:
+) -> tuple[SolveResult, DeviceArray]:
     """Solve A_FF' mu_F = -g_F.
 
     Returns the result of the solve, and mu as a stored field, 0 elsewhere. Operators with blocks
@@ -303,7 +304,7 @@ def _adjoint(
     return result, layout.load(result.x, f64)
 
 
-def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.array[Any]) -> None:
+def _gather(problem: LCP, multiplier: DeviceArray, g: DeviceArray, z: DeviceArray) -> None:
     """Compute z = g + A'mu."""
     A, shape = problem.A, problem.layout.stored_shape
     if A.symmetric:
@@ -318,7 +319,7 @@ def _floating(A: Operator) -> Any:
     return A.floating_components() if has(A, NamesComponents) else None
 
 
-def _projected(floating: Any, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[Any]:
+def _projected(floating: Any, g: DeviceArray, cells: DeviceArray) -> DeviceArray:
     """Return g without the part that A' cannot meet.
 
     On singular components that are free as a whole: the mean of g if their null space is the
@@ -360,14 +361,14 @@ class Transpose(Operator):
         if has(A, HasCells):
             self.cells = A.cells
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A'x."""
         return self._A.apply_transpose(x, out)
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x."""
         return self._A.apply(x, out)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A."""
         return self._A.diagonal()

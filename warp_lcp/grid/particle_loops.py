@@ -18,6 +18,7 @@ from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import is_recording
 from warp_lcp.kernels.memory import Scalar, Slot, rows_memory
 from warp_lcp.kernels.thread_pool import get_threads
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -58,7 +59,7 @@ class ListMemory:
         self.touched = wp.empty(2, dtype=wp.int32, device=device)
         self.slot("touched of").point_to(self.touched)
 
-    def take(self, count: int, arrays: Mapping[str, wp.array[Any]]) -> None:
+    def take(self, count: int, arrays: Mapping[str, DeviceArray]) -> None:
         """Use a list of this length and these arrays.
 
         Recorded launches refer to the arrays by name.
@@ -100,7 +101,7 @@ TOUCHED: dict[Any, StencilKernel] = {
 }
 
 
-def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[wp.int32] | None:
+def touched_planes(grid: "StaggeredGrid", position: DeviceArray) -> wp.array[wp.int32] | None:
     """Return the planes of a field that the particles of each chunk may add to.
 
     They are rows in 2-D. Returns None where one thread adds up all.
@@ -120,7 +121,7 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
 def scatter(
     passed: StencilKernel,
     grid: "StaggeredGrid",
-    position: wp.array[Any],
+    position: DeviceArray,
     touched: wp.array[wp.int32] | None,
     *structs: "DataclassInstance",
     runs: wp.array[wp.int32] | None = None,
