@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
@@ -23,7 +23,7 @@ BUILTIN = "builtin:"  # prefix of the names of meshes that the project generates
 Wall = Literal["separating", "free-slip", "sticky"]
 
 
-def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float | str:
+def _wall_friction(value: object, handler: ValidatorFunctionWrapHandler) -> float | str:
     """Return a number from 0 to 10 or "stick", with one error for both alternatives."""
     try:
         friction: float | str = handler(value)
