@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise, product
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -293,7 +292,7 @@ def _alike(one: Motion | None, other: Motion | None) -> bool:
         return False
 
 
-def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> Any:
+def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> kernels.ThinShape:
     """Return a shape as kernels take it, enlarged by a `skin` [m].
 
     A mesh is not enlarged.

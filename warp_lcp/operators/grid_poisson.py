@@ -9,13 +9,13 @@ import copy
 from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows
-from warp_lcp.kernels.fields import overwrite, real_array
+from warp_lcp.kernels.fields import Array, overwrite, real_array
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import (
@@ -39,6 +39,17 @@ FACE_GRADIENT = KERNELS["grid_poisson.face_gradient"]
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
 Face = Any  # a number or an array
+
+
+class PoissonArguments(TypedDict, total=False):
+    """Coefficients of `GridPoisson`, see there."""
+
+    face_x: Face
+    face_y: Face
+    face_z: Face
+    shift: Array | float | None
+
+
 AXES = "xyz"
 
 
