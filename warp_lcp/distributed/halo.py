@@ -22,6 +22,8 @@ from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
 from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
+    from petsc4py import PETSc
+
     from warp_lcp.distributed.decomposition import Decomposition
 
 
@@ -57,7 +59,7 @@ class Halo:
         self._forest = (
             star_forest(decomposition.ranks, boxes, stored, shifts=shifts) if several else None
         )
-        self._staging: dict[Any, np.ndarray] = {}
+        self._staging: dict[type, np.ndarray] = {}
         self._coarser: dict[tuple[int, int, int], Halo | None] = {}
 
     @property
@@ -280,13 +282,13 @@ class StarForest:
             content.
     """
 
-    def __init__(self, made: Any) -> None:
+    def __init__(self, made: PETSc.SF) -> None:
         self.handle, self.free = (ctypes.c_uint64 * 1)(), weakref.finalize(self, made.destroy)
         self.made = made
         self.handle[0] = made.handle
-        self.pairs: dict[tuple[int, ...], Any] = {}
+        self.pairs: dict[tuple[int, ...], ctypes.Array[ctypes.c_uint64]] = {}
 
-    def replace(self, made: Any) -> None:
+    def replace(self, made: PETSc.SF) -> None:
         """Free the forest and use another one, also in recorded exchanges; collective."""
         self.free()
         self.made, self.free = made, weakref.finalize(self, made.destroy)

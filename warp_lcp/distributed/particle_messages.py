@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.grid.particles import MOST_A_CELL, Particles
-from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.memory import Scalar, Slot
 from warp_lcp.kernels.types import DeviceArray
@@ -42,7 +43,7 @@ class Buffer:
         host: the same as a NumPy array.
     """
 
-    def __init__(self, dtype: Any) -> None:
+    def __init__(self, dtype: type) -> None:
         self._dtype, self._slot = dtype, Slot()
         self._allocate(1)
 
@@ -294,15 +295,11 @@ class ParticleMessages:
         }
 
     @property
-    def _placed(self) -> dict[str, Any]:
-        placement = self.part.grid.placement
-        return {
-            name: getattr(placement, name)
-            for name in ("planes", "dx", "inverse_dx", "before_x", "before_y", "before_z")
-        }
+    def _placed(self) -> dict[str, float | int]:
+        return asdict(self.part.grid.placement)
 
-    def _bind(self, kernel: Any, given: dict[str, Any]) -> None:
-        kernel.bind(Rows.entries(1, self._device), **given).launch()
+    def _bind(self, kernel: StencilKernel, given: Mapping[str, object]) -> None:
+        kernel.bind_arguments(Rows.entries(1, self._device), (), dict(given)).launch()
 
 
 def bounds_of(part: Subdomain) -> dict[str, float]:
