@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -25,6 +24,7 @@ from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 
@@ -239,7 +239,7 @@ class DensityCorrection:
         self,
         grid: StaggeredGrid,
         boundary: Boundary,
-        solver: Any,
+        solver: Solver,
         *,
         particles_a_cell: int,
         max_density: float,

@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TypedDict
 
 import numpy as np
 import warp as wp
@@ -38,6 +39,17 @@ from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopw
 # Largest relative residual of bodies' contacts. Above it gravity's velocity of a step is wrong by a
 # hundredth, and bodies creep.
 CONTACTS_MISSED = 1e-2
+
+
+class ParticleSimulationOptions(TypedDict, total=False):
+    """Optional arguments of `ParticleSimulation`, see there."""
+
+    make_parts: Callable[[StaggeredGrid], Parts] | None
+    outlets: Outlets | None
+    bodies: RigidBodies | None
+    coverage: DomainWindow | None
+    spray: Spray | None
+    notes: Sequence[str]
 
 
 class ParticleSimulation(ParticleCheckpoints):
@@ -278,6 +290,10 @@ class ParticleSimulation(ParticleCheckpoints):
             *(time for part in timed for time in (part.start, part.stop)),
         )
         return [time for time in times if self.time < time <= until]
+
+    @abstractmethod
+    def step(self, dt: float) -> Row:
+        """Advance by dt [s]; return the row of the log."""
 
     def rebalance(self) -> None:
         """Continue in better boxes of ranks, if there are any; collective.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -222,6 +222,5 @@ class Spray:
             return
         kept = None if source.kept is None else source.kept.numpy()[which, 0]
         target.append(source.position.numpy()[which], source.velocity.numpy()[which], kept)
-        marks: Any = source.marks
-        marks.assign(which.astype(np.int32))
-        source.remove(marks)
+        source.marks.assign(which.astype(np.int32))
+        source.remove(source.marks)
