@@ -9,20 +9,21 @@ gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_i
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve
-from warp_lcp.gradients.names import flat
+from warp_lcp.gradients.names import Name, flat
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Array
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, Sums, Tally, rows_of
 from warp_lcp.operators import SparseOperator, Stencil
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import (
     HasBlocks,
@@ -75,9 +76,9 @@ class Gradients:
     """
 
     b: DeviceArray
-    lower: Any
-    upper: Any
-    coefficients: dict[str, Any]
+    lower: DeviceArray | float
+    upper: DeviceArray | float
+    coefficients: dict[str, DeviceArray | float | dict[Hashable, DeviceArray]]
     free: int
     degenerate: int
     status: SolveStatus
@@ -89,7 +90,7 @@ class Gradients:
         return self.status is SolveStatus.CONVERGED
 
     @property
-    def by_name(self) -> dict[Any, Any]:
+    def by_name(self) -> dict[Name, DeviceArray | float]:
         """All gradients by name.
 
         Those of a stencil's offset have pairs as names, such as ("coefficients", (0, 1)).
@@ -184,7 +185,7 @@ def _as_given(problem: LCP, stored: DeviceArray) -> DeviceArray:
     )
 
 
-def _checked(result: Any, allow_inexact: bool) -> LCP:
+def _checked(result: SolveResult, allow_inexact: bool) -> LCP:
     """Return the problem of a result, if the result has gradients."""
     if not isinstance(result, SolveResult):
         raise ValueError(f"result is a {type(result).__name__}: expected what wl.solve returned")
@@ -215,8 +216,8 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
 
 
 def _classified(
-    problem: LCP, result: SolveResult, x: Any, g: Any
-) -> tuple[Any, Any, Any, int, int]:
+    problem: LCP, result: SolveResult, x: DeviceArray, g: DeviceArray
+) -> tuple[DeviceArray, DeviceArray, DeviceArray, int, int]:
     """Classify the unknowns of a result as free or held.
 
     Returns y, the cell types with 0 where an unknown is held, the bound that holds it, and the
@@ -262,7 +263,12 @@ def _classified(
 
 
 def _adjoint(
-    problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stopping: StoppingCriteria
+    problem: LCP,
+    cells: DeviceArray,
+    g: DeviceArray,
+    count: int,
+    on_grid: bool,
+    stopping: StoppingCriteria,
 ) -> tuple[SolveResult, DeviceArray]:
     """Solve A_FF' mu_F = -g_F.
 
@@ -274,7 +280,9 @@ def _adjoint(
     if count == 0:  # the system solved is 1 x = 0
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
     if has(A, HasBlocks):
-        block = _transposed(A).on_cells(cells.numpy())
+        transposed = _transposed(A)
+        assert has(transposed, HasBlocks), "as A"
+        block = transposed.on_cells(cells.numpy())
         right = _projected(_floating(block), g, cells)  # its value in AIR has no effect
         result = solve(
             LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping
@@ -314,12 +322,14 @@ def _gather(problem: LCP, multiplier: DeviceArray, g: DeviceArray, z: DeviceArra
         ADD.bind(rows_of(z), z=g, x=z).launch()
 
 
-def _floating(A: Operator) -> Any:
+def _floating(A: Operator) -> FloatingComponents | None:
     """Return the components on which an operator is singular, None if unknown."""
     return A.floating_components() if has(A, NamesComponents) else None
 
 
-def _projected(floating: Any, g: DeviceArray, cells: DeviceArray) -> DeviceArray:
+def _projected(
+    floating: FloatingComponents | None, g: DeviceArray, cells: DeviceArray
+) -> DeviceArray:
     """Return g without the part that A' cannot meet.
 
     On singular components that are free as a whole: the mean of g if their null space is the
@@ -331,7 +341,7 @@ def _projected(floating: Any, g: DeviceArray, cells: DeviceArray) -> DeviceArray
     return g
 
 
-def _transposed(A: Operator) -> Any:
+def _transposed(A: Operator) -> Operator:
     """Return A'."""
     if A.symmetric:
         return A
