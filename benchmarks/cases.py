@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,6 +16,7 @@ from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, reside
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
 from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.solve import Solver
 
 RTOL = 1e-6
 # A method without fallbacks may need hundreds of steps, and its residual may rise for more steps
@@ -33,12 +33,12 @@ class SolverCase:
     form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`
     scene: Splash  # the scene
     bounds: str  # unknowns with p >= 0: a name of BOUNDS
-    solver: Any  # settings of the method
+    solver: Solver  # settings of the method
     device: str  # Warp device
     full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
     label: str = ""  # display name of the method; its class name if empty
     # Makes the operator from cells, a device and face coefficients.
-    operator: Callable[..., Any] = wl.GridPoisson
+    operator: Callable[..., wl.Operator] = wl.GridPoisson
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)
