@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -51,6 +52,7 @@ def displacement_pass(cut: bool) -> StencilKernel:
 
 
 @forward_kernel(module="warp_lcp.material.density_correction.count")
+@no_type_check
 def add_kernel(
     a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), sum: wp.array(dtype=wp.float64)
 ):

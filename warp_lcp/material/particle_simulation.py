@@ -13,7 +13,8 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.grid.active_rows import ActiveRows
-from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
+from warp_lcp.grid.particle_loops import MARGIN
+from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.kernels.launch_graph import LaunchGraph, copy
@@ -793,4 +794,5 @@ class ParticleSimulation(ParticleCheckpoints):
         free = self.boundary.base.numpy()[k, j, i] != wl.SOLID
         if self.grid.barriers is not None:
             free |= self.grid.barriers.near.numpy()[k, j, i] > 0
-        return free & self.boundary.admits(points)
+        admitted: np.ndarray = free & self.boundary.admits(points)
+        return admitted

@@ -183,7 +183,7 @@ class Spray:
             for array in (particles.position, particles.velocity)
         )
         room = CLEAR * dx + (np.linalg.norm(v, axis=1) + 10.0 * dx) * dt
-        near = ~np.isfinite(x + v).all(axis=1)
+        near: np.ndarray = ~np.isfinite(x + v).all(axis=1)
         for axis in range(self._dimension):
             for side, gap in enumerate((x[:, axis], self._extent[axis] - x[:, axis])):
                 if not self._open >> (2 * axis + side) & 1:
