@@ -13,9 +13,9 @@ import hashlib
 import itertools
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import scipy.sparse
@@ -24,18 +24,23 @@ from rich.console import Console
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
+from warp_lcp.files.tables import Tables
 from warp_lcp.problem.protocol import families
+from warp_lcp.problem.solve import Solver
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import METHODS
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 SHAPES = {"2-D": (11, 38), "3-D": (9, 14, 21), "long rows": (4, 5, 300), "flat": (5, 1, 24)}
 PARTS = ("small", "other", "methods", "frames")
 PRECISIONS = ("mixed", "double", "single")
 STOPPING = wl.StoppingCriteria(rtol=1e-7, max_iterations=12)
-OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # settings that select other code paths
+OTHER_SETTINGS: dict[str, tuple[Tables, ...]] = {  # settings that select other code paths
     "accelerated-projected-gradient": ({"lipschitz": 20.0},),
     "fischer-newton": (
         {"fischer_weight": 0.9},
@@ -61,12 +66,17 @@ SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse
 SEED = 0  # added to the seeds of all problems
 
 
+Made = wl.GridPoisson | wl.SparseOperator | wl.DenseOperator
+Side = float | np.ndarray  # a bound
+BitsSolve = tuple[str, wl.LCP, Solver, np.ndarray | None]  # name, problem, method, start
+
+
 def generator(seed: int) -> np.random.Generator:
     """Return a random generator for a problem."""
     return np.random.default_rng(seed + SEED)
 
 
-def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
+def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Side, Side]]:
     """Return lower and upper bounds of each kind that the kernels distinguish."""
     rng = generator(2718)
     low, high, some = -rng.random(shape), rng.random(shape), rng.random(shape) < 0.3
@@ -83,7 +93,7 @@ def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
     }
 
 
-def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
+def faces_of(shape: tuple[int, ...]) -> dict[str, Tables]:
     """Return face coefficients of each form: 1, one number per axis, arrays."""
     rng, names = generator(31), "xyz"[: len(shape)]
     axes = enumerate(reversed(names))
@@ -93,7 +103,7 @@ def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
     return {"unit": {}, "number": {"face_y": 3.0}, "arrays": arrays}
 
 
-def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
+def small_solves() -> Iterator[BitsSolve]:
     """Yield name, problem, method and start on small random sets of cells.
 
     They cover all forms of storage, sides and bounds.
@@ -135,7 +145,7 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                 )
 
 
-def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
+def other_solves() -> Iterator[BitsSolve]:
     """Yield solves of splashes, closed boxes, low-rank terms and other methods."""
     box, shape = np.full((8, 9, 20), wl.FLUID), (8, 9, 20)
     b = generator(5).standard_normal(shape)
@@ -170,7 +180,7 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
         yield "splash 32 walls", splash(32).lcp("walls", device="cpu"), sweeping, None
 
 
-def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
+def method_solves() -> Iterator[BitsSolve]:
     """Yield every method on small grids, matrices and user-defined operators.
 
     The bounds are of each kind. A method is left out where the problem is too large for it.
@@ -192,7 +202,7 @@ def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
                     yield f"{what} {kind} {number} warm", wl.LCP(make(), b, *sides), made, start
 
 
-def _operators() -> Iterator[tuple[str, Any, tuple[int, ...]]]:
+def _operators() -> Iterator[tuple[str, Callable[[], Made], tuple[int, ...]]]:
     rng = generator(1618)
     factor = rng.standard_normal((40, 40))
     matrix = factor @ factor.T + 4 * np.eye(40)
@@ -226,14 +236,17 @@ def _operators() -> Iterator[tuple[str, Any, tuple[int, ...]]]:
     yield "dense tiny", lambda: wl.DenseOperator(matrix[:3, :3], device="cpu"), (3,)
 
 
-def _variants(name: str, method: Any) -> list[Any]:
+def _variants(name: str, method: Callable[..., Solver]) -> list[Solver]:
     """Return a method in each precision, and with its OTHER_SETTINGS."""
-    chosen = any(field.name == "precision" for field in dataclasses.fields(method))
+    chosen = any(
+        field.name == "precision"
+        for field in dataclasses.fields(cast(type[DataclassInstance], method))
+    )
     made = [method(precision=p) for p in PRECISIONS] if chosen else [method()]
     return made + [method(**settings) for settings in OTHER_SETTINGS.get(name, ())]
 
 
-def line(what: str, problem: wl.LCP, method: Any, start: Any) -> str:
+def line(what: str, problem: wl.LCP, method: Solver, start: np.ndarray | None) -> str:
     """Solve a problem and return its line."""
     called = f"{type(method).__name__} {getattr(method, 'precision', '')}".strip()
     try:
@@ -260,7 +273,7 @@ def frames(name: str, resolution: int, duration: float) -> str:
         return f"{name}: {len(found)} files {_digest(*(p.read_bytes() for p in found))}"
 
 
-def _digest(*parts: Any) -> str:
+def _digest(*parts: bytes | np.ndarray) -> str:
     made = hashlib.sha256()
     for part in parts:
         made.update(part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes())

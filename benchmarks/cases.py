@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,8 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, resident_bytes
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.solve import Solver
 
 RTOL = 1e-6
 # A method without fallbacks may need hundreds of steps, and its residual may rise for more steps
@@ -32,12 +33,12 @@ class SolverCase:
     form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`
     scene: Splash  # the scene
     bounds: str  # unknowns with p >= 0: a name of BOUNDS
-    solver: Any  # settings of the method
+    solver: Solver  # settings of the method
     device: str  # Warp device
     full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
     label: str = ""  # display name of the method; its class name if empty
     # Makes the operator from cells, a device and face coefficients.
-    operator: Callable[..., Any] = wl.GridPoisson
+    operator: Callable[..., wl.Operator] = wl.GridPoisson
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)
@@ -174,7 +175,7 @@ class SolverCase:
         }
         return figures
 
-    def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:
+    def _in_place(self) -> tuple[wl.LCP, DeviceArray]:
         """Return the problem with b in the stored layout, and b.
 
         Time-stepping codes keep b in this layout.
@@ -182,5 +183,5 @@ class SolverCase:
         b = self._stored(self.scene.b)
         return self.scene.lcp(self.bounds, device=self.device, b=b), b
 
-    def _stored(self, values: np.ndarray) -> wp.array[Any]:
+    def _stored(self, values: np.ndarray) -> DeviceArray:
         return wp.array(np.pad(values, 1), dtype=wp.float64, device=self.device)

@@ -153,6 +153,7 @@ def frozen(rng: np.random.Generator, seed: int) -> Problem:
     """Return contacts with constant friction boxes: symmetric, semi-definite, sparse."""
     p = scene(rng, seed, None)
     normal = np.abs(rng.standard_normal(len(p.b)))
+    assert isinstance(p.lower, wl.AffineBounds) and isinstance(p.upper, wl.AffineBounds)
     low, high = p.lower.at(normal), p.upper.at(normal)
     return Problem(
         f"{p.name}, frozen", p.A, p.b, np.minimum(low, high), high, None, p.facts - {"affine"}

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.contacts import SIMULATOR
+from warp_lcp.files.tables import Tables
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.scene.scene_file import load_scene
@@ -31,7 +32,7 @@ METHODS = ("psor", "nncg", "proximal-gauss-seidel")
 SHARE = 0.15  # largest share of the time of PSOR's steps
 
 
-def spheres(method: str) -> dict[str, Any]:
+def spheres(method: str) -> Tables:
     """Return the scene: spheres of 9 to 10 cm that fall onto each other.
 
     They start on a lattice, slightly displaced.
@@ -63,12 +64,12 @@ def spheres(method: str) -> dict[str, Any]:
 class _Timed:
     """Contact method whose solves are timed."""
 
-    def __init__(self, solver: Any) -> None:
+    def __init__(self, solver: Callable[[ContactProblem, np.ndarray], ContactImpulses]) -> None:
         self.solver, self.seconds = solver, 0.0
 
     def __call__(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
         begun = time.perf_counter()
-        found: ContactImpulses = self.solver(problem, start)
+        found = self.solver(problem, start)
         self.seconds += time.perf_counter() - begun
         return found
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.contact_steps import steps_of_spheres
@@ -20,9 +19,11 @@ from warp_lcp.benchmarks.harness.record import (
     Results,
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.files.tables import Tables
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import Assembly, World
+from warp_lcp.problem.solve import Solver
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
@@ -43,7 +44,7 @@ STACKS = ("box-stack", "sphere-stack", "wall", "leaning-wall", "heavy-on-light")
 # Most unknowns of a Stewart-Trinkle problem that Lemke's method and Newton's method solve.
 LARGEST_LCP = 1500
 
-BOXED: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
+BOXED: dict[str, Callable[[ContactSystem], tuple[Solver, int]]] = {
     "PGS": lambda s: (wl.ProjectedSOR(omega=1.0), SWEEPS),
     "PSOR 1.4": lambda s: (wl.ProjectedSOR(omega=1.4), SWEEPS),
     "NNCG": lambda s: (wl.NNCG(), SWEEPS),
@@ -55,7 +56,7 @@ BOXED: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
         50,
     ),
 }
-LCP: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
+LCP: dict[str, Callable[[ContactSystem], tuple[Solver, int]]] = {
     "Lemke": lambda s: (wl.Lemke(), 1000),
     "Fischer-Newton": lambda s: (wl.FischerNewton(), 200),
     "interior point": lambda s: (wl.InteriorPoint(precision="double"), 100),
@@ -116,7 +117,7 @@ def _scene(
     Return linear iterations, relative residuals and seconds of each.
     """
     curves: dict[str, Curve] = {}
-    models: list[tuple[ContactModel, str, dict[str, Any]]] = [
+    models: list[tuple[ContactModel, str, Tables]] = [
         (BoxedModel(), "boxed", BOXED),
         (StewartTrinkleModel(4), "LCP", LCP),
     ]

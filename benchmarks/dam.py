@@ -18,9 +18,10 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.peers.petsc import environment, interpreter, missing
+from warp_lcp.files.tables import Tables
 from warp_lcp.gallery import dam
 
-SIZES = {"width": 16.0, "high": 24.0, "low": 4.0}
+SIZES: Tables = {"width": 16.0, "high": 24.0, "low": 4.0}
 COARSEST, RTOL, REPEAT = (5, 7), 1e-8, 2
 OPTIONS = ("-ksp_type", "cg", "-pc_type", "mg")
 

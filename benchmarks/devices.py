@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,6 +19,7 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results, shown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns
 from warp_lcp.benchmarks.problems import splash
+from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.rigid.contact_models import BoxedModel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -28,7 +28,7 @@ TITLE = "One machine: solvers, contacts, steps, kernels"
 SIZES = (64, 128)
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
 SWEEPS = 20  # sweeps of PGS; the time of one is reported, since 1e-6 needs thousands on these grids
-METHODS: dict[str, Callable[[], Any]] = {
+METHODS: dict[str, Callable[[], Solver]] = {
     "ProjectedMultigrid": wl.ProjectedMultigrid,
     "MinimumMapNewton": wl.MinimumMapNewton,
     "MPRGP": wl.MPRGP,
@@ -78,7 +78,9 @@ def _solves(n: int, options: Options) -> list[BenchmarkRecord]:
     work: dict[str, Callable[[], object]] = {}
     results: dict[str, wl.SolveResult] = {}
 
-    def solve(name: str, method: Any, workspace: Any, stopping: wl.StoppingCriteria) -> None:
+    def solve(
+        name: str, method: Solver, workspace: Workspace, stopping: wl.StoppingCriteria
+    ) -> None:
         results[name] = wl.solve(problem, method, stopping=stopping, workspace=workspace)
         wp.synchronize_device(device)
 
@@ -112,7 +114,7 @@ def _kernels(n: int, options: Options) -> list[BenchmarkRecord]:
     box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device=options.device)
     x, y = (wp.ones(box.layout.size, dtype=wp.float32, device=options.device) for _ in range(2))
     problem = splash(n).lcp("linear", device=options.device)
-    workspace: Any = wl.ProjectedMultigrid().init(problem)
+    workspace = wl.ProjectedMultigrid().init(problem)
     wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
 
     def product() -> None:

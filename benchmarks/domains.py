@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
@@ -95,7 +94,7 @@ def falling(n: int) -> LiquidScene:
     )
 
 
-def _stepping(n: int) -> Any:
+def _stepping(n: int) -> Callable[[], None]:
     simulation = SIMULATOR.create(falling(n), device="cpu", folder=Path())
     start = simulation.state()
 
@@ -136,7 +135,7 @@ class Shares(NoStopwatch):
         self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
-    def stage(self, name: str, *arrays: Any) -> Iterator[None]:
+    def stage(self, name: str, *arrays: wp.array | None) -> Iterator[None]:
         """Add the seconds of the enclosed code to a stage."""
         begun = time.perf_counter()
         yield

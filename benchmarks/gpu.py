@@ -10,6 +10,10 @@ form (`benchmarks/emulated_cuda.py`).
 
 import importlib
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import warp as wp
 
 if "--rehearse" in sys.argv:
     importlib.import_module("benchmarks.emulated_cuda")  # must precede the package
@@ -26,7 +30,6 @@ import traceback
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -416,7 +419,7 @@ class GpuVerdict:
         (self.out / "verdict.json").write_text(json.dumps(kept, indent=1))
 
 
-def launched(graph: Any) -> None:
+def launched(graph: wp.Graph | list[wp.Launch]) -> None:
     """Launch the commands of a graph.
 
     A graph that loops on the device stays a graph.

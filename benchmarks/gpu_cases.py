@@ -9,13 +9,13 @@ import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import splash
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.problem.protocol import families
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -102,10 +102,12 @@ def large(device: str, n: int = 48) -> Arrays:
     return found
 
 
-def simulation(name: str, device: str, cells: int = 0) -> Any:
+def simulation(name: str, device: str, cells: int = 0) -> ParticleSimulation:
     """Return a built-in scene's simulation, small, or of so many cells."""
     scene = load_scene(name, [f"domain.resolution={cells or SCENES[name]}"])
-    return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    made = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    assert isinstance(made, ParticleSimulation)
+    return made
 
 
 def states(name: str, device: str, steps: int = STEPS) -> Iterator[Arrays]:

@@ -8,7 +8,14 @@ wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of
 a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
 """
 
+from typing import TYPE_CHECKING
+
 from benchmarks import emulated_cuda  # must precede the package
+from warp_lcp.files.tables import Tables
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.kernel_variant import KernelVariant
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.operators.padded_stencil import PaddedStencil
 
 # ruff: isort: split
 
@@ -19,7 +26,6 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -33,6 +39,9 @@ from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.kernels import StencilKernel, layout
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.multigrid.stencil_level import StencilLevel
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 assert emulated_cuda
 
@@ -130,7 +139,7 @@ def key(name: str) -> str:
     )
 
 
-def kinds(given: dict[str, Any]) -> str:
+def kinds(given: Tables) -> str:
     """Return the suffix of a kernel's name for its arguments.
 
     It tells apart arguments that change the amount of work.
@@ -138,7 +147,7 @@ def kinds(given: dict[str, Any]) -> str:
     return "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
 
 
-def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
+def passes() -> dict[str, tuple[Heard, Tables]]:
     """Return the kernels over the finest grid in solves of a full basin, by name.
 
     They are bound as CUDA launches them on large grids.
@@ -149,16 +158,16 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
     for side in (0, -1):
         wall[side] = wall[:, side] = wall[:, :, side] = True
     b = np.where(cells == wl.FLUID, np.random.default_rng(2015).standard_normal(SHAPE), 0.0)
-    heard: list[tuple[Heard, dict[str, Any]]] = []
+    heard: list[tuple[Heard, Tables]] = []
     bind = StencilKernel.bind_arguments
 
     def listening(
         declared: StencilKernel,
-        rows: Any,
-        structs: Any,
-        given: dict[str, Any],
-        stencil: Any = None,
-        bounds: Any = None,
+        rows: Rows,
+        structs: tuple[DataclassInstance, ...],
+        given: Tables,
+        stencil: PaddedStencil | None = None,
+        bounds: list[DeviceArray | float] | None = None,
     ) -> BoundKernel:
         bound = bind(declared, rows, structs, given, stencil, bounds)
         fields = {
@@ -203,7 +212,7 @@ def passes() -> dict[str, tuple[Heard, dict[str, Any]]]:
         A = wl.GridPoisson(cells, device="cpu")
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
         A.stencil.product(x, wp.zeros_like(x))
-    found: dict[str, tuple[Heard, dict[str, Any]]] = {}
+    found: dict[str, tuple[Heard, Tables]] = {}
     for one, given in heard:
         rows, declared = one.bound.rows, one.bound.form.declared
         if max(rows.size, rows.other_size) == A.layout.size and not (
@@ -222,9 +231,7 @@ def cells_of(bound: BoundKernel) -> int:
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
-def count(
-    name: str, one: Heard, given: dict[str, Any], folder: Path, warps: int = 1
-) -> InstructionCount:
+def count(name: str, one: Heard, given: Tables, folder: Path, warps: int = 1) -> InstructionCount:
     """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
     Args:
@@ -291,7 +298,7 @@ def count(
     )
 
 
-def _compiled(form: Any, folder: Path) -> Kernel:
+def _compiled(form: KernelVariant, folder: Path) -> Kernel:
     """Return a kernel compiled for sm_90."""
     kernel, place = form.kernel, folder / form.kernel.module.name
     if not place.exists():

@@ -16,7 +16,15 @@ cells: 1.2 us by its counts. Nothing that is newer than those solves has been me
 With --sass, the kernels' machine code is counted instead: see `benchmarks/gpu_counts.py`.
 """
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 from benchmarks import emulated_cuda, gpu_counts  # must precede the package
+from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.kernels import Rows
+from warp_lcp.kernels.launch_graph import Launch
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.operators.padded_stencil import PaddedStencil
 
 # ruff: isort: split
 
@@ -26,7 +34,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -40,6 +48,9 @@ from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 SHARE = 0.8  # share of the data sheets' bandwidth that streaming kernels reach
 RECORDED, LAUNCHED = 6.0, 12.0  # [us] a small launch in a graph, and one from Python
@@ -136,7 +147,7 @@ class Work:
         self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount], times: int
     ) -> str:
         """Return a table of the ten kernels that take longest, of one of some `times`."""
-        rows: dict[str, list[Any]] = {}
+        rows: dict[str, list[TableValue]] = {}
         for size, graph, key, cells, name in zip(
             self.bytes, self.graph, self.keys, self.cells, self.names, strict=True
         ):
@@ -216,7 +227,7 @@ class Launched(NamedTuple):
     across: int = 0
 
 
-def name_of(kernel: Any) -> str:
+def name_of(kernel: wp.Kernel) -> str:
     """Return a kernel's module, without the package, and its name."""
     return f"{kernel.module.name.removeprefix('warp_lcp.')}:{kernel.key}"
 
@@ -228,7 +239,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
     has set up.
     """
     given: dict[int, tuple[BoundKernel, Heard]] = {}
-    tags: dict[int, tuple[Any, Launched]] = {}
+    tags: dict[int, tuple[object, Launched]] = {}
     bind, launch_bound, launch_sequence = (
         StencilKernel.bind_arguments,
         BoundKernel.launch,
@@ -240,11 +251,11 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
 
     def binding(
         declared: StencilKernel,
-        rows: Any,
-        structs: Any,
-        arguments: dict[str, Any],
-        stencil: Any = None,
-        bounds: Any = None,
+        rows: Rows,
+        structs: tuple[DataclassInstance, ...],
+        arguments: Tables,
+        stencil: PaddedStencil | None = None,
+        bounds: list[DeviceArray | float] | None = None,
     ) -> BoundKernel:
         bound = bind(declared, rows, structs, arguments, stencil, bounds)
         taken = {name: bound.given[name] for name in declared.arrays}
@@ -261,7 +272,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         given[id(bound)] = bound, Heard(bound, fields)
         return bound
 
-    def launching(bound: BoundKernel, *args: Any) -> None:
+    def launching(bound: BoundKernel, *args: Launch) -> None:
         known = given.get(id(bound))
         launched = Launched(0.0, 0)
         if known:
@@ -274,7 +285,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         launch_bound(bound, *args)
         current.pop()
 
-    def sequencing(sequence: PersistentKernel, *args: Any) -> None:
+    def sequencing(sequence: PersistentKernel, *args: Launch) -> None:
         stages = len(sequence._stages)
         across = stages if sequence.tasks > THREADS else 0
         current.append(Launched(0.0, stages, across=across))
@@ -282,13 +293,13 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         current.pop()
 
     def launch(
-        kernel: Any,
-        dim: Any,
-        inputs: Any = (),
-        *args: Any,
+        kernel: wp.Kernel,
+        dim: int | tuple[int, ...],
+        inputs: Sequence[object] = (),
+        *args: object,
         record_cmd: bool = False,
-        **options: Any,
-    ) -> Any:
+        **options: object,
+    ) -> wp.Launch | None:
         # Of a Warp kernel without a declaration.
         arrays = [a for a in inputs if isinstance(a, wp.array)]
         moved = float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays))
@@ -300,7 +311,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
             note(launched, graph=False)
         return made
 
-    def replaying(command: Any, *args: Any) -> None:
+    def replaying(command: wp.Launch, *args: object) -> None:
         replay(command, *args)
         _, launched = tags.get(id(command), (None, Launched(0.0, 0)))
         note(launched, graph=True)

@@ -29,7 +29,19 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, TypeVar
+
+Answer = dict[str, float | str]  # figures and words of a piece of work
+
+
+class Row(TypedDict):
+    """A piece of work and the answers of the workers."""
+
+    kind: str
+    name: str
+    cells: int
+    found: dict[str, Answer]
+
 
 ROOT = Path(__file__).resolve().parents[1]
 ANSWER = "ANSWER "  # begins a worker's line with an answer
@@ -74,7 +86,10 @@ def pieces(sizes: Sizes) -> Iterator[tuple[str, str, int]]:
         yield "solve", name, sizes.methods
 
 
-def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+ResultT = TypeVar("ResultT")
+
+
+def timed(work: Callable[[], ResultT]) -> tuple[float, ResultT]:
     """Return the time of some work on the device [s], and its result."""
     import warp as wp
 
@@ -152,7 +167,7 @@ class TreeWorker:
             text=True,
         )
 
-    def ask(self, piece: tuple[str, str, int]) -> dict[str, Any]:
+    def ask(self, piece: tuple[str, str, int]) -> Answer:
         """Return the result of a piece of work."""
         asked, answers = self._process.stdin, self._process.stdout
         assert asked is not None
@@ -179,10 +194,10 @@ class Turns:
 
     out: Path
     names: list[str]
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
-    def add(self, piece: tuple[str, str, int], found: dict[str, dict[str, Any]]) -> None:
+    def add(self, piece: tuple[str, str, int], found: dict[str, Answer]) -> None:
         """Add the results of a piece of work, and write the files."""
         kind, name, n = piece
         self.rows.append({"kind": kind, "name": name, "cells": n, "found": found})
@@ -210,10 +225,10 @@ class Turns:
             yield f"Left out, for the time was over: {', '.join(self.left_out)}."
 
 
-def shown(found: dict[str, Any]) -> str:
+def shown(found: Answer) -> str:
     """Return the text of a piece of work's results, for the page."""
     if "ms" not in found:
-        return found.get("error", "")
+        return str(found.get("error", ""))
     if "iterations" not in found:
         return f"{found['ms']:.3g}"
     status = "" if found["status"] == "CONVERGED" else f", {found['status']}"

@@ -11,11 +11,11 @@ steps.
 import sys
 import time
 import tracemalloc
-from typing import Any
 
 import numpy as np
 
 import warp_lcp as wl
+from warp_lcp.files.tables import Tables
 
 SHAPES, REPEAT, SEED = ((1024, 1024), (128, 128, 128)), 9, 2027
 TOLERANCES = (1e-6, 1e-10)
@@ -23,14 +23,14 @@ TOLERANCES = (1e-6, 1e-10)
 
 def membrane(
     shape: tuple[int, ...], faces: bool
-) -> tuple[wl.GridPoisson, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+) -> tuple[wl.GridPoisson, np.ndarray, np.ndarray, np.ndarray, Tables]:
     """Return operator, cells, load, obstacle and coefficients of a clamped membrane."""
     cells, rng = np.full(shape, wl.AIR), np.random.default_rng(SEED)
     cells[(slice(1, -1),) * len(shape)] = wl.FLUID
     square = sum(
         ((q - n / 2) / (0.3 * n)) ** 2 for q, n in zip(np.indices(shape), shape, strict=True)
     )
-    coefficients: dict[str, Any] = {}
+    coefficients: Tables = {}
     for axis in range(len(shape) if faces else 0):
         face = list(shape)
         face[-1 - axis] += 1

@@ -17,7 +17,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -28,9 +27,17 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.report import markdown, write
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.kernels.thread_pool import COUNT, RUN, UNFINISHED, ThreadPool
+from warp_lcp.kernels.thread_pool import (
+    COUNT,
+    RUN,
+    UNFINISHED,
+    Arguments,
+    OperationTable,
+    ThreadPool,
+)
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
+from warp_lcp.simulation import Profiled
 
 TITLE = "Host time of a step by stage"
 SCENES = ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "dam-break")
@@ -48,7 +55,7 @@ LAUNCHES, COPIES, READS, ALLOCATIONS = (
 )
 # Calls by kind, and where callers look them up. Each launch by Warp loads its module first,
 # whatever name `wp.launch` was called by.
-COUNTED: dict[str, tuple[tuple[Any, str], ...]] = {
+COUNTED: dict[str, tuple[tuple[object, str], ...]] = {
     LAUNCHES: ((wp.Module, "load"), (wp.Launch, "launch")),
     COPIES: ((wp, "copy"), (wp.array, "assign"), (wp.array, "zero_"), (wp.array, "fill_")),
     READS: ((wp.array, "numpy"),),
@@ -133,7 +140,7 @@ class StepRecorder:
         self.native: dict[str, float] = defaultdict(float)
         self._timer, self._replays, self._within = timer, replays, False
         self._arrays: list[wp.array] = []
-        self._table: Any = None  # the table that the thread pool executes
+        self._table: OperationTable | None = None  # the table that the thread pool executes
         self._patches = ExitStack()
 
     def __enter__(self) -> StepRecorder:
@@ -154,16 +161,16 @@ class StepRecorder:
         self._patches.close()
         self._arrays = []
 
-    def _replace(self, owner: Any, name: str, function: Callable[..., Any]) -> None:
+    def _replace(self, owner: object, name: str, function: Callable[..., object]) -> None:
         self._patches.enter_context(patch.object(owner, name, function))
 
-    def _counted(self, kind: str, plain: Callable[..., Any]) -> Callable[..., Any]:
+    def _counted(self, kind: str, plain: Callable[..., object]) -> Callable[..., object]:
         """Return a function that counts its calls.
 
         Calls by another counted function are not counted.
         """
 
-        def call(*args: Any, **options: Any) -> Any:
+        def call(*args: object, **options: object) -> object:
             if self._within:
                 return plain(*args, **options)
             self.counts[self._timer.current][kind] += 1
@@ -175,8 +182,8 @@ class StepRecorder:
 
         return call
 
-    def _run(self, plain: Callable[..., Any]) -> Callable[..., Any]:
-        def run(team: ThreadPool, table: Any) -> None:
+    def _run(self, plain: Callable[..., object]) -> Callable[..., object]:
+        def run(team: ThreadPool, table: OperationTable) -> None:
             self.counts[self._timer.current].update({CALLS: 1, OPERATIONS: int(table.words[COUNT])})
             self._table = table
             plain(team, table)
@@ -184,7 +191,7 @@ class StepRecorder:
         return run
 
     def _kept(self, plain: Callable[..., None]) -> Callable[..., None]:
-        def init(array: wp.array, *args: Any, **options: Any) -> None:
+        def init(array: wp.array, *args: object, **options: object) -> None:
             plain(array, *args, **options)
             self._arrays.append(array)
 
@@ -196,12 +203,13 @@ class StepRecorder:
         The last repetition leaves the same memory as the first call.
         """
 
-        def do(team: ThreadPool, asked: Any) -> None:
+        def do(team: ThreadPool, asked: Arguments) -> None:
             if asked.mode != RUN:
                 return plain(team, asked)
             before = [
                 (begin, ctypes.string_at(begin, end - begin)) for begin, end in self._memory()
             ]
+            assert self._table is not None, "set by `run`"
             seconds = [self._timed(plain, team, asked)]
             for _ in range(self._replays if not self._table.words[UNFINISHED] else 0):
                 for begin, content in before:
@@ -213,7 +221,7 @@ class StepRecorder:
         return do
 
     @staticmethod
-    def _timed(run: Callable[..., None], *args: Any) -> float:
+    def _timed(run: Callable[..., None], *args: object) -> float:
         begun = time.process_time()
         run(*args)
         return time.process_time() - begun
@@ -266,10 +274,8 @@ def scene_records(
         if number < 1:
             raise ValueError(f"{what} = {number}: must be >= 1")
     scene = load_scene(name, [f"domain.resolution={resolution}"])
-    simulation: Any = simulators()[scene.scene.simulator].create(
-        scene, device=device, folder=Path.cwd()
-    )
-    if not hasattr(simulation, "watch"):  # see `warp_lcp.simulation.Profiled`
+    simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    if not isinstance(simulation, Profiled):
         raise ValueError(f"{name}: its simulation has no stages")
 
     def step() -> None:

@@ -2,7 +2,6 @@
 """Peers of the 7-point product: a plain Warp kernel and Numba."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -57,7 +56,7 @@ def numba_products(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> dict[str, Cal
     import numba
 
     @numba.njit(fastmath=True)
-    def masked(d: Any, x: Any, y: Any) -> None:
+    def masked(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
         for i in range(1, x.shape[0] - 1):
             for j in range(1, x.shape[1] - 1):
                 for k in range(1, x.shape[2] - 1):
@@ -73,7 +72,7 @@ def numba_products(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> dict[str, Cal
                     y[i, j, k] = v if e != 0 else np.float32(0)
 
     @numba.njit(fastmath=True)
-    def constant(x: Any, y: Any) -> None:
+    def constant(x: np.ndarray, y: np.ndarray) -> None:
         for i in range(1, x.shape[0] - 1):
             for j in range(1, x.shape[1] - 1):
                 for k in range(1, x.shape[2] - 1):

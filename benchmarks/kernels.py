@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, cast
 from unittest import mock
 
 import numpy as np
@@ -23,8 +23,15 @@ from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTabl
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
 from warp_lcp.benchmarks.problems import Splash, basin
+from warp_lcp.files.tables import Tables
 from warp_lcp.kernels import Rows, StencilKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.operators.grid_poisson import PoissonArguments
+from warp_lcp.operators.padded_stencil import PaddedStencil
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)
@@ -51,7 +58,7 @@ class Heard:
     """Stencil kernel with its fields by name, recorded when it was bound."""
 
     bound: BoundKernel
-    fields: dict[str, wp.array[Any]]
+    fields: dict[str, DeviceArray]
 
     @property
     def name(self) -> str:
@@ -197,8 +204,10 @@ def _basin(n: int, form: str) -> Splash:
     scene = basin(n)
     if form == "unit":
         return scene
-    ones = {f"face_{a}": np.ones([n + (i == j) for j in range(3)]) for i, a in enumerate("zyx")}
-    return Splash(n, scene.cells, scene.b, scene.wall, ones)
+    ones: Tables = {
+        f"face_{a}": np.ones([n + (i == j) for j in range(3)]) for i, a in enumerate("zyx")
+    }
+    return Splash(n, scene.cells, scene.b, scene.wall, cast(PoissonArguments, ones))
 
 
 def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
@@ -224,10 +233,10 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     def listening(
         declared: StencilKernel,
         rows: Rows,
-        *structs: Any,
-        stencil: Any = None,
-        bounds: list[Any] | None = None,
-        **given: Any,
+        *structs: DataclassInstance,
+        stencil: PaddedStencil | None = None,
+        bounds: list[DeviceArray | float] | None = None,
+        **given: object,
     ) -> BoundKernel:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)
         taken = {name: bound.given[name] for name in declared.arrays}

@@ -13,7 +13,6 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -576,7 +575,7 @@ class Lane:
             )
             return
         value = np.float64(self._real(o[1]))
-        of: dict[str, Callable[[Any], Any]] = {
+        of: dict[str, Callable[[np.float64], np.float64]] = {
             "RCP": lambda v: 1 / v,
             "RSQ": lambda v: 1 / np.sqrt(v),
             "SQRT": np.sqrt,

@@ -10,11 +10,10 @@ import argparse
 import gc
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tomli_w
@@ -25,6 +24,8 @@ from warp_lcp.benchmarks.harness.machine import array_bytes, machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
+from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.models import TABLE
 from warp_lcp.scene.scene import Scene, Time
@@ -44,7 +45,6 @@ BEGIN, END = (
     "-->",
     "<!-- end -->",
 )
-Tables = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -141,12 +141,14 @@ def reference(
     return validate(simulators()[simulator].scene_model, given, "reference")
 
 
-def create(scene: Scene, device: str) -> Any:
+def create(scene: Scene, device: str) -> ParticleSimulation:
     """Return the simulation of a scene."""
-    return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    made = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    assert isinstance(made, ParticleSimulation)
+    return made
 
 
-def run_seconds(simulation: Any, time: Time) -> np.ndarray:
+def run_seconds(simulation: ParticleSimulation, time: Time) -> np.ndarray:
     """Return the seconds of each step of the first frames of a run.
 
     Time steps are those of a run, since the number of iterations of a solve depends on them.
@@ -163,7 +165,7 @@ def run_seconds(simulation: Any, time: Time) -> np.ndarray:
     return np.array(spent)
 
 
-def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
+def step_seconds_of(simulation: ParticleSimulation, dt: float) -> tuple[float, Tables]:
     """Return the seconds of a step and its row.
 
     On a CPU they are CPU seconds, which other programs do not affect.
@@ -348,12 +350,12 @@ def table_of(simulator: str, dimension: int, records: list[BenchmarkRecord]) -> 
     )
 
 
-def price_list(records: list[BenchmarkRecord]) -> Mapping[str, Any]:
+def price_list(records: list[BenchmarkRecord]) -> TableView:
     """Return the contents of `warp_lcp/scene/models.toml`.
 
     It holds the fields of `warp_lcp.scene.models.Price` by simulator, dimension and model.
     """
-    listed: dict[str, Any] = {}
+    listed: Tables = {}
     for record in records:
         where, separator, name = record.name.partition(": ")
         if not separator:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 import warp_lcp as wl
+from warp_lcp.files.tables import Tables
 from warp_lcp.gallery.fluid import (
     BOUNDS,
     SOLID_CENTER,
@@ -15,6 +18,7 @@ from warp_lcp.gallery.fluid import (
     splash,
     splash_part,
 )
+from warp_lcp.operators.grid_poisson import PoissonArguments
 
 __all__ = [
     "BOUNDS",
@@ -45,7 +49,7 @@ def cut_cells(scene: Splash) -> Splash:
     """
     n = scene.n
     c, f = (np.arange(n) + 0.5) / n, np.arange(n + 1) / n
-    faces = {}
+    faces: Tables = {}
     for axis, name in enumerate(("face_z", "face_y", "face_x")):
         points = np.meshgrid(*(f if a == axis else c for a in range(3)), indexing="ij", sparse=True)
         distance = (
@@ -53,7 +57,7 @@ def cut_cells(scene: Splash) -> Splash:
             - SOLID_RADIUS
         )
         faces[name] = np.clip(distance * n + 0.5, 0.1, 1.0)
-    return Splash(n, scene.cells, scene.b, scene.wall, faces)
+    return Splash(n, scene.cells, scene.b, scene.wall, cast(PoissonArguments, faces))
 
 
 def anisotropic(scene: Splash, ratio: float = 100.0) -> Splash:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 import warp as wp
@@ -23,7 +23,10 @@ from warp_lcp.benchmarks.harness.machine import COPIED, machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results, shown, spread
 from warp_lcp.benchmarks.harness.timing import Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.operators.grid_poisson import PoissonArguments
 from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.solve import Solver
 from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 
 TITLE = "Published methods for the pressure LCP"
@@ -49,16 +52,18 @@ class ProductsOnly(wl.Operator):
 
     symmetric = True
 
-    def __init__(self, cells: np.ndarray, *, device: Any, **faces: Any) -> None:
+    def __init__(
+        self, cells: np.ndarray, *, device: wp.DeviceLike, **faces: Unpack[PoissonArguments]
+    ) -> None:
         self._grid = wl.GridPoisson(cells, device=device, **faces)
         self.shape, self.dtype, self.device = self._grid.shape, self._grid.dtype, self._grid.device
         self.cells, self.layout = self._grid.cells, self._grid.layout
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x."""
         return self._grid.apply(x, out)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A."""
         return self._grid.diagonal()
 
@@ -101,8 +106,8 @@ class PublishedEntry:
 
     source: str  # authors and year; "here" for variants of this library
     label: str
-    solver: Any
-    operator: Callable[..., Any] = wl.GridPoisson
+    solver: Solver
+    operator: Callable[..., wl.Operator] = wl.GridPoisson
 
 
 ENTRIES = (

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,8 +19,11 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.book import appendix_c
 from warp_lcp.benchmarks.book import problems as book
 from warp_lcp.benchmarks.book.outcome import outcome
+from warp_lcp.files.tables import Tables
 from warp_lcp.gallery import Problem, ball_obstacle, journal_bearing
 from warp_lcp.gallery.obstacle import membrane_height
+from warp_lcp.host_problem import Matrix
+from warp_lcp.problem.solve import Solver
 
 WITHIN = 2  # iterations by which a count may differ
 P4PDES, DEALII, PERMON, TAO, BOOK = (
@@ -34,7 +36,7 @@ P4PDES, DEALII, PERMON, TAO, BOOK = (
 MURTY, YOUNG = "Murty 1988", "theory"
 LEVELS = (17, 33, 65, 129, 257)  # nodes along a side
 # PETSc's tolerance of linear systems.
-NEWTON: dict[str, Any] = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}
+NEWTON: Tables = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}
 REDUCED = wl.MinimumMapNewton(safeguard=False, **NEWTON)
 SEMISMOOTH = wl.FischerNewton(safeguard=False, scaled=False, fischer_weight=1.0, **NEWTON)
 SOLVED = 1e-8  # PETSc's relative tolerance
@@ -82,7 +84,7 @@ Small = Callable[[np.ndarray, np.ndarray], float]
 
 def steps_until(
     problem: wl.LCP,
-    method: Any,
+    method: Solver,
     norm: Small,
     tolerance: float,
     *,
@@ -149,19 +151,23 @@ def hemisphere(n: int) -> Problem:
     )
 
 
-def _membrane(n: int, method: Any, norm: Any, x0: np.ndarray | None = None) -> wl.SolveResult:
+def _membrane(
+    n: int, method: Solver, norm: Callable[..., float], x0: np.ndarray | None = None
+) -> wl.SolveResult:
     problem = hemisphere(n)
     return steps_until(
         problem.lcp(), method, partial(norm, np.asarray(problem.lower)), SOLVED, x0=x0
     )
 
 
-def cold_membrane(method: Any, norm: Any, levels: Sequence[int] = LEVELS) -> tuple[float, ...]:
+def cold_membrane(
+    method: Solver, norm: Callable[..., float], levels: Sequence[int] = LEVELS
+) -> tuple[float, ...]:
     """Return the iterations on each grid from x = max(0, psi)."""
     return tuple(_membrane(n, method, norm).iterations for n in levels)
 
 
-def sequenced_membrane(method: Any, norm: Any) -> tuple[float, ...]:
+def sequenced_membrane(method: Solver, norm: Callable[..., float]) -> tuple[float, ...]:
     """Return the iterations on each grid with grid sequencing.
 
     Each starts from the bilinear interpolant of the coarser solution; the first has 5^2 nodes.
@@ -246,10 +252,11 @@ def bearing_problem(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     The problem is a journal bearing of eccentricity 0.1.
     """
     problem = journal_bearing(nx, ny, device="cpu").dense()
+    assert isinstance(problem.A, np.ndarray)
     return problem.A, problem.b, np.asarray(problem.lower), 1e-6
 
 
-def gradient_steps(A: Any, b: np.ndarray, lower: np.ndarray, tolerance: float) -> float:
+def gradient_steps(A: Matrix, b: np.ndarray, lower: np.ndarray, tolerance: float) -> float:
     """Return MPRGP's steps to a projected gradient of `tolerance` times b.
 
     Proportioning steps count separately, as in PERMON.
@@ -375,7 +382,7 @@ def slowest_mode(n: int, *, by_rows: bool) -> tuple[np.ndarray, float]:
     return np.outer(wave, wave), factor**2 if by_rows else factor
 
 
-def sweeps(n: int, method: Any, *, by_rows: bool) -> float:
+def sweeps(n: int, method: Solver, *, by_rows: bool) -> float:
     """Return the sweeps that divide the slowest error by 1e6.
 
     No bound is active: A x = A 1, x >= 0, from 1 plus that error.

@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -28,6 +27,7 @@ from warp_lcp.distributed.messages import MpiMailbox
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.simulator import FluidsSimulator
+from warp_lcp.grid.part import subdomain_of
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph
 from warp_lcp.scene.scene_file import load_scene
 
@@ -77,7 +77,7 @@ class Traffic:
     def _listen(self, kind: type, name: str, size: Callable[..., int]) -> None:
         plain = getattr(kind, name)
 
-        def counted(self_: Any, *arguments: Any, **options: Any) -> Any:
+        def counted(self_: object, *arguments: object, **options: object) -> object:
             self._count(f"{kind.__name__}.{name}", size(self_, *arguments, **options))
             return plain(self_, *arguments, **options)
 
@@ -91,7 +91,7 @@ class Traffic:
             dict[int, tuple[CommandBuffer, list[tuple[str, int]]]](),
         )
 
-        def recording(graph: LaunchGraph, arguments: tuple[Any, ...]) -> Any:
+        def recording(graph: LaunchGraph, arguments: tuple[object, ...]) -> CommandBuffer:
             outer, self._recorded = self._recorded, []
             program = record(graph, arguments)
             assert program is not None
@@ -103,7 +103,8 @@ class Traffic:
                 self._count(kind, size)
             run(program)
 
-        cast(Any, LaunchGraph)._recorded, cast(Any, CommandBuffer).run = recording, running
+        setattr(LaunchGraph, "_recorded", recording)  # noqa: B010  # a method
+        setattr(CommandBuffer, "run", running)  # noqa: B010
 
     def _count(self, kind: str, size: int) -> None:
         if self._recorded is not None:
@@ -151,7 +152,7 @@ def main() -> None:
     traffic.times.clear()
     start_time = time.process_time()
     rows = [simulation.step(simulation.stable_dt()) for _ in range(STEPS)]
-    part: Any = simulation.grid.part
+    part = subdomain_of(simulation.grid)
     box = part.box.counts
     cut = sum(
         box[0] * box[1] * box[2] // box[axis]

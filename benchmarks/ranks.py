@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -45,6 +44,7 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.kernels.thread_pool import VARIABLE
+from warp_lcp.problem.solve import Workspace
 from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"
@@ -87,7 +87,7 @@ class Shared:
             return np.where(self.part.wall, 0.0, -np.inf)
         return {"linear": -np.inf, "everywhere": 0.0}[self.bounds]
 
-    def build(self) -> tuple[wl.LCP, wl.ProjectedMultigrid, Any]:
+    def build(self) -> tuple[wl.LCP, wl.ProjectedMultigrid, Workspace]:
         """Return the problem, the method and its workspace."""
         cells, solver = (
             np.ascontiguousarray(self.part.cells[1:-1, 1:-1, 1:-1]),

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -17,8 +16,11 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
+from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -45,7 +47,7 @@ class Watch:
     """Observer that collects the rows of a run's log."""
 
     def __init__(self) -> None:
-        self.rows: list[Mapping[str, Any]] = []
+        self.rows: list[TableView] = []
 
     def note(self, text: str) -> None:
         """Ignore a remark."""
@@ -53,7 +55,7 @@ class Watch:
     def start(self, time: float, end: float) -> None:
         """Ignore the time [s] of the begin and of the end."""
 
-    def step(self, row: Mapping[str, Any]) -> None:
+    def step(self, row: TableView) -> None:
         """Store a step's row."""
         self.rows.append(row)
 
@@ -135,16 +137,16 @@ class BothSolves:
     Each of the two solves starts from its own last solution.
     """
 
-    def __init__(self, plain: Any, device: str) -> None:
+    def __init__(self, plain: Callable[..., wl.SolveResult], device: str) -> None:
         self.plain, self.device = plain, device
         self.bounded: list[float] = []
         self.linear: list[float] = []
         self.iterations = [0, 0]
         self._problem: wl.LCP | None = None
-        self._work: Any = None
+        self._work: Workspace | None = None
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
-    def __call__(self, problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
+    def __call__(self, problem: wl.LCP, solver: Solver, **options: object) -> wl.SolveResult:
         """Solve both problems and record the seconds."""
         if self._problem is None:
             self._problem = wl.LCP(
@@ -164,7 +166,7 @@ class BothSolves:
         return result
 
     def _timed(
-        self, seconds: list[float], problem: wl.LCP, solver: Any, options: dict[str, Any]
+        self, seconds: list[float], problem: wl.LCP, solver: Solver, options: Tables
     ) -> wl.SolveResult:
         begun = time.perf_counter()
         result: wl.SolveResult = self.plain(problem, solver, **options)
@@ -172,7 +174,7 @@ class BothSolves:
         seconds.append(time.perf_counter() - begun)
         return result
 
-    def _start(self, x0: wp.array[Any]) -> wp.array[Any]:
+    def _start(self, x0: DeviceArray) -> DeviceArray:
         """Scale the last linear solution by the ratio of time steps.
 
         The scene scales its own solution in the same way.
@@ -228,9 +230,10 @@ def _walls(size: int, options: Options) -> BenchmarkRecord:
 def _particles(size: int, options: Options) -> BenchmarkRecord:
     """Step a dam break and time its particle stages."""
     scene = load_scene("dam-break", [WHOLE, f"domain.resolution={size}"])
-    simulation: Any = simulators()[scene.scene.simulator].create(
+    simulation = simulators()[scene.scene.simulator].create(
         scene, device=options.device, folder=Path.cwd()
     )
+    assert isinstance(simulation, ParticleSimulation)
     count = simulation.particles.count
     with timed(options.device, STAGES) as seconds:
         for _ in range(PARTICLE_STEPS + 1):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,10 +15,12 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordLines, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.heavy_ball import METHODS
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.granular.stress import Stress
 
 TITLE = "Sand: pressure and friction together"
 # [s] into the collapse.
@@ -66,12 +67,12 @@ def measure(options: Options, out: Path) -> Results:
     return Results([*records, *states, *models, *steps], tables, [chart])
 
 
-def collapse(size: int, **tables: Any) -> SandScene:
+def collapse(size: int, **tables: TableValue) -> SandScene:
     """Return the collapse of a column twice as high as wide.
 
     The domain has `size` cells across.
     """
-    scene: dict[str, Any] = {
+    scene: Tables = {
         "scene": {"simulator": "granular"},
         "time": {"duration": COLLAPSE_END},
         "domain": {
@@ -107,7 +108,7 @@ def _simulation(scene: SandScene, device: str) -> SandSimulation:
     return SIMULATOR.create(scene, device=device, folder=Path())
 
 
-def _step(simulation: SandSimulation) -> dict[str, Any]:
+def _step(simulation: SandSimulation) -> Tables:
     return simulation.step(min(simulation.stable_dt(), simulation.scene.time.dt_max))
 
 
@@ -117,7 +118,7 @@ class _Taken:
     It records the residual [rho g dx] and the seconds.
     """
 
-    def __init__(self, stress: Any, name: str, tolerance: float, most: int) -> None:
+    def __init__(self, stress: Stress, name: str, tolerance: float, most: int) -> None:
         self.stress, self.method, self.tolerance, self.most = (
             stress,
             METHODS[name](),

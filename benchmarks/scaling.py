@@ -12,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -75,7 +74,7 @@ class Growing:
         lower, solver = self.scene.lower(self.bounds), wl.ProjectedMultigrid()
         begun = time.perf_counter()
         problem = wl.LCP(wl.GridPoisson(self.scene.cells, device=self.device), self.scene.b, lower)
-        work: Any = solver.init(problem)
+        work = solver.init(problem)
         wp.synchronize_device(self.device)
         setup = time.perf_counter() - begun
         result = wl.solve(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.peers.libraries import pyamg, scipy_cg
 from warp_lcp.benchmarks.peers.peer import PeerAnswer, Question
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
+from warp_lcp.files.tables import Tables
+from warp_lcp.operators.grid_poisson import PoissonArguments
+from warp_lcp.problem.solve import Solver
 from warp_lcp.solvers.fallback import Progress
 
 TITLE = "Linear and LCP pressure solves"
@@ -47,7 +51,7 @@ def is_near(progress: Progress) -> bool:
     return progress.norms[-1] <= 1e-2 * progress.norms[0]
 
 
-OTHERS = {
+OTHERS: dict[str, Solver] = {
     "MPRGP": wl.MPRGP(),
     "FischerNewton": wl.FischerNewton(),
     "InteriorPoint": wl.InteriorPoint(),
@@ -129,7 +133,7 @@ def _cases(n: int, device: str) -> list[SolverCase]:
     if n > LARGE:
         return [SolverCase("unit", scene, bounds, engine, device) for bounds in BOUNDS]
     flat = anisotropic(scene)
-    arrays = {
+    arrays: Tables = {
         f"face_{a}": np.full([n + (i == j) for j in range(3)], flat.faces.get(f"face_{a}", 1.0))
         for i, a in enumerate("zyx")
     }
@@ -146,7 +150,9 @@ def _cases(n: int, device: str) -> list[SolverCase]:
     cases += [SolverCase("faces", cut_cells(scene), bounds, engine, device) for bounds in BOUNDS]
     harder = {
         "cells 1:100": flat,
-        "arrays 1:100": type(scene)(n, scene.cells, scene.b, scene.wall, arrays),
+        "arrays 1:100": type(scene)(
+            n, scene.cells, scene.b, scene.wall, cast(PoissonArguments, arrays)
+        ),
     }
     return cases + [
         SolverCase(form, s, bounds, engine, device, full=False)

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,6 +21,7 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.sparse_family import FAMILY, SparseProblem, numbered_at_random
+from warp_lcp.files.tables import Tables
 
 TITLE = "Sparse matrices numbered at random: with bounds, against PyAMG without"
 # Roots of the numbers of unknowns; first seed of problems on which nothing was tuned.
@@ -81,8 +81,8 @@ def pyamg_solvers(problem: SparseProblem) -> dict[str, Callable[[], float]]:
 def _pyamg(problem: SparseProblem, build: str, accel: str) -> float:
     import pyamg
 
-    A: Any = sp.csr_matrix(problem.A)
-    settings: dict[str, Any] = (
+    A: sp.spmatrix = sp.csr_matrix(problem.A)
+    settings: Tables = (
         {} if problem.symmetric or build.startswith("ruge") else {"symmetry": "nonsymmetric"}
     )
     if problem.near_null_space is not None:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -159,7 +158,7 @@ class _Grid:
     def work(self, count: int) -> Work:
         """Return the measured functions by name."""
         wl.set_threads(count)
-        workspace: Any = wl.ProjectedMultigrid().init(self.problem)
+        workspace = wl.ProjectedMultigrid().init(self.problem)
         wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
         hierarchy: Hierarchy = workspace.hierarchy
         fine, coarse = hierarchy.levels[:2]

@@ -11,11 +11,11 @@ of CPU times.
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import warp_lcp as wl
+from warp_lcp.files.tables import Tables
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 VISCOSITIES = (1e-3, 1.0, 1e3, 1e5)  # [Pa s]
@@ -24,11 +24,9 @@ TURNS, DT = 5, 1e-2
 
 def tank(cells: int, viscosity: float, wall: str) -> LiquidSimulation:
     """Return the tank with its velocity, before a step."""
-    blocks: list[dict[str, Any]] = [
-        {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.5, 1.0]}
-    ]
+    blocks: list[Tables] = [{"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.5, 1.0]}]
     blocks += [{"shape": "sphere", "center": [x, 0.5, 0.5], "radius": 0.2} for x in (0.25, 0.75)]
-    data: dict[str, Any] = {
+    data: Tables = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 1.0},
         "domain": {"size": [1.0] * 3, "resolution": cells, "wall": wall},

@@ -6,7 +6,7 @@ They are written to `forces.csv`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -16,7 +16,7 @@ from warp_lcp.fluids.thin_forces_kernels import thin_pressure_kernel
 from warp_lcp.fluids.wall_kernels import WallKernelFields
 from warp_lcp.grid.cell_kernel import scan
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 from warp_lcp.kernels.memory import Scalar
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 SPARE = 1.5  # factor on the number of entries when the buffer is enlarged
 
 
-def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
+def walls_of(grid: StaggeredGrid, boundary: Boundary) -> WallKernelFields:
     """Return the solids of a boundary as `wall_kernels.WallKernelFields`."""
     S = WallKernelFields()
     S.planes, S.spacing, S.origin = grid.planes, grid.spacing, wp.vec3i(*grid.origin)
@@ -43,12 +43,9 @@ def walls_of(grid: StaggeredGrid, boundary: Boundary) -> Any:
         if cut.moves:
             S.moving = cut.moving
         if (barriers := boundary.barriers) is not None:
-            for axis, number, below, above in zip(
-                "xyz", barriers.number, barriers.below, barriers.above, strict=False
-            ):
-                setattr(S, f"number_{axis}", number)
-                setattr(S, f"below_{axis}", below)
-                setattr(S, f"above_{axis}", above)
+            S.number_x, S.number_y, S.number_z = three_components(barriers.number)
+            S.below_x, S.below_y, S.below_z = three_components(barriers.below)
+            S.above_x, S.above_y, S.above_z = three_components(barriers.above)
     else:
         assert isinstance(boundary, WholeCells)
         S.index = boundary.solids.index
@@ -82,7 +79,7 @@ class WallSums:
         self._reserve(0)
 
     def take(
-        self, kernel: wp.Kernel, window: Window, references: np.ndarray, given: Sequence[Any]
+        self, kernel: wp.Kernel, window: Window, references: np.ndarray, given: Sequence[object]
     ) -> np.ndarray:
         """Return the sums of a kernel's entries, shape (solids, 6).
 
@@ -109,7 +106,7 @@ class WallSums:
             axis=-1,
         )
 
-    def _count(self, kernel: wp.Kernel, window: Window, given: list[Any]) -> None:
+    def _count(self, kernel: wp.Kernel, window: Window, given: list[object]) -> None:
         """Launch a kernel that counts entries, and compute the offsets of the rows."""
         clear(self._counts)
         window.launch_rows(
@@ -117,7 +114,7 @@ class WallSums:
         )
         scan(self._counts, self._offsets, inclusive=False)
 
-    def _write(self, kernel: wp.Kernel, window: Window, given: list[Any]) -> None:
+    def _write(self, kernel: wp.Kernel, window: Window, given: list[object]) -> None:
         """Launch a kernel that writes its entries."""
         window.launch_rows(
             kernel,
@@ -132,7 +129,7 @@ class WallSums:
             ],
         )
 
-    def launch(self, kernel: wp.Kernel, window: Window, given: Sequence[Any]) -> None:
+    def launch(self, kernel: wp.Kernel, window: Window, given: Sequence[object]) -> None:
         """Launch a kernel for its other effects; its entries are only counted."""
         window.launch_rows(kernel, [self.walls, None, self._counts, None, None, None, *given])
 

@@ -6,8 +6,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -26,12 +25,13 @@ from warp_lcp.grid.staggered import (
 )
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.grid.window_reduction import WindowTally
-from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.launch_graph import LaunchGraph, copy
 from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 
 CONSTANTS = {
@@ -48,9 +48,26 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
 
 
+@dataclass(frozen=True)
+class PressureKernels:
+    """Kernels of a pressure projection.
+
+    Attributes:
+        prepare: right-hand side, coefficients and bounds.
+        subtract_gradient: new velocity of the faces.
+        support: part of the pressure that carries weight.
+        contact: how liquid touches its walls.
+    """
+
+    prepare: StencilKernel
+    subtract_gradient: StencilKernel
+    support: StencilKernel
+    contact: StencilKernel
+
+
 @functools.cache
-def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
-    """Return the kernels `prepare`, `subtract_gradient`, `support` and `contact`.
+def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> PressureKernels:
+    """Return the kernels of a pressure projection.
 
     Args:
         cut: whether faces have open fractions.
@@ -73,12 +90,12 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
         "THETA_MIN": THETA_MIN,
         "TINY_WEIGHT": TINY_WEIGHT,
     }
-    names = ("prepare", "subtract_gradient", "support", "contact")
-    return SimpleNamespace(
-        **{
-            name: KERNELS.kernel(f"fluids.pressure.{name}", module=module, constants=flags)
-            for name in names
-        }
+    kernel = functools.partial(KERNELS.kernel, module=module, constants=flags)
+    return PressureKernels(
+        prepare=kernel("fluids.pressure.prepare"),
+        subtract_gradient=kernel("fluids.pressure.subtract_gradient"),
+        support=kernel("fluids.pressure.support"),
+        contact=kernel("fluids.pressure.contact"),
     )
 
 
@@ -213,7 +230,7 @@ class PressureProjection:
         self,
         grid: StaggeredGrid,
         boundary: Boundary,
-        solver: Any,
+        solver: Solver,
         *,
         tolerance: float | Literal["auto"],
         max_iterations: int,
@@ -250,7 +267,7 @@ class PressureProjection:
         self._lower = (
             wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
         )
-        self._least: Any = -np.inf if self._lower is None else self._lower
+        self._least: wp.array | float = -np.inf if self._lower is None else self._lower
         part = grid.part
         opens = part.ranks.any(bool(boundary.open_sides & ~part.cuts))
         self._shift = grid.field() if phi is not None or opens else None

@@ -29,7 +29,7 @@ STEP = wp.constant(0.25)  # step of the search for the surface [cells]
 VALUES = 6
 FAR = 1e9  # larger than any grid [cells]
 
-options: dict[str, typing.Any] = {"module": "fluids.probes"}
+options: dict[str, str] = {"module": "fluids.probes"}
 
 
 @wp.func

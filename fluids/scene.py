@@ -12,7 +12,7 @@ from warp_lcp.fluids.tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
-from warp_lcp.scene.shapes import LiquidProperties, MaterialProperties, SourceProperties
+from warp_lcp.scene.shapes import LiquidProperties, MaterialProperties, Shape, SourceProperties
 from warp_lcp.scene.suspicious_settings import LIQUID_DENSITY, UsualRange
 from warp_lcp.settings import Positive
 
@@ -84,6 +84,11 @@ class SurfaceTensionSettings(Table):
     contact_angle: float = Field(
         default=90.0, ge=0, le=180, description="in the liquid [degrees]; above 90 walls repel it"
     )
+
+
+def _viscosity(shape: Shape) -> float | None:
+    """Return the viscosity of a material or source [Pa s]; None for the default."""
+    return shape.viscosity if isinstance(shape, LiquidProperties | SourceProperties) else None
 
 
 class LiquidScene(ParticleScene):
@@ -158,10 +163,7 @@ class LiquidScene(ParticleScene):
             self.surface_tension,
         )
         given = [("viscosity.value", self.viscosity.value if self.viscosity else None)]
-        given += [
-            (f"{place}.viscosity", getattr(shape, "viscosity", None))
-            for place, shape in self.shapes()
-        ]
+        given += [(f"{place}.viscosity", _viscosity(shape)) for place, shape in self.shapes()]
         for place, value in given:
             notes += VISCOSITY.notes(place, value)
         notes += LIQUID_CFL.notes("time.cfl", self.time.cfl)
@@ -237,7 +239,7 @@ class LiquidScene(ParticleScene):
         if self.viscosity is None or all(shape.viscosity is None for shape in liquids):
             return None
         return [
-            (getattr(shape, "viscosity", None) or self.viscosity.value) / self.viscosity.value
+            (_viscosity(shape) or self.viscosity.value) / self.viscosity.value
             for shape in materials
         ]
 

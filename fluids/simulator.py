@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Unpack
 
 import numpy as np
 
@@ -46,7 +46,7 @@ from warp_lcp.material.particle_assembly import (
     start_band,
 )
 from warp_lcp.material.particle_log import Row
-from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
@@ -91,7 +91,7 @@ class LiquidSimulation(ParticleSimulation):
         *,
         solids: Sequence[PlacedSolid] = (),
         models: Sequence[LiquidModel] = (),
-        **more: Any,
+        **more: Unpack[ParticleSimulationOptions],
     ) -> None:
         tell = scene.output.forces or (scene.drags is not None and more.get("bodies") is not None)
         self.models = tuple(models)
@@ -316,7 +316,7 @@ class LiquidSimulation(ParticleSimulation):
                     # The velocities of the bodies have changed.
                     self.boundary.begin_step(self.time, dt)
                 part.fill(*self.velocity)
-        return {name: float(part.ranks.sum(value)) for name, value in row.items()}
+        return {name: float(part.ranks.sum(float(value or 0.0))) for name, value in row.items()}
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the log columns of pressure and volume.
@@ -623,8 +623,16 @@ class FluidsSimulator:
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         solids = placed_solids(scene, folder)
         bodies = make_bodies(scene, solids, partial(RigidBodies, ranks=ranks or ONE_PROCESS))
-        more: dict[str, Any] = {"ranks": ranks, "wall_velocity": wall_velocity, "models": models}
-        return self.assemble(scene, solids, bodies, device=device, folder=folder, **more)
+        return self.assemble(
+            scene,
+            solids,
+            bodies,
+            device=device,
+            folder=folder,
+            ranks=ranks,
+            wall_velocity=wall_velocity,
+            models=models,
+        )
 
     def assemble(
         self,

@@ -2,8 +2,8 @@
 """Kernels of surface tension: extension into walls, curvature, push, energy."""
 
 import functools
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -11,7 +11,7 @@ from warp_lcp.fluids.pressure import CONSTANTS, THETA_MIN
 from warp_lcp.grid.cell_kernel import F32 as FIELD
 from warp_lcp.grid.cell_kernel import I8 as MARKS
 from warp_lcp.grid.cell_kernel import INTS, POINTS, cell_kernel, list_kernel
-from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels import KernelFile, StencilKernel
 
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
@@ -33,19 +33,31 @@ CURVATURE = KERNELS["fluids.surface_tension.curvature"]
 JUMP = KERNELS["fluids.surface_tension.jump"]
 
 
-@functools.cache
-def push_pass(cut: bool) -> SimpleNamespace:
-    """Return the kernels `push` and `energy`, with or without open fractions.
+@dataclass(frozen=True)
+class SurfaceTensionKernels:
+    """Kernels of the surface tension.
 
-    `push` acts on the velocity; `energy` sums the surface's energy. `cut` is True if faces have
-    open fractions.
+    Attributes:
+        push: acts on the velocity.
+        energy: sums the surface's energy.
+    """
+
+    push: StencilKernel
+    energy: StencilKernel
+
+
+@functools.cache
+def push_pass(cut: bool) -> SurfaceTensionKernels:
+    """Return the kernels with or without open fractions.
+
+    `cut` is True if faces have open fractions.
     """
     kernel = functools.partial(
         KERNELS.kernel,
         module=MODULE + "_cut" * cut,
         constants={"CUT": cut, "MOVING": False, "GHOST": True},
     )
-    return SimpleNamespace(
+    return SurfaceTensionKernels(
         push=kernel("fluids.surface_tension.push"),
         energy=kernel("fluids.surface_tension.surface_energy"),
     )

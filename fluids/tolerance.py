@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +11,7 @@ import warp_lcp as wl
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.vectors import Communicator, Reduction, convert, rows_of
+from warp_lcp.problem.protocol import Operator
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h")
 CHANGE = KERNELS["tolerance.change"]
@@ -81,7 +81,7 @@ class TimeErrorTolerance:
 
     def measure(
         self,
-        A: Any,
+        A: Operator,
         result: wl.SolveResult,
         criteria: wl.StoppingCriteria,
         fields: list[wp.array],

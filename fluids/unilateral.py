@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,7 @@ from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.problem.solve import Solver
 
 
 class UnilateralPressure(PressureProjection):
@@ -86,7 +87,7 @@ class UnilateralPressure(PressureProjection):
         self,
         grid: StaggeredGrid,
         boundary: Boundary,
-        solver: Any,
+        solver: Solver,
         *,
         level_set: LevelSet,
         weights: Sequence[wp.array],
@@ -216,7 +217,7 @@ class UnilateralPressure(PressureProjection):
         cells, pressure = (part.box_of(field.numpy()) for field in (self.cells, self.pressure))
         return np.argwhere((cells == FLUID) | (pressure > 0.0)) + np.array(part.owned.low)
 
-    def _at(self, velocity: Sequence[wp.array]) -> Any:
+    def _at(self, velocity: Sequence[wp.array]) -> kernels.UnilateralSetting:
         """Return the kernel struct with current velocities and open fractions."""
         s = self._setting
         s.u, s.v, s.w = three_components(velocity)

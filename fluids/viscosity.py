@@ -34,7 +34,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -68,6 +67,21 @@ ROUNDING = 4 * float(np.finfo(np.float32).eps)
 STIFF = 1.0
 
 VISCOUS_COLUMNS = ("viscous_iterations", "viscous_residual", "dissipated", "wall_work")
+
+
+@dataclass(frozen=True)
+class ViscousFields:
+    """Fields of a viscous step that its residual reads.
+
+    Attributes:
+        u: velocity of each component [m/s].
+        kind: int8 of AIR, FLUID, SOLID.
+        contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
+    """
+
+    u: Sequence[wp.array]
+    kind: wp.array
+    contact: wp.array
 
 
 @dataclass(frozen=True)
@@ -250,7 +264,7 @@ class Viscosity:
         self._begin(box, inner, tau)
         self._graphs["_set_up"].run(kind, contact, variant=self._placed)
         self._placed = True
-        fields = {"u": velocity, "kind": kind, "contact": contact}
+        fields = ViscousFields(velocity, kind, contact)
         if self._bodies is not None:
             self._bodies.take(
                 self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity
@@ -261,12 +275,12 @@ class Viscosity:
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
             before = norm
-            goal: dict[str, Any] = (
-                {"tolerance": self.tolerance, "by_error": True}
-                if tau * self._thickest > STIFF and not iterations
-                else {"tolerance": 0.7 * least}
+            by_error = tau * self._thickest > STIFF and not iterations
+            self._solver.start(
+                max_iterations=self.max_iterations - iterations,
+                tolerance=self.tolerance if by_error else 0.7 * least,
+                by_error=by_error,
             )
-            self._solver.start(max_iterations=self.max_iterations - iterations, **goal)
             self._graphs["_take_solution"].run(velocity, self._solver.x, variant=self._solver.x.ptr)
             norm, lost, driven, _ = self._force(fields, changed=True)
             iterations += self._solver.found()[0]  # read together with the force
@@ -523,6 +537,7 @@ class Viscosity:
         """Launch the kernels that cut links at thin solids, and link faces to the solids."""
         grid, fine, barriers = self.grid, self._fine, self.grid.barriers
         assert isinstance(self.boundary, CutBoundary), "thin solids are among cut cells"
+        assert barriers is not None
         cut = self.boundary.cut
         cells, solids = [kind, contact, self._tau], [self._slips, cut.turn, cut.shift]
         placed = [wp.vec3i(*grid.origin), grid.planes, grid.spacing]
@@ -553,7 +568,7 @@ class Viscosity:
         """Velocities of solids on the faces of each component."""
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
-    def _force(self, given: dict[str, Any], *, changed: bool) -> list[float]:
+    def _force(self, given: ViscousFields, *, changed: bool) -> list[float]:
         """Write the residual; return its norm and the energies of the step.
 
         In this order: the norm, the energy lost by the force, the work of walls, the norm of the
@@ -577,12 +592,12 @@ class Viscosity:
             float(np.sqrt(totals[3])),
         ]
 
-    def _residual(self, given: dict[str, Any], changed: bool) -> None:
+    def _residual(self, given: ViscousFields, changed: bool) -> None:
         """Launch the kernels that write the residual and its sums."""
         fine, solids = self._fine, self._solids
         residual, velocity, distance = (
             self.multigrid.components(self.multigrid.r),
-            given["u"],
+            given.u,
             self._distance,
         )
         for axis in range(self.grid.dimension):
@@ -593,8 +608,8 @@ class Viscosity:
                 self._unknowns,
                 fine.rows(axis),
                 self.grid.placement,
-                kind=given["kind"],
-                contact=given["contact"],
+                kind=given.kind,
+                contact=given.contact,
                 base=self.boundary.base,
                 u=velocity[axis],
                 ub=ub,

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 import warp as wp
 
 from warp_lcp.fluids.viscosity_level import ViscosityLevel
+from warp_lcp.fluids.viscosity_passes import ViscousKernels
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.launch_graph import Launch
 from warp_lcp.kernels.vectors import Communicator
@@ -70,7 +70,7 @@ class WallPull:
         boundary: Boundary,
         numbers: Sequence[int],
         solids: int,
-        passes: Any,
+        passes: ViscousKernels,
     ) -> None:
         self.grid, self.boundary, self._passes = grid, boundary, passes
         self.width, self.count = 3 if grid.dimension == 2 else 6, len(numbers)
@@ -94,7 +94,7 @@ class WallPull:
             points: reference points of the solids' rotations [m], shape (solids, 3).
         """
         grid, distance = self.grid, walls.distance
-        owners: list[Any] = (
+        owners: list[wp.array | None] = (
             [*self.boundary.cut.wall]
             if isinstance(self.boundary, CutBoundary)
             else [None] * grid.dimension
@@ -222,7 +222,7 @@ class BodyDrag:
         boundary: CutBoundary,
         bodies: RigidBodies,
         density: float,
-        passes: Any,
+        passes: ViscousKernels,
         solved: Window,
         across: Communicator | None,
     ) -> None:

@@ -17,13 +17,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.fluids.viscosity_passes import viscous_passes
-from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window, three_components
+from warp_lcp.grid.staggered import CLEAR, FieldT, StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import Launch, perform
 from warp_lcp.multigrid.cycle import CycleStage, Launches
 
@@ -148,7 +147,7 @@ class ViscosityLevel:
         """Return the two other axes; None for a missing one."""
         return [*(a for a in range(self.dimension) if a != axis), None][:2]
 
-    def of_others(self, axis: int, fields: Sequence[Any]) -> list[Any]:
+    def of_others(self, axis: int, fields: Sequence[FieldT]) -> list[FieldT | None]:
         """Return the entries of the other components in a list with one per component."""
         return [None if other is None else fields[other] for other in self.others(axis)]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.fluids.viscosity_level import KNOWN, ViscosityLevel
+from warp_lcp.grid.part import subdomain_of
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
@@ -90,7 +90,7 @@ class ViscosityMultigrid:
         last = self.levels[-1]
         if self._gathered is None:
             return Cycle(self.levels, last.solve)
-        part: Any = last.grid.part
+        part = subdomain_of(last.grid)
         whole, first = self._gathered.cycle, self._gathered.levels[0]
         gather = Launches(partial(perform, partial(part.collect, last.b, first.b)))
         take = Launches(partial(perform, partial(_take_part, last, first)))
@@ -146,7 +146,7 @@ class ViscosityMultigrid:
             fine = coarse
         if self._gathered is not None:
             first = self._gathered.levels[0]
-            part: Any = fine.grid.part
+            part = subdomain_of(fine.grid)
             part.collect(fine.equations, first.equations)
             self._gathered.move_to(first.grid.everywhere)
             self._gathered.set_up()
@@ -154,6 +154,6 @@ class ViscosityMultigrid:
 
 def _take_part(level: ViscosityLevel, whole: ViscosityLevel) -> None:
     """Copy this rank's part of the whole grid's solution, with ghost cells."""
-    part: Any = level.grid.part
+    part = subdomain_of(level.grid)
     for x, of_whole in zip(level.x, whole.x, strict=True):
         part.take(of_whole, x)

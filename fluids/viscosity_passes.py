@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.material.boundary_kernels import RELEASED
@@ -23,6 +23,30 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/viscosity.h", KINDS | LIMI
 LEVELS = KernelFile(Path(__file__).parent / "headers/viscosity_multigrid.h", {"ALIKE": CORE})
 
 
+@dataclass(frozen=True)
+class ViscousKernels:
+    """Kernels of the viscous solve; the declarations in the headers explain them."""
+
+    distance: StencilKernel
+    weights: StencilKernel
+    diagonal: StencilKernel
+    force: StencilKernel
+    links: StencilKernel
+    cover: StencilKernel
+    add: StencilKernel
+    sum: StencilKernel
+    span: StencilKernel
+    sweep: StencilKernel
+    product: StencilKernel
+    residual: StencilKernel
+    average: StencilKernel
+    close: StencilKernel
+    coarse_diagonal: StencilKernel
+    normalize: StencilKernel
+    prolong: StencilKernel
+    restrict: StencilKernel
+
+
 @functools.cache
 def viscous_passes(
     dimension: int,
@@ -31,7 +55,7 @@ def viscous_passes(
     moving: bool = False,
     varies: bool = False,
     thin: bool = False,
-) -> SimpleNamespace:
+) -> ViscousKernels:
     """Return the kernels of the viscous solve for a dimension.
 
     The other arguments select variants of the kernels that read walls and surface.
@@ -61,7 +85,7 @@ def viscous_passes(
     def level(name: str, apart: str = "", **constants: bool) -> StencilKernel:
         return LEVELS.kernel(f"fluids.viscosity.{name}", module=area + apart, constants=constants)
 
-    return SimpleNamespace(
+    return ViscousKernels(
         distance=near("distance"),
         weights=near("weights", "_varies" * varies, VARIES=varies),
         diagonal=near("diagonal", "_thin" * thin, THIN=thin),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -133,7 +132,7 @@ class WallDrag:
         phi: wp.array | None,
         *,
         apply: bool,
-    ) -> list[list[Any]]:
+    ) -> list[list[object]]:
         """Return the kernel's arguments for each component."""
         D = self._drag
         D.walls, D.kind, D.contact, D.phi = sums.walls, projection.kind, projection.contact, phi

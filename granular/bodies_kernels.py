@@ -3,15 +3,19 @@
 
 import functools
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from warp_lcp.granular.stress_kernels import KERNELS
 from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
+from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.layout import make_struct, put
+
+if TYPE_CHECKING:
+    from warp._src.codegen import Struct, StructInstance
 
 _INTS, _BYTES, _REALS = (
     wp.array(dtype=wp.int32),
@@ -28,12 +32,12 @@ options = {"module": "granular.bodies"}
 
 
 @functools.cache
-def vector_struct(real: Any) -> Any:
+def vector_struct(real: type) -> "Struct":
     """Return the struct of a vector field's components as flat arrays."""
     return make_struct(f"Vector_{real.__name__}", dict.fromkeys("xyz", wp.array(dtype=real)))
 
 
-def flat_vector(fields: Sequence[wp.array]) -> Any:
+def flat_vector(fields: Sequence[wp.array]) -> "StructInstance":
     """Return the components of a vector field as flat arrays; missing ones are null."""
     return put(
         vector_struct(fields[0].dtype)(),
@@ -282,8 +286,25 @@ def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Ve
         out[n] = wp.float64(1.0) / wp.float64(around)
 
 
+@dataclass(frozen=True)
+class SandBodyKernels:
+    """Kernels of rigid bodies in the stress solve.
+
+    Attributes:
+        move: velocity of the bodies' faces.
+        strain: shear rates of the edges beside bodies.
+        trial: projected step of the cells beside bodies.
+        trial_wall: that of the walls beside them.
+    """
+
+    move: wp.Kernel
+    strain: wp.Kernel
+    trial: StencilKernel
+    trial_wall: StencilKernel
+
+
 @functools.cache
-def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> SimpleNamespace:
+def body_kernels(dimension: int, real: type, box: bool, rate: bool = False) -> SandBodyKernels:
     """Return the kernels for 2 or 3 dimensions, with velocities of type `real`."""
     name = f"bodies_{dimension}d_{real.__name__}{'_box' * box}{'_rate' * rate}"
     module, Velocity = f"granular.{name}", vector_struct(real)
@@ -316,4 +337,4 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         KERNELS.kernel, module=f"granular.{name}", compute=real, constants=words
     )
     trial, trial_wall = made("granular.bodies.step"), made("granular.bodies.wall_step")
-    return SimpleNamespace(move=move, strain=strain, trial=trial, trial_wall=trial_wall)
+    return SandBodyKernels(move=move, strain=strain, trial=trial, trial_wall=trial_wall)

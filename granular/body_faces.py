@@ -43,7 +43,13 @@ class Incidence:
 
     def where(self, wanted: np.ndarray) -> Incidence:
         """Return the selected places; mask of type bool, shape (n,)."""
-        return Incidence(*(getattr(self, name)[wanted] for name in self.__dataclass_fields__))
+        return Incidence(
+            self.at[wanted],
+            self.body[wanted],
+            self.row[wanted],
+            self.axis[wanted],
+            self.share[wanted],
+        )
 
 
 @dataclass(frozen=True)
@@ -258,10 +264,11 @@ def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
         edge_parts.append(_summed(grid, parts, d))
     order = np.argsort(np.concatenate([part.body for part in edge_parts]), kind="stable")
     return Incidence(
-        *(
-            np.concatenate([getattr(part, name) for part in edge_parts])[order]
-            for name in Incidence.__dataclass_fields__
-        )
+        np.concatenate([part.at for part in edge_parts])[order],
+        np.concatenate([part.body for part in edge_parts])[order],
+        np.concatenate([part.row for part in edge_parts])[order],
+        np.concatenate([part.axis for part in edge_parts])[order],
+        np.concatenate([part.share for part in edge_parts])[order],
     )
 
 

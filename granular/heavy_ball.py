@@ -6,7 +6,6 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -351,10 +350,25 @@ def _sweep(stress: Stress, passed: StencilKernel, omega: float) -> None:
         passed.bind(rows, *structs, cells=cells, omega=omega, now=now, numbers=numbers).launch()
 
 
+@dataclass(frozen=True)
+class InterleavedKernels:
+    """Kernels of interleaved sweeps.
+
+    Attributes:
+        pressure: sweep over the pressures.
+        friction: sweep over the friction.
+        wall: sweep over walls.
+    """
+
+    pressure: StencilKernel
+    friction: StencilKernel
+    wall: StencilKernel
+
+
 @functools.cache
 def interleaved_passes(
     dimension: int, box: bool = False, rate: bool = False, listed: bool = False
-) -> SimpleNamespace:
+) -> InterleavedKernels:
     """Return the sweep kernels in 2-D or 3-D.
 
     `listed`: over a list of cells.
@@ -364,7 +378,7 @@ def interleaved_passes(
         KERNELS.kernel, module=module, constants={"DIM": dimension, "BOX": box, "RATE": rate}
     )
     area = "granular.interleaved" + "_listed" * listed
-    return SimpleNamespace(
+    return InterleavedKernels(
         pressure=kernel(f"{area}.sweep_pressure"),
         friction=kernel(f"{area}.sweep_friction"),
         wall=kernel("granular.interleaved.sweep_walls"),

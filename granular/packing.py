@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,7 @@ from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
 
 if TYPE_CHECKING:
+    from warp_lcp.distributed.halo import StarForest
     from warp_lcp.granular.cut_walls import CutWalls
 
 REACH = 2  # layers of ghost cells whose stresses act on velocities in the box
@@ -101,7 +102,7 @@ class Packing:
         self.counted = grid.part.owned
         # Exchange of this step's cells on ranks; always the same object, since recorded exchanges
         # read it.
-        self._forest: Any = None
+        self._forest: StarForest | None = None
         self.strained, self.moved, self.stressed = (
             self._around(0, 1),
             self._around(1, 1),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -139,7 +139,7 @@ class Gauge(Table):
     height: float = Field(description="height above the domain's floor [m]")
 
 
-def _not_automatic(value: Any) -> Any:
+def _not_automatic(value: object) -> object:
     """Refuse "auto", which is for liquids."""
     if value == "auto":
         message = (
@@ -228,7 +228,7 @@ class SandScene(ParticleScene):
 
     @model_validator(mode="before")
     @classmethod
-    def _density_of_material(cls, data: Any) -> Any:
+    def _density_of_material(cls, data: object) -> object:
         """Set the default density to that of the material."""
         if not isinstance(data, dict):
             return data
@@ -328,9 +328,13 @@ class SandScene(ParticleScene):
     def complaints(self) -> list[Complaint]:
         """Return errors that involve several keys."""
         complaints = super().complaints()
-        for key, first in (("friction_angle", self.friction_angle), ("cohesion", self.cohesion)):
-            for number, sand in enumerate(self.sand):
-                value = getattr(sand, key)
+        angles = [sand.friction_angle for sand in self.sand]
+        cohesions = [sand.cohesion for sand in self.sand]
+        for key, first, values in (
+            ("friction_angle", self.friction_angle, angles),
+            ("cohesion", self.cohesion, cohesions),
+        ):
+            for number, value in enumerate(values):
                 if value is not None and value != first:
                     message = (
                         f"must be {first:g} as in the other [[sand]]: a scene has one material"

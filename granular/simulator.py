@@ -6,14 +6,14 @@ import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack, cast
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.heavy_ball import METHODS
+from warp_lcp.granular.heavy_ball import METHODS, StressWorkspace
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.percentiles import ParticlePercentiles
 from warp_lcp.granular.report import SandReport
@@ -39,9 +39,10 @@ from warp_lcp.material.particle_assembly import (
     placed_solids,
 )
 from warp_lcp.material.particle_log import Row
-from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.scene.scene import Scene
@@ -96,7 +97,12 @@ class SandSimulation(ParticleSimulation):
     scene: SandScene
 
     def __init__(
-        self, scene: SandScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any
+        self,
+        scene: SandScene,
+        grid: StaggeredGrid,
+        parts: Parts,
+        particles: Particles,
+        **more: Unpack[ParticleSimulationOptions],
     ) -> None:
         """Allocate the fields and find the cells with sand."""
         self.method = METHODS[scene.solver.method]()
@@ -116,6 +122,7 @@ class SandSimulation(ParticleSimulation):
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
+        assert parts.solids is not None, "made by `make_parts`"
         scene, self.solids = self.scene, parts.solids
         self._base, self.density = grid.field(wp.int8), grid.field()
         self._completion, self._density_to_grid = (
@@ -131,8 +138,8 @@ class SandSimulation(ParticleSimulation):
             self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried
         )
         self.outcome = SandReport(self.stress)
-        self._work: Any = None  # workspace of the current method
-        self._made_by: Any = None
+        self._work: StressWorkspace | None = None  # of the current method
+        self._made_by: Solver | None = None
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
 
@@ -401,7 +408,9 @@ class SandSimulation(ParticleSimulation):
         # The first solve on a grid, or the method has changed.
         if self._made_by is not self.method:
             self._work, self._made_by = self.method.init(self.stress), self.method
-        return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
+        return wl.solve(
+            self.stress, self.method, stopping=stopping, workspace=cast(Workspace, self._work)
+        )
 
     def _solve(self, window: Window, dt: float) -> Row:
         """Solve for the stresses, and read their velocity; return log values.
@@ -648,9 +657,8 @@ class GranularSimulator:
             from warp_lcp.distributed.balance import Balance
             from warp_lcp.distributed.particle_assembly import part_of
 
-            shown = [
-                key for key in ("surface", "volume") if scene.endless and getattr(scene.output, key)
-            ]
+            outputs = {"surface": scene.output.surface, "volume": scene.output.volume}
+            shown = [key for key, on in outputs.items() if scene.endless and on]
             # Surface and volume would end at sides that ranks do not have.
             refused = [f"output.{key} where an axis is periodic" for key in shown]
             balance = Balance(fixed=STEP_WORK)

@@ -15,9 +15,8 @@ dense sand take part, away from solids that cut cells.
 """
 
 import functools
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -36,7 +35,7 @@ from warp_lcp.granular.yield_set import (
     TENSION,
     WEIGHT,
 )
-from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 
 # Slots of the momentum's state: number of steps; limits for pressure and friction; momenta of this
@@ -58,16 +57,30 @@ PERIOD = 5
 DAMPED = 0.15  # part of the checkerboard that is removed in a step
 HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
 
-MOMENTUM: dict[str, Any] = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S}
+MOMENTUM: dict[str, int] = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S}
 KERNELS = KernelFile(
     Path(__file__).parent / "headers/stress.h", CONSTANTS | MOMENTUM | {"DAMPED": DAMPED}
 )
 
 
+@dataclass(frozen=True)
+class StressKernels:
+    """Kernels of the stress solve; the declarations in the headers explain them."""
+
+    edge_stress: StencilKernel
+    face_velocity: StencilKernel
+    edge_strain: StencilKernel
+    step: StencilKernel
+    traction: StencilKernel
+    admit: StencilKernel
+    damp: StencilKernel
+    wall: StencilKernel
+
+
 @functools.cache
 def stress_passes(
-    dimension: int, real: Any, *, box: bool = False, rate: bool = False, cut: bool = False
-) -> SimpleNamespace:
+    dimension: int, real: type, *, box: bool = False, rate: bool = False, cut: bool = False
+) -> StressKernels:
     """Return the kernels for 2 or 3 dimensions.
 
     Steps have velocities in float32, the natural residual in float64.
@@ -83,15 +96,17 @@ def stress_passes(
         "RESIDUAL": residual,
         "TRIAL": 0,
     }
-    names = ("edge_stress", "face_velocity", "edge_strain", "step", "traction", "admit", "damp")
-    cell_kernels = {
-        name: KERNELS.kernel(
-            f"granular.stress.{name}", module=module, compute=real, constants=words
-        )
-        for name in names
-    }
-    wall = KERNELS.kernel("granular.stress.wall_step", module=module, compute=real, constants=words)
-    return SimpleNamespace(**cell_kernels, wall=wall)
+    kernel = functools.partial(KERNELS.kernel, module=module, compute=real, constants=words)
+    return StressKernels(
+        edge_stress=kernel("granular.stress.edge_stress"),
+        face_velocity=kernel("granular.stress.face_velocity"),
+        edge_strain=kernel("granular.stress.edge_strain"),
+        step=kernel("granular.stress.step"),
+        traction=kernel("granular.stress.traction"),
+        admit=kernel("granular.stress.admit"),
+        damp=kernel("granular.stress.damp"),
+        wall=kernel("granular.stress.wall_step"),
+    )
 
 
 @forward_kernel(module="granular.momentum")

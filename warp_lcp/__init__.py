@@ -6,7 +6,7 @@ Matrix-free methods as NVIDIA Warp kernels.
 import warnings
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from warp_lcp.default import default_method, solve
 from warp_lcp.default_chain import default_chain
@@ -83,7 +83,7 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import the modules of simulations on first access.
 
     Programs that only solve problems do not load them.

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.lcp import LCP
+
+Matrix: TypeAlias = scipy.sparse.sparray | np.ndarray
+"""Sparse or dense matrix on the host, shape (n, n)."""
+
 
 FACTS = frozenset(
     {
@@ -57,10 +62,10 @@ class Problem:
     """
 
     name: str
-    A: Any
+    A: GridPoisson | Matrix
     b: np.ndarray
-    lower: Any
-    upper: Any
+    lower: np.ndarray | AffineBounds
+    upper: np.ndarray | AffineBounds
     solution: np.ndarray | None
     facts: frozenset[str]
 
@@ -71,13 +76,24 @@ class Problem:
             raise ValueError(f"facts holds {unknown}: allowed are {sorted(FACTS)}")
 
     @property
+    def grid(self) -> GridPoisson:
+        """The operator of a problem on a grid.
+
+        Raises:
+            TypeError: the problem has a matrix.
+        """
+        if not isinstance(self.A, GridPoisson):
+            raise TypeError(f"{self.name} has a matrix, not a grid")
+        return self.A
+
+    @property
     def kind(self) -> str:
         """Family of the operator: "grid", "sparse" or "dense"."""
         if isinstance(self.A, GridPoisson):
             return "grid"
         return "sparse" if scipy.sparse.issparse(self.A) else "dense"
 
-    def lcp(self, *, device: Any = None, dtype: Any = wp.float64) -> LCP:
+    def lcp(self, *, device: wp.DeviceLike = None, dtype: type = wp.float64) -> LCP:
         """Return the problem as an LCP for a solver.
 
         The operator of a grid already has its device and type.
@@ -93,7 +109,7 @@ class Problem:
         A = make.get(self.kind, lambda: DenseOperator(self.A, device=device, dtype=dtype))()
         return LCP(A, self.b, _number_or_field(self.lower), _number_or_field(self.upper))
 
-    def energy(self, x: Any) -> float:
+    def energy(self, x: np.ndarray | DeviceArray) -> float:
         """Return the energy x'A x / 2 + b'x in float64.
 
         A solution minimizes it within the bounds if A is symmetric.
@@ -114,6 +130,7 @@ class Problem:
         if not isinstance(self.A, GridPoisson):
             return self
         rows = np.flatnonzero(self.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == FLUID)
+        assert isinstance(self.lower, np.ndarray) and isinstance(self.upper, np.ndarray)
         b, lower, upper = (f.ravel()[rows] for f in (self.b, self.lower, self.upper))
         x = None if self.solution is None else self.solution.ravel()[rows]
         return Problem(
@@ -125,12 +142,13 @@ class Problem:
         if self.kind == "dense":
             return self
         p = self.sparse()
+        assert not isinstance(p.A, GridPoisson | np.ndarray), "a sparse matrix"
         return Problem(
             f"{self.name} as dense", p.A.toarray(), p.b, p.lower, p.upper, p.solution, p.facts
         )
 
 
-def _number_or_field(bound: Any) -> Any:
+def _number_or_field(bound: np.ndarray | AffineBounds) -> float | np.ndarray | AffineBounds:
     """Return a constant bound as a number, for which methods are faster."""
     if isinstance(bound, AffineBounds):
         return bound

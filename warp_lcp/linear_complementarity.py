@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.default import solve, solve_by_attempts
 from warp_lcp.kernels.fields import Array, real_array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.restated import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
@@ -192,7 +193,7 @@ class _Fields:
             raise ValueError(f"{name} has shape {host.shape}: expected {self.given}")
         return host
 
-    def unload(self, field: wp.array[Any], dtype: Any = np.float64) -> np.ndarray:
+    def unload(self, field: DeviceArray, dtype: Any = np.float64) -> np.ndarray:
         """Return a field in b's shape if the sizes agree, else in its own shape."""
         host = np.array(field.numpy(), dtype=dtype)
         return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
@@ -318,7 +319,7 @@ def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
     return lambda found: callback(found.x)
 
 
-def _sides(problem: LCP, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]]:
+def _sides(problem: LCP, x: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
     """Return y = A x + b and the active bound of each unknown.
 
     Both are fields of the operator's shape, 0 in cells without an unknown. The mask is -1 where x

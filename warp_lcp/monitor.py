@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_lcp.problem.result import SolveResult
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from warp_lcp.problem.result import Record
 
 X_AXES = {  # of plot_convergence: the attribute of Record and the axis label
@@ -42,8 +44,8 @@ def plot_convergence(
     *,
     x: str = "iterations",
     relative: bool = True,
-    axes: Any = None,
-) -> Any:
+    axes: Axes | None = None,
+) -> Axes:
     """Plot residuals over iterations or seconds, on a logarithmic axis.
 
     There is one line for each solve.
@@ -88,7 +90,9 @@ def plot_convergence(
     return axes
 
 
-def _labeled(results: Any) -> list[tuple[str, SolveResult]]:
+def _labeled(
+    results: SolveResult | Sequence[SolveResult] | Mapping[str, SolveResult],
+) -> list[tuple[str, SolveResult]]:
     """Return pairs of a label and a result."""
     if isinstance(results, SolveResult):
         results = [results]

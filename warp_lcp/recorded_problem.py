@@ -8,14 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.files.archive import Archive
 from warp_lcp.files.size_limits import check_claim
+from warp_lcp.files.tables import Tables
 from warp_lcp.host_problem import Problem
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
 from warp_lcp.problem.lcp import LCP
 
@@ -77,7 +78,7 @@ class RecordedProblem(Problem):
     absolute_tolerance: float
 
 
-def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
+def arrays(problem: LCP, x0: DeviceArray) -> dict[str, np.ndarray]:
     """Return the arrays of a recorded problem, on the host.
 
     The caller adds `NUMBERS`.
@@ -115,7 +116,7 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
     return saved
 
 
-def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.ndarray:
+def _inner(field: DeviceArray, A: GridPoisson, axis: int | None = None) -> np.ndarray:
     """Return a stored field without its ring.
 
     A field of faces includes the upper faces of the last cells.
@@ -137,7 +138,7 @@ def files(folder: Path) -> list[Path]:
     return [path for _, path in sorted(found)]
 
 
-def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> RecordedProblem:
+def load(path: Path, *, device: wp.DeviceLike = None, dtype: type = wp.float32) -> RecordedProblem:
     """Read a recorded problem.
 
     Args:
@@ -151,7 +152,7 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
     """
     with opened(path) as archive:
         saved = archive.read(sorted(KNOWN & archive.headers.keys()))
-        coefficients: dict[str, Any] = {
+        coefficients: Tables = {
             name: saved[name] for name in ("face_x", "face_y", "face_z", "shift") if name in saved
         }
         A = GridPoisson(saved["cells"], device=device, dtype=dtype, **coefficients)
@@ -159,7 +160,7 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
             np.broadcast_to(saved[name], A.shape).astype(np.float64)
             for name in ("b", "lower", "upper", "x0")
         )
-        numbers: dict[str, Any] = {name: saved[name].item() for name in NUMBERS}
+        numbers: Tables = {name: saved[name].item() for name in NUMBERS}
         facts = {"symmetric", "semidefinite"} | (
             {"mixed"} if np.isneginf(lower[saved["cells"] == FLUID]).any() else set()
         )

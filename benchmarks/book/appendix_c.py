@@ -9,7 +9,6 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, splash
+from warp_lcp.problem.solve import Solver
 
 # The book's methods: monotone searches without fallbacks, no preceding cycles, linear systems
 # solved. Num4LCP's default at kinks, "random", leaves their rows of the Jacobian empty, as "zero"
@@ -36,7 +36,7 @@ APPROXIMATION = replace(FISCHER, kink="approximation", max_linear_iterations=50)
 MINIMUM_MAP = wl.MinimumMapNewton(safeguard=False, monotone_cycles=0, eta=1e-8)
 INTERIOR = wl.InteriorPoint(mehrotra=False, monotone_cycles=0, precision="double")
 PGS, PSOR = wl.ProjectedSOR(omega=1.0), wl.ProjectedSOR(omega=1.4)
-Method = tuple[Any, Merit]
+Method = tuple[Solver, Merit]
 METHODS: dict[str, Method] = {
     "Fischer-Newton": (FISCHER, Merit.FISCHER),
     "minimum map": (MINIMUM_MAP, Merit.MINIMUM),
@@ -117,11 +117,9 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
         planted = "none" if of_kind[0].solution is None else f"{infeasible} of {len(of_kind)}"
         rows.append([kind, planted, f"{worst:.2g}", f"{statistics.fmean(held):.1%}"])
         if kind in COMPARED:
-            i, j = np.nonzero(
-                of_kind[0].A[:60, :60].toarray()
-                if hasattr(of_kind[0].A, "toarray")
-                else of_kind[0].A[:60, :60]
-            )
+            A = of_kind[0].A
+            assert not isinstance(A, wl.GridPoisson)
+            i, j = np.nonzero(A[:60, :60] if isinstance(A, np.ndarray) else A[:60, :60].toarray())
             panels.append(
                 RecordLines(
                     kind,

@@ -6,7 +6,6 @@ The methods are sweep orders of PGS, subspace minimization and NNCG.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import contact_scenes
+from warp_lcp.problem.solve import Solver
 from warp_lcp.rigid.contact_models import BoxedModel, ContactSystem
 
 # Scenes in place of figure 2.3, whose scenes are dense and structured: brick walls.
@@ -30,12 +30,12 @@ ORDERED = ("wall", "box-stack", "leaning-wall", "gear-pyramid")
 ROUNDS = 100  # sweeps shown in figure 2.3
 LEVELS = (1e-3, 1e-6, 1e-10)
 # Method, and the least number of sweeps that one of its steps costs.
-METHODS: dict[str, tuple[Any, int]] = {
+METHODS: dict[str, tuple[Solver, int]] = {
     "PGS": (wl.ProjectedSOR(omega=1.0), 1),
     "NNCG": (wl.NNCG(), 1),
     "PGS-SM": (wl.SubspaceMinimization(precision="double", backtracks=-1), 6),
 }
-ORDERS: dict[str, Callable[[ContactSystem, np.ndarray], Any]] = {
+ORDERS: dict[str, Callable[[ContactSystem, np.ndarray], Solver]] = {
     "PGS": lambda system, height: wl.ProjectedSOR(omega=1.0),
     "impulse": lambda system, height: wl.ProjectedSOR(omega=1.0, order="magnitude"),
     "coordinate": lambda system, height: wl.ProjectedSOR(
@@ -127,7 +127,7 @@ def measure(results: Results, scale: ProblemScale, options: Options) -> None:
     )
 
 
-def _order(problem: wl.LCP, solver: Any, options: Options) -> tuple[list[float], list[float]]:
+def _order(problem: wl.LCP, solver: Solver, options: Options) -> tuple[list[float], list[float]]:
     history = wl.solve(problem, solver, stopping=contacts.unhindered(ROUNDS)).history
     return _curve([(h.iteration, h.residual) for h in history])
 

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,8 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.gallery import Problem
+from warp_lcp.kernels.fields import Array
+from warp_lcp.problem.solve import Solver
 
 RTOL = 1e-6  # relative natural residual at which this library calls a problem solved
 DEEP = 1e-12  # tolerance of the solves, small enough to show the final convergence rate
@@ -97,7 +98,13 @@ class Trace:
 
 
 def follow(
-    problem: Problem, solver: Any, merit: Merit, device: str, *, most: int = 100, x0: Any = None
+    problem: Problem,
+    solver: Solver,
+    merit: Merit,
+    device: str,
+    *,
+    most: int = 100,
+    x0: Array | None = None,
 ) -> Trace:
     """Solve a dense or sparse problem and record the merit of each iterate."""
     lcp = problem.lcp(device=device)
@@ -184,12 +191,12 @@ class BookOutcome:
 def outcome(
     name: str,
     problems: Sequence[Problem],
-    solver: Any,
+    solver: Solver,
     merit: Merit,
     device: str,
     *,
     limits: Limits | None = None,
-    starts: Sequence[Any] | None = None,
+    starts: Sequence[Array] | None = None,
 ) -> BookOutcome:
     """Solve all problems by a method, from x = 0 or the given starts."""
     limits = limits or Limits()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +11,7 @@ import warp as wp
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.gallery import Plant, Problem, contact, planted, poisson
 from warp_lcp.gallery.matrices import banded_matrix, spectrum_matrix
+from warp_lcp.host_problem import Matrix
 
 BLOCK = 6  # unknowns of a contact: normal, four tangents, slip speed
 ZEROS = 0.25  # share of zeros in x in all experiments of Num4LCP
@@ -50,7 +50,7 @@ class ProblemScale:
         return ProblemScale(20 * options.repeat, 10, 30, 100, grids, (10, 20, 40, 80), 5000)
 
 
-def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
+def recipe(A: Matrix, rng: np.random.Generator, name: str) -> Problem:
     """Return the problem that Num4LCP's `make_lcp` makes of a matrix.
 
     Its `solution` is the planted x, uniform in (0, 1) with a quarter set to 0. b is -A x where x >
@@ -63,7 +63,7 @@ def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
     return Problem(name, A, b, np.zeros(len(x)), np.full(len(x), np.inf), x, frozenset())
 
 
-def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
+def complementary(A: Matrix, rng: np.random.Generator, name: str) -> Problem:
     """Return a problem with a complementary solution: b = y - A x.
 
     A quarter of x is 0, with y > 0 there.
@@ -71,7 +71,7 @@ def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
     return planted(A, rng, Plant(active=ZEROS), name=name, facts=frozenset())
 
 
-RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {
+RULES: dict[str, Callable[[Matrix, np.random.Generator, str], Problem]] = {
     "recipe": recipe,
     "planted": complementary,
 }

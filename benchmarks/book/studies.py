@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -32,11 +31,12 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, contact, splash
+from warp_lcp.problem.solve import Solver
 
 STEPS = 10  # steps that figure C.5 times
 # Fewest unknowns for fitted exponents on grids: below, launches cost as much as the work.
 LEAST = 3000
-GRID: dict[str, tuple[Any, int]] = {  # method, most steps
+GRID: dict[str, tuple[Solver, int]] = {  # method, most steps
     "ProjectedMultigrid": (wl.ProjectedMultigrid(), 100),
     "FischerNewton": (wl.FischerNewton(), 100),
     "MinimumMapNewton": (wl.MinimumMapNewton(), 100),
@@ -44,7 +44,7 @@ GRID: dict[str, tuple[Any, int]] = {  # method, most steps
     "PSOR 1.9": (wl.ProjectedSOR(omega=1.9), 400),
     "PGS": (PGS, STEPS),
 }
-DENSE: dict[str, tuple[Any, int]] = {
+DENSE: dict[str, tuple[Solver, int]] = {
     "FischerNewton": (wl.FischerNewton(), 100),
     "MinimumMapNewton": (wl.MinimumMapNewton(), 200),
     "InteriorPoint": (wl.InteriorPoint(), 100),
@@ -132,7 +132,7 @@ def _cost(results: Results, scale: ProblemScale, options: Options) -> None:
     )
 
 
-def _timed(problem: wl.LCP, solver: Any, most: int, repeat: int) -> tuple[wl.SolveResult, float]:
+def _timed(problem: wl.LCP, solver: Solver, most: int, repeat: int) -> tuple[wl.SolveResult, float]:
     """Return a solve and its least time [s]; the first solve only loads kernels."""
     work, stopping = (
         solver.init(problem),
@@ -171,10 +171,11 @@ def _warm(results: Results, scale: ProblemScale, options: Options) -> None:
             wl.solve(p.lcp(device=options.device), PGS, stopping=stopping).x.numpy()
             for p in problems
         ]
-        for method, (solver, merit) in {
+        methods: dict[str, Method] = {
             "Fischer-Newton": (FISCHER, Merit.FISCHER),
             "minimum map": (MINIMUM_MAP, Merit.MINIMUM),
-        }.items():
+        }
+        for method, (solver, merit) in methods.items():
             for start, starts in (("from 0", None), (f"from {SWEPT} sweeps", swept)):
                 name = f"{method} {start}"
                 solves = outcome(
@@ -214,6 +215,7 @@ def solvable(problem: Problem) -> bool:
     If A is positive semi-definite, the LCP then has a solution.
     """
     n = len(problem.b)
+    assert isinstance(problem.A, np.ndarray)
     return bool(
         scipy.optimize.linprog(
             np.zeros(n), A_ub=-problem.A, b_ub=problem.b, bounds=(0, None), method="highs"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
@@ -21,8 +21,9 @@ from warp_lcp.benchmarks.extremes.case import (
     refusal,
     stopped,
 )
-from warp_lcp.benchmarks.extremes.problem import GridProblem, with_solution
+from warp_lcp.benchmarks.extremes.problem import GridFields, GridProblem, with_solution
 from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, chance, given, noise, pool
+from warp_lcp.files.tables import Tables
 
 SHAPE = (40, 44)
 EXACT_OR_FLOOR = Promise(Expected.EITHER, frozenset({"FLOOR"}))
@@ -63,7 +64,7 @@ def scales() -> Iterator[ExtremeCase]:
 
 
 def given_pool(
-    family: str, name: str, more: dict[str, Any] | None = None, **fields: Any
+    family: str, name: str, more: Tables | None = None, **fields: Unpack[GridFields]
 ) -> Iterator[ExtremeCase]:
     """Yield a pool with these fields for both methods.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,6 +12,9 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import Expected, ExtremeCase, Promise, SolveCase
 from warp_lcp.benchmarks.extremes.shapes import grounded, pool
+from warp_lcp.files.tables import TableValue
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.solve import Solver, Workspace
 
 CAUGHT = Promise(Expected.CAUGHT)
 RIGHT = (  # problems that the correct methods solve
@@ -24,14 +26,14 @@ RIGHT = (  # problems that the correct methods solve
 class SignFlipped:
     """Method with the wrong sign of its step: x - dx in place of x + dx."""
 
-    def __init__(self, right: Any) -> None:
+    def __init__(self, right: Solver) -> None:
         self._right = right
 
-    def init(self, problem: wl.LCP) -> Any:
+    def init(self, problem: wl.LCP) -> Workspace:
         """Return the workspace of the correct method."""
         return self._right.init(problem)
 
-    def step(self, problem: wl.LCP, work: Any, x: wp.array[Any]) -> wl.Step:
+    def step(self, problem: wl.LCP, work: Workspace, x: DeviceArray) -> wl.Step:
         """Take the negative of the correct step."""
         before = x.numpy().copy()
         done = self._right.step(problem, work, x)
@@ -40,7 +42,7 @@ class SignFlipped:
         return done
 
 
-def backwards(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
+def backwards(problem: wl.LCP, solver: Solver, **options: TableValue) -> wl.SolveResult:
     """Solve by steps of the wrong sign.
 
     The solve loop recomputes the residual and does not report convergence.
@@ -48,7 +50,7 @@ def backwards(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
     return wl.solve(problem, SignFlipped(solver), **options)
 
 
-def flipped_and_sure(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
+def flipped_and_sure(problem: wl.LCP, solver: Solver, **options: TableValue) -> wl.SolveResult:
     """Return -x with the status and residual of the correct result x.
 
     The result itself shows no fault.
@@ -59,7 +61,9 @@ def flipped_and_sure(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveRe
     )
 
 
-def equations(problem: wl.LCP, solver: Any, *, sign: float, **options: Any) -> wl.SolveResult:
+def equations(
+    problem: wl.LCP, solver: Solver, *, sign: float, **options: TableValue
+) -> wl.SolveResult:
     """Solve y = A x + sign b without bounds.
 
     The result is correct for this problem, not for the given one.
@@ -69,7 +73,12 @@ def equations(problem: wl.LCP, solver: Any, *, sign: float, **options: Any) -> w
 
 
 def sooner(
-    problem: wl.LCP, solver: Any, *, stopping: wl.StoppingCriteria, start: bool, **options: Any
+    problem: wl.LCP,
+    solver: Solver,
+    *,
+    stopping: wl.StoppingCriteria,
+    start: bool,
+    **options: TableValue,
 ) -> wl.SolveResult:
     """Return an unconverged iterate and call it converged.
 

@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from enum import Enum
 from types import FrameType
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.problem import Problem
+from warp_lcp.files.tables import Tables, TableView
 
 PRECISIONS = ("single", "mixed", "double")
 RTOL = {"single": 1e-3, "mixed": 1e-8, "double": 1e-8}
@@ -87,7 +87,7 @@ class ExtremeAttempt:
     # Faults that do not depend on the expected outcome.
     faults: list[str] = field(default_factory=list)
     met: bool = False  # whether the independent residual meets the tolerance
-    facts: dict[str, Any] = field(default_factory=dict)  # further entries of the record
+    facts: Tables = field(default_factory=dict)  # further entries of the record
     # CPU time [s] including the judgement; infinite on a GPU.
     processor: float = math.inf
 
@@ -181,7 +181,7 @@ class SolveCase(ExtremeCase):
     _: KW_ONLY
     precisions: tuple[str, ...] = ()
     # Criteria in addition to rtol and max_iterations, or in their place.
-    stopping: Mapping[str, Any] = field(default_factory=dict)
+    stopping: TableView = field(default_factory=dict)
     x0: np.ndarray | None = None  # initial guess
     # Replaces `wl.solve` in tests of the checks.
     solve: Callable[..., wl.SolveResult] = wl.solve
@@ -194,7 +194,7 @@ class SolveCase(ExtremeCase):
 
     def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Solve and compare the reported with the independent residual."""
-        criteria: dict[str, Any] = {
+        criteria: Tables = {
             "rtol": RTOL[precision],
             "max_iterations": MAX_ITERATIONS,
             **self.stopping,
@@ -210,11 +210,7 @@ class SolveCase(ExtremeCase):
 
 
 def checked(
-    problem: Problem,
-    result: wl.SolveResult,
-    criteria: Mapping[str, Any],
-    seconds: float,
-    precision: str,
+    problem: Problem, result: wl.SolveResult, criteria: TableView, seconds: float, precision: str
 ) -> ExtremeAttempt:
     """Return the attempt of a result, with all faults that NumPy finds."""
     exact, x = problem.exact(), problem.unknowns(result.x.numpy())

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from warp_lcp.benchmarks.extremes.case import EITHER, SOLVED, ExtremeCase
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of
 from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full, given, noise, pool
+from warp_lcp.files.tables import Tables
 
 SHAPES = ((48, 53), (17, 18, 19))
 Y, X = np.indices((48, 50))
@@ -26,7 +26,7 @@ LARGEST_CONTRAST = 1e4
 LIGHTEST = 1e6
 
 
-def may_stop(value: float, largest: float) -> dict[str, Any]:
+def may_stop(value: float, largest: float) -> Tables:
     """Return the promise for a ratio whose documented limit is `largest`."""
     return {"promises": SINGLE_MAY_STOP if value <= largest else MIXED_MAY_STOP, "stopping": ROUGH}
 

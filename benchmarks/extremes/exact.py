@@ -11,14 +11,14 @@ and columns. Norms are scaled by their largest entry, so that squares neither ov
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 from scipy.optimize import linear_sum_assignment
+
+from warp_lcp.files.tables import TableView
 
 AIR, FLUID, SOLID = 0, 1, 2
 AXES = "xyz"
@@ -28,7 +28,7 @@ AXES = "xyz"
 class Exact:
     """Equations of the unknowns alone, in float64."""
 
-    matrix: Any  # sparse, shape (n, n)
+    matrix: scipy.sparse.csr_array  # shape (n, n)
     b: np.ndarray  # shape (n,), units of y
     lower: np.ndarray  # shape (n,)
     upper: np.ndarray  # shape (n,)
@@ -78,7 +78,7 @@ class Exact:
         return norm(size)
 
 
-def equilibrated_scale(matrix: Any) -> np.ndarray:
+def equilibrated_scale(matrix: scipy.sparse.sparray) -> np.ndarray:
     """Return the scale d of a matrix's natural residual.
 
     The cost of an entry is log(sqrt(|a_ii a_jj|) / |a_ij|). The cost of the diagonal is 0, and a
@@ -130,8 +130,8 @@ def norm(values: np.ndarray) -> float:
 
 def stencil(
     cells: np.ndarray,
-    faces: Mapping[str, Any],
-    shift: Any = None,
+    faces: TableView,
+    shift: float | np.ndarray | None = None,
     periodic: tuple[bool, ...] = (False, False, False),
 ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Return the matrix of the FLUID cells, and which cells these are, flat.

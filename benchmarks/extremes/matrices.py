@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -109,7 +108,7 @@ def cycling() -> Iterator[ExtremeCase]:
     The Newton method is that of the minimum map.
     """
     case = partial(given, "P-matrices")
-    robust: Any = (*NEWTON, "fischer-newton", *LEMKE)
+    robust = (*NEWTON, "fischer-newton", *LEMKE)
     for n in (3, 4, 5, 6, 7, 9, 12, 30):
         yield from case(f"cyclic, {n} unknowns", partial(circulant, n), robust)
         for start, every in (("first", n), ("alternating", 2)):

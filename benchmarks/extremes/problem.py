@@ -5,9 +5,9 @@ Both the library's problem and the independent residual are made from the same a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import scipy.sparse
@@ -17,11 +17,26 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.exact import Exact, stencil
+from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.host_problem import Matrix
 
 BALANCED = 1e-10  # share of sum |b|: a sum of b below it is 0 up to rounding
 # Share of the mean |b| that is added to a pool's b if its sum has the sign that no bound can
 # balance.
 GENTLY = 0.01
+
+
+class GridFields(TypedDict, total=False):
+    """Arguments of `GridProblem` besides its cells."""
+
+    b: np.ndarray
+    lower: float | np.ndarray
+    upper: float | np.ndarray
+    faces: TableView
+    shift: float | np.ndarray | None
+    periodic: tuple[bool, ...]
+    columns: np.ndarray | None
+    weights: np.ndarray | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,20 +45,20 @@ class GridProblem:
 
     cells: np.ndarray  # AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx)
     b: np.ndarray  # field of the shape of `cells`
-    lower: Any = 0.0  # number or field
-    upper: Any = np.inf  # number or field
-    faces: Mapping[str, Any] = field(default_factory=dict)  # `face_x` and so on, numbers or arrays
-    shift: Any = None  # None, number or field
+    lower: float | np.ndarray = 0.0  # number or field
+    upper: float | np.ndarray = np.inf  # number or field
+    faces: TableView = field(default_factory=dict)  # `face_x` and so on, numbers or arrays
+    shift: float | np.ndarray | None = None  # None, number or field
     periodic: tuple[bool, ...] = (False, False, False)  # whether x, y, z wrap around
     columns: np.ndarray | None = None  # U, shape of `cells` and (k,); none if None
     weights: np.ndarray | None = None  # W, shape (k, k)
 
-    def lcp(self, device: str, storage: Any) -> wl.LCP:
+    def lcp(self, device: str, storage: type) -> wl.LCP:
         """Return the problem for the library.
 
         `storage` is the type of coefficients, wp.float32 or wp.float64.
         """
-        A: Any = wl.GridPoisson(
+        A: wl.GridPoisson | wl.SumOperator = wl.GridPoisson(
             self.cells,
             shift=self.shift,
             periodic=self.periodic,
@@ -73,7 +88,7 @@ class GridProblem:
         """Return the unknowns of a field x, shape (n,), float64."""
         return x.astype(np.float64).ravel()[self.cells.ravel() == wl.FLUID]
 
-    def rounded(self, storage: Any) -> bool:
+    def rounded(self, storage: type) -> bool:
         """Return whether `storage` rounds the coefficients: arrays or unequal numbers."""
         faces = [self.faces.get(f"face_{axis}", 1.0) for axis in "xyz"[: self.cells.ndim]]
         uneven = (
@@ -88,18 +103,21 @@ class GridProblem:
 class MatrixProblem:
     """Dense or sparse matrix problem with bounds."""
 
-    matrix: Any
+    matrix: Matrix
     b: np.ndarray
-    lower: Any = 0.0
-    upper: Any = np.inf
+    lower: float | np.ndarray = 0.0
+    upper: float | np.ndarray = np.inf
 
     @staticmethod
     def of(problem: gallery.Problem | Exact) -> MatrixProblem:
         """Return a problem of the gallery; one on a grid as GridProblem."""
         matrix = problem.matrix if isinstance(problem, Exact) else problem.A
-        return MatrixProblem(matrix=matrix, b=problem.b, lower=problem.lower, upper=problem.upper)
+        lower, upper = problem.lower, problem.upper
+        assert not isinstance(matrix, wl.GridPoisson)
+        assert isinstance(lower, np.ndarray) and isinstance(upper, np.ndarray)
+        return MatrixProblem(matrix=matrix, b=problem.b, lower=lower, upper=upper)
 
-    def lcp(self, device: str, storage: Any) -> wl.LCP:
+    def lcp(self, device: str, storage: type) -> wl.LCP:
         """Return the problem for the library."""
         kind = wl.SparseOperator if scipy.sparse.issparse(self.matrix) else wl.DenseOperator
         return wl.LCP(
@@ -122,7 +140,7 @@ class MatrixProblem:
         """Return x."""
         return x.astype(np.float64).ravel()
 
-    def rounded(self, storage: Any) -> bool:
+    def rounded(self, storage: type) -> bool:
         """Return whether entries are rounded."""
         return storage is wp.float32
 
@@ -130,7 +148,7 @@ class MatrixProblem:
 Problem = GridProblem | MatrixProblem
 
 
-def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Any]) -> dict[str, Any]:
+def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], np.ndarray]) -> Tables:
     """Return arrays of face coefficients; `value` maps an array's shape to its values."""
     axes = list(zip("xyz", range(len(shape))[::-1], strict=False))
     return {

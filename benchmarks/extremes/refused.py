@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -15,6 +14,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import ExtremeCase, RefusalCase
+from warp_lcp.files.tables import TableValue
 
 SHAPE = (4, 5)
 CELLS = np.array([[1] * 5] * 3 + [[0] * 5])
@@ -42,19 +42,19 @@ def spoiled(shape: tuple[int, ...], value: float) -> np.ndarray:
     return field
 
 
-def grid(device: str, **options: Any) -> wl.GridPoisson:
+def grid(device: str, **options: TableValue) -> wl.GridPoisson:
     """Return a small grid."""
     return wl.GridPoisson(CELLS, device=device, **options)
 
 
-def run(device: str, p: str, **options: Any) -> wl.SolveResult:
+def run(device: str, p: str, **options: TableValue) -> wl.SolveResult:
     """Solve a small problem."""
     fields = {key: options.pop(key) for key in ("b", "lower", "upper") if key in options}
     problem = wl.LCP(grid(device), **({"b": np.ones(SHAPE)} | fields))
     return wl.solve(problem, wl.ProjectedMultigrid(precision=p), **options)
 
 
-def low_rank(device: str, columns: Any, weights: Any) -> wl.SumOperator:
+def low_rank(device: str, columns: np.ndarray, weights: np.ndarray) -> wl.SumOperator:
     """Return a grid with a low-rank term."""
     return wl.SumOperator(grid(device), wl.LowRankOperator(columns, weights, device=device))
 

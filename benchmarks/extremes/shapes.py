@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from warp_lcp.benchmarks.extremes.case import (
     RefusalCase,
     SolveCase,
 )
-from warp_lcp.benchmarks.extremes.problem import GridProblem, solvable
+from warp_lcp.benchmarks.extremes.problem import GridFields, GridProblem, Problem, solvable
+from warp_lcp.files.tables import TableValue
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SEED = 7919
@@ -26,7 +27,11 @@ LARGE_BUDGET = 60.0  # seconds for 10^6 unknowns
 
 
 def given(
-    family: str, name: str, make: Callable[[], Any], methods: tuple[str, ...] = METHODS, **more: Any
+    family: str,
+    name: str,
+    make: Callable[[], Problem],
+    methods: tuple[str, ...] = METHODS,
+    **more: TableValue,
 ) -> Iterator[ExtremeCase]:
     """Yield the case for each method.
 
@@ -49,12 +54,12 @@ def noise(shape: tuple[int, ...], number: int = 0) -> np.ndarray:
     return b - b.mean()
 
 
-def full(shape: tuple[int, ...], **more: Any) -> GridProblem:
+def full(shape: tuple[int, ...], **more: Unpack[GridFields]) -> GridProblem:
     """Return a closed box of liquid, with p >= 0."""
     return GridProblem(cells=np.full(shape, FLUID), **({"b": noise(shape)} | more))
 
 
-def pool(shape: tuple[int, ...], **more: Any) -> GridProblem:
+def pool(shape: tuple[int, ...], **more: Unpack[GridFields]) -> GridProblem:
     """Return a pool with AIR as its topmost layer along y.
 
     On a random half of the cells p >= 0; the others have no bound.
@@ -171,7 +176,7 @@ def checkerboard(shape: tuple[int, ...], other: int) -> GridProblem:
     return GridProblem(cells=np.where(odd, FLUID, other), b=np.abs(b) if other == SOLID else b)
 
 
-def labyrinth(n: int, **more: Any) -> GridProblem:
+def labyrinth(n: int, **more: TableValue) -> GridProblem:
     """Return one winding channel of liquid, a cell wide, open to air at its end."""
     cells = np.full((n, n), FLUID)
     cells[1::2] = SOLID

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import EllipsisType
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warp_lcp.benchmarks.extremes.case import (
     PRECISIONS,
@@ -24,6 +25,7 @@ from warp_lcp.benchmarks.extremes.case import (
     stopped,
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.files.tables import Tables, TableValue, TableView
 from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.granular import SIMULATOR as GRANULAR
@@ -160,25 +162,23 @@ liquid, sand = (
 )
 
 
-def box(low: Sequence[float], high: Sequence[float], **more: Any) -> dict[str, Any]:
+def box(low: Sequence[float], high: Sequence[float], **more: object) -> Tables:
     """Return the scene table of a box."""
     return {"shape": "box", "min": low, "max": high, **more}
 
 
-def made(kind: ExtremeMaterial, **tables: Any) -> Callable[[str, str], ParticleSimulation]:
+def made(kind: ExtremeMaterial, **tables: TableValue) -> Callable[[str, str], ParticleSimulation]:
     """Return a function that makes a small column.
 
     The scene's tables may be overridden. `velocity` is that of the column.
     """
 
     def make(precision: str, device: str) -> ParticleSimulation:
-        usual: dict[str, Any] = {
+        usual: Tables = {
             "time": {"duration": 10.0, "dt_max": 10.0, "dt_min": 1e-12},
             "domain": {"size": [1.0, 0.5], "resolution": 16},
         }
-        data: dict[str, Any] = {
-            name: values | tables.get(name, {}) for name, values in usual.items()
-        }
+        data: Tables = {name: values | tables.get(name, {}) for name, values in usual.items()}
         data["scene"] = {"simulator": kind.simulator.name}
         data[kind.name] = [
             box([0.0, 0.0], [0.375, 0.375], velocity=tables.get("velocity", [0.0, 0.0]))
@@ -208,8 +208,8 @@ def steps_and_forces() -> Iterator[ExtremeCase]:
             name: str,
             kind: ExtremeMaterial = kind,
             *,
-            tables: Mapping[str, Any] | None = None,
-            **more: Any,
+            tables: TableView | None = None,
+            **more: TableValue,
         ) -> RunCase:
             return RunCase(
                 kind.name, name, made(kind, **(tables or {})), precisions=kind.precisions, **more
@@ -257,7 +257,7 @@ def steps_and_forces() -> Iterator[ExtremeCase]:
         )
 
 
-def gravity(*components: float) -> dict[str, Any]:
+def gravity(*components: float) -> Tables:
     """Return the scene tables of a gravity [m/s^2]."""
     return {"physics": {"gravity": list(components)}}
 
@@ -370,7 +370,10 @@ def particles_anywhere() -> Iterator[ExtremeCase]:
     )
 
 
-def put(field: str, at: Any, value: Any) -> Callable[[ParticleSimulation], None]:
+Place = slice | EllipsisType | np.ndarray | tuple[int | slice, ...]  # of an array
+
+
+def put(field: str, at: Place, value: ArrayLike) -> Callable[[ParticleSimulation], None]:
     """Return a function that overwrites some positions or velocities of particles."""
 
     def change(simulation: ParticleSimulation) -> None:

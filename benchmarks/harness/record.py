@@ -6,9 +6,9 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.files.tables import Tables
 
 SOURCE = "source digest"  # fact of the machine's record: the version of the measured code
 MACHINE = "machine"  # name of the record of the machine and the date
@@ -20,7 +20,7 @@ class BenchmarkRecord:
 
     name: str  # unique in its file and stable across versions, so that results can be compared
     figures: dict[str, Figure] = field(default_factory=dict)  # by name
-    facts: dict[str, Any] = field(default_factory=dict)  # entries that are no numbers
+    facts: Tables = field(default_factory=dict)  # entries that are no numbers
 
     def value(self, figure: str) -> float | None:
         """Return a figure's value; None if there is no such figure."""

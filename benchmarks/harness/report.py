@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from warp_lcp.benchmarks.harness.machine import present
 from warp_lcp.benchmarks.harness.record import (
@@ -22,9 +22,11 @@ from warp_lcp.benchmarks.harness.record import (
     Results,
     write_json,
 )
+from warp_lcp.files.tables import Tables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
 
 COLOR, LIMIT = "#3a6ea5", "#b3432b"
 SHADES = 64  # colors of a picture
@@ -77,7 +79,7 @@ def _row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return (
         ", ".join(f"{k} {v}" for k, v in value.items())
         if isinstance(value, Mapping)
@@ -94,7 +96,7 @@ def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
 
     images = []
     for chart in charts:
-        canvas: Any = Canvas(dpi=90, layout="constrained")
+        canvas = Canvas(dpi=90, layout="constrained")
         if isinstance(chart, Panels):
             _panels(canvas, chart)
         elif isinstance(chart, Bars):
@@ -132,11 +134,11 @@ def _bars(axes: Axes, chart: Bars) -> None:
     axes.margins(y=0.01)
 
 
-def _panels(canvas: Any, chart: Panels) -> None:
+def _panels(canvas: Canvas, chart: Panels) -> None:
     rows = -(-len(chart.panels) // chart.columns)
     canvas.set_size_inches(PANEL[0] * chart.columns, PANEL[1] * rows + 0.6)
     names = list(dict.fromkeys(label for panel in chart.panels for label in panel.curves))
-    shown: dict[str, Any] = {}
+    shown: Tables = {}
     for axes, panel in zip(
         canvas.subplots(rows, chart.columns, squeeze=False).ravel(), chart.panels, strict=False
     ):
@@ -175,7 +177,7 @@ def _lines(axes: Axes, chart: RecordLines, names: Sequence[str] = ()) -> None:
             )
             continue
         # Earlier curves are wider, so that coinciding curves are all visible.
-        color: Any = (
+        color: Tables = (
             {"color": f"C{place % 10}", "linewidth": 3 - 2 * place / len(names)} if names else {}
         )
         marker = "." if len(x) < (2 if names else MARKERS) else ""

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
 from unittest.mock import patch
 
 import warp as wp
@@ -147,8 +146,8 @@ def timed(
     """
     seconds: dict[str, list[float]] = defaultdict(list)
 
-    def watch(label: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **options: Any) -> Any:
+    def watch(label: str, function: Callable[..., object]) -> Callable[..., object]:
+        def call(*args: object, **options: object) -> object:
             wp.synchronize_device(device)
             begun = time.perf_counter()
             try:

@@ -18,7 +18,8 @@ import warnings
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+
+from warp_lcp.files.tables import Tables
 
 LIMIT = 60.0  # [s] limit of CPU time for a solve without max_seconds
 GRACE = 15.0  # [s] from the limit until the worker is ended
@@ -116,7 +117,7 @@ def _work(kind: str, seed: int, indices: range) -> None:
         )
 
 
-def _write(record: dict[str, Any]) -> None:
+def _write(record: Tables) -> None:
     sys.stdout.write("@" + json.dumps(record) + "\n")
     sys.stdout.flush()
 
@@ -192,7 +193,7 @@ def supervise(kind: str, seed: int, count: int) -> list[HostileOutcome]:
     return outcomes
 
 
-def _late(record: dict[str, Any]) -> list[list[str]]:
+def _late(record: Tables) -> list[list[str]]:
     late = (
         [["TIMEOUT", f"{record['seconds']:.0f} s, {record['status']}"]]
         if record["seconds"] > LIMIT

@@ -8,14 +8,21 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.io
 import scipy.sparse
+from scipy.sparse.linalg import LinearOperator
 
 import warp_lcp as wl
+from warp_lcp.files.tables import TableValue
+from warp_lcp.host_problem import Matrix
+from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.protocol import families
+
+if TYPE_CHECKING:
+    import qpsolvers
 
 Bounds = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 CONVERGED, INFEASIBLE, REFUSED, EXCEPTION = "CONVERGED", "INFEASIBLE", "REFUSED", "EXCEPTION"
@@ -68,7 +75,7 @@ class HostileBox:
         largest: a bound on |x| beyond which an answer is suspicious.
     """
 
-    A: Any
+    A: Matrix
     b: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
@@ -99,8 +106,8 @@ class HostileProgram:
         unique: whether x is the only solution.
     """
 
-    scaled: Any
-    plain: Any
+    scaled: qpsolvers.Problem
+    plain: qpsolvers.Problem
     expected: str
     unique: bool
 
@@ -140,17 +147,21 @@ class HostileCase:
     method: str | None = None
 
 
+Made = wl.Operator | wl.SparseOperator | Matrix | LinearOperator  # what the library accepts as A
+Side = float | np.ndarray | AffineBounds  # bounds in the form for the library
+
+
 def box_case(
     rng: np.random.Generator,
     name: str,
     box: HostileBox,
     *,
-    operator: Callable[[], Any] | None = None,
+    operator: Callable[[], Made] | None = None,
     shape: tuple[int, ...] | None = None,
     unknowns: np.ndarray | None = None,
     named: tuple[str, ...] = NAMED,
     share: float = 0.4,
-    bounds: tuple[Any, Any] | None = None,
+    bounds: tuple[Side, Side] | None = None,
     entries: bool = True,
     x0: np.ndarray | None = None,
 ) -> HostileCase:
@@ -178,8 +189,10 @@ def box_case(
             rng.choice(["solve", "linear_complementarity", "command line"], p=[0.86, 0.125, 0.015])
         )
 
-    def field_of(values: Any) -> Any:
-        if shape is None or unknowns is None or np.ndim(values) == 0:
+    def field_of(values: Side) -> Side:
+        if isinstance(values, AffineBounds) or shape is None or unknowns is None:
+            return values
+        if np.ndim(values) == 0:
             return values
         full = np.zeros(int(np.prod(shape)))
         full[unknowns] = values
@@ -214,7 +227,12 @@ def box_case(
 
 
 def command_line(
-    A: Any, b: np.ndarray, lower: Any, upper: Any, rtol: float, method: str | None
+    A: TableValue,
+    b: np.ndarray,
+    lower: TableValue,
+    upper: TableValue,
+    rtol: float,
+    method: str | None,
 ) -> HostileAnswer:
     """Solve by `warp-lcp solve` from Matrix Market files."""
     with tempfile.TemporaryDirectory() as name:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+
+from warp_lcp.host_problem import Matrix
 
 Array = np.ndarray
 AIR, FLUID, SOLID = 0, 1, 2
@@ -57,7 +59,7 @@ def plane_laplacian(
     return graph_laplacian(index.size, tails, heads, 10 ** rng.uniform(-spread, spread, len(tails)))
 
 
-def definite(rng: np.random.Generator, n: int) -> tuple[str, Any]:
+def definite(rng: np.random.Generator, n: int) -> tuple[str, Matrix]:
     """Return an SPD matrix of condition number up to 1e4, dense or sparse."""
     kind = str(rng.choice(["dense", "chain", "plane", "graph"]))
     if kind == "dense" or n < 4:
@@ -78,7 +80,7 @@ def definite(rng: np.random.Generator, n: int) -> tuple[str, Any]:
     return "graph", (A + 0.1 * sp.eye_array(n)).tocsr()
 
 
-def positive(rng: np.random.Generator, n: int) -> tuple[str, Any]:
+def positive(rng: np.random.Generator, n: int) -> tuple[str, Matrix]:
     """Return an unsymmetric P-matrix: definite plus skew, or a dominant M-matrix."""
     if rng.random() < 0.5:
         B, C = rng.standard_normal((2, n, n)) / n**0.5
@@ -115,7 +117,7 @@ def bounds(rng: np.random.Generator, n: int, kind: str | None = None) -> tuple[s
 
 
 def plant(
-    rng: np.random.Generator, A: Any, low: Array, high: Array, spread: float = 1.0
+    rng: np.random.Generator, A: Matrix, low: Array, high: Array, spread: float = 1.0
 ) -> tuple[Array, Array]:
     """Return x and b of a problem that x solves.
 
@@ -139,7 +141,7 @@ def plant(
     return x, y - A @ x
 
 
-def scaled(A: Any, rows: Array, columns: Array) -> Any:
+def scaled(A: Matrix, rows: Array, columns: Array) -> Matrix:
     """Return diag(rows) A diag(columns), dense or sparse as A is."""
     if sp.issparse(A):
         return (sp.diags_array(rows) @ A @ sp.diags_array(columns)).tocsr()
@@ -148,8 +150,8 @@ def scaled(A: Any, rows: Array, columns: Array) -> Any:
 
 def stencil_matrix(
     cells: Array,
-    coefficients: dict[tuple[int, ...], Any],
-    shift: Any,
+    coefficients: Mapping[tuple[int, ...], Array | float],
+    shift: float | Array | None,
     periodic: tuple[bool, ...],
     outside: int,
 ) -> sp.csr_array:
@@ -166,7 +168,7 @@ def stencil_matrix(
             entries.append((i, i, float(np.broadcast_to(shift, cells.shape)[cell])))
         for offset, a in coefficients.items():
             value, neighbor_cell = (
-                float(a[cell] if np.ndim(a) else a),
+                float(a[cell] if isinstance(a, np.ndarray) and a.ndim else a),
                 neighbor(cell, offset, cells.shape, periodic),
             )
             kind = outside if neighbor_cell is None else cells[neighbor_cell]
@@ -181,7 +183,7 @@ def stencil_matrix(
 
 def boundary_term(
     cells: Array,
-    coefficients: dict[tuple[int, ...], Any],
+    coefficients: Mapping[tuple[int, ...], Array | float],
     values: Array,
     periodic: tuple[bool, ...],
     outside: int,
@@ -202,12 +204,14 @@ def boundary_term(
                     (k % n if wrap else k) + 1
                     for k, n, wrap in zip(reached, cells.shape, wraps, strict=True)
                 )
-                total[cell] += float(a[cell] if np.ndim(a) else a) * values[at]
+                total[cell] += (
+                    float(a[cell] if isinstance(a, np.ndarray) and a.ndim else a) * values[at]
+                )
     return total
 
 
 def neighbor(
-    cell: Any, offset: tuple[int, ...], shape: tuple[int, ...], periodic: tuple[bool, ...]
+    cell: Sequence[int], offset: tuple[int, ...], shape: tuple[int, ...], periodic: tuple[bool, ...]
 ) -> tuple[int, ...] | None:
     """Return cell + offset, wrapped on periodic axes (given as x, y, z); None outside."""
     indices = []

@@ -5,7 +5,7 @@ Stencils and grids are beside SOLID, AIR and periodic sides.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -23,6 +23,8 @@ from warp_lcp.benchmarks.hostile.case import (
 )
 
 Rng = np.random.Generator
+# Of a stencil, by offset; a float is the same in all cells.
+Coefficients = dict[tuple[int, ...], np.ndarray | float]
 
 
 def _cells(rng: Rng, most: int = 14, solid: float = 0.2) -> np.ndarray:
@@ -43,15 +45,23 @@ def _cells(rng: Rng, most: int = 14, solid: float = 0.2) -> np.ndarray:
 
 
 def _coefficients(
-    rng: Rng, cells: np.ndarray, *, symmetric: bool, spread: float, margin: float, periodic: Any
-) -> dict[Any, Any]:
+    rng: Rng,
+    cells: np.ndarray,
+    *,
+    symmetric: bool,
+    spread: float,
+    margin: float,
+    periodic: tuple[bool, ...],
+) -> Coefficients:
     """Return coefficients a_o <= 0 by offset, as arrays.
 
     The center makes every row dominant by `margin`, whatever its neighbors are. If symmetric,
     a_o(i) = a_-o(i + o) between cells; the coefficient of a closed or outer side is independent.
     """
     names = draw.offsets(cells.ndim, axes=bool(rng.random() < 0.4))
-    a: dict[Any, Any] = {o: -(10 ** rng.uniform(-spread, 0, cells.shape)) for o in names}
+    a: dict[tuple[int, ...], np.ndarray] = {
+        o: -(10 ** rng.uniform(-spread, 0, cells.shape)) for o in names
+    }
     if symmetric:
         for o in names:
             if o > tuple(-k for k in o):
@@ -59,11 +69,11 @@ def _coefficients(
                     there = draw.neighbor(cell, o, cells.shape, periodic)
                     if there is not None and cells[cell] == cells[there] == draw.FLUID:
                         a[tuple(-k for k in o)][there] = a[o][cell]
-    center = sum(-values for values in a.values()) if a else np.ones(cells.shape)
+    center = np.add.reduce([-values for values in a.values()]) if a else np.ones(cells.shape)
     # A closed side adds a_o < 0 to the diagonal. So the row's sum is that of the center and all
     # sides.
     a[(0,) * cells.ndim] = center * (1 + margin)
-    return a
+    return {**a}
 
 
 def solid(rng: Rng) -> HostileCase:
@@ -95,7 +105,7 @@ def solid(rng: Rng) -> HostileCase:
     )
     matrix = draw.stencil_matrix(cells, a, shift, periodic, outside)
 
-    def operator() -> Any:
+    def operator() -> wl.Stencil:
         return wl.Stencil(
             cells,
             a,
@@ -179,7 +189,7 @@ def periodic(rng: Rng) -> HostileCase:
         )
         cells, sides = np.ones(shape, int), (False, False, False)
         spread = rng.uniform(1, 6)
-        a = _coefficients(
+        a: Coefficients = _coefficients(
             rng,
             cells,
             symmetric=False,
@@ -243,11 +253,17 @@ def periodic(rng: Rng) -> HostileCase:
 
 
 def _stencil_case(
-    rng: Rng, name: str, box: HostileBox, cells: np.ndarray, a: Any, sides: Any, outside: int
+    rng: Rng,
+    name: str,
+    box: HostileBox,
+    cells: np.ndarray,
+    a: Coefficients,
+    sides: tuple[bool, ...],
+    outside: int,
 ) -> HostileCase:
     """Return a case whose cells are all FLUID."""
 
-    def operator() -> Any:
+    def operator() -> wl.Operator:
         return _stencil(cells, a, sides, outside)
 
     every = np.arange(cells.size)
@@ -263,7 +279,9 @@ def _stencil_case(
     )
 
 
-def _stencil(cells: Any, a: Any, sides: Any, outside: int) -> Any:
+def _stencil(
+    cells: np.ndarray, a: Coefficients, sides: tuple[bool, ...], outside: int
+) -> wl.Stencil:
     return wl.Stencil(cells, a, periodic=sides, outside=outside, device="cpu", dtype=wp.float64)
 
 
@@ -313,7 +331,7 @@ def _faces(rng: Rng) -> HostileCase:
         storage=storage,
     )
 
-    def operator() -> Any:
+    def operator() -> wl.Operator:
         return wl.GridPoisson(
             cells, face_x=fx, face_y=fy, device="cpu", **({"dtype": wp.float64} if double else {})
         )
@@ -339,12 +357,12 @@ def gradients(rng: Rng) -> HostileCase:
             rng, cells, symmetric=bool(rng.random() < 0.4), spread=1.0, margin=0.3, periodic=sides
         )
         F = np.flatnonzero(cells.ravel() == draw.FLUID)
-        A: Any = draw.stencil_matrix(cells, a, None, sides, outside)[F][:, F].tocsr()
+        A = draw.stencil_matrix(cells, a, None, sides, outside)[F][:, F].tocsr()
     else:
         A = draw.positive(rng, draw.size(rng, 1, 60))[1]
         A = (
             A.toarray()
-            if kind == "dense" and sp.issparse(A)
+            if kind == "dense" and not isinstance(A, np.ndarray)
             else sp.csr_array(A)
             if kind == "sparse"
             else A
@@ -376,7 +394,7 @@ def gradients(rng: Rng) -> HostileCase:
         expected |= _by_offset(cells, a, F, mu, x, outside)
     condition = np.linalg.cond(D[np.ix_(free, free)]) if free.any() else 1.0
 
-    def field_of(values: Any) -> Any:
+    def field_of(values: np.ndarray) -> np.ndarray:
         full = np.zeros(cells.size)
         full[F] = values
         return full.reshape(cells.shape)
@@ -398,15 +416,19 @@ def gradients(rng: Rng) -> HostileCase:
         except ArithmeticError as error:
             return HostileAnswer("NO GRADIENT", None, str(error)[:100])
         values = {
-            name: getattr(gradient, name).numpy().ravel()[F] for name in ("b", "lower", "upper")
+            name: cast(wp.array, field).numpy().ravel()[F]
+            for name, field in (
+                ("b", gradient.b),
+                ("lower", gradient.lower),
+                ("upper", gradient.upper),
+            )
         }
         if kind == "dense":
-            values["matrix"] = gradient.coefficients["matrix"].numpy().ravel()
+            matrix = cast(wp.array, gradient.coefficients["matrix"])
+            values["matrix"] = matrix.numpy().ravel()
         if kind == "stencil":
-            values |= {
-                f"coefficient {o}": v.numpy().ravel()[F]
-                for o, v in gradient.coefficients["coefficients"].items()
-            }
+            by_offset = cast(dict[tuple[int, ...], wp.array], gradient.coefficients["coefficients"])
+            values |= {f"coefficient {o}": v.numpy().ravel()[F] for o, v in by_offset.items()}
         return HostileAnswer("CONVERGED", result.x.numpy().ravel()[F], "", values)
 
     name = f"gradients of a {kind} problem, n={n}, {free.sum()} free, {bound} bounds"
@@ -414,7 +436,7 @@ def gradients(rng: Rng) -> HostileCase:
 
 
 def _by_offset(
-    cells: np.ndarray, a: Any, F: np.ndarray, mu: np.ndarray, x: np.ndarray, outside: int
+    cells: np.ndarray, a: Coefficients, F: np.ndarray, mu: np.ndarray, x: np.ndarray, outside: int
 ) -> dict[str, np.ndarray]:
     """Return mu_i x_(i + o), or mu_i x_i where that neighbor is SOLID."""
     fields = np.zeros((2, cells.size))

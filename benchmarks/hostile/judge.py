@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,6 +25,9 @@ from warp_lcp.benchmarks.hostile.case import (
     Refusal,
     Values,
 )
+
+if TYPE_CHECKING:
+    import qpsolvers
 
 EPS = np.finfo(np.float64).eps
 HIDDEN = 1e-3  # a row violated by more than this share of its terms counts as hidden
@@ -180,7 +183,7 @@ def _far(box: HostileBox, x: np.ndarray, d: np.ndarray) -> str:
         return f"|x| reaches {np.abs(x).max():.1e}, a solution has {box.largest:.1e} at most"
     if not box.unique or box.solution is None or len(x) > 400:
         return ""
-    A = box.A.toarray() if sp.issparse(box.A) else box.A
+    A = box.A if isinstance(box.A, np.ndarray) else box.A.toarray()
     root = np.sqrt(d)
     condition = float(np.linalg.cond(A / root[:, None] / root))
     error = float(np.linalg.norm(root * (x - box.solution))) / max(
@@ -255,7 +258,7 @@ def _linear_program(box: HostileBox) -> bool | None:
 
 
 def _enumerate(box: HostileBox) -> bool | None:
-    A, n = (box.A.toarray() if sp.issparse(box.A) else box.A), len(box.b)
+    A, n = (box.A if isinstance(box.A, np.ndarray) else box.A.toarray()), len(box.b)
     for state in product((0, -1, 1), repeat=n):  # each unknown free, at l or at u
         s = np.array(state)
         x = np.where(s < 0, box.lower, np.where(s > 0, box.upper, 0.0))
@@ -293,13 +296,13 @@ def reference(program: HostileProgram) -> np.ndarray | None:
     )
 
 
-def _cost(p: Any, x: np.ndarray) -> tuple[float, float]:
+def _cost(p: qpsolvers.Problem, x: np.ndarray) -> tuple[float, float]:
     """Return x'Px / 2 + q'x and the sum of its terms' magnitudes."""
     half = 0.5 * float(x @ (p.P @ x))
     return half + float(p.q @ x), abs(half) + float(np.abs(p.q) @ np.abs(x))
 
 
-def violation(p: Any, x: np.ndarray) -> float:
+def violation(p: qpsolvers.Problem, x: np.ndarray) -> float:
     """Return the largest violation of a row or bound, relative to the row's terms."""
     worst = 0.0
     for M, side, equal in ((p.G, p.h, False), (p.A, p.b, True)):

@@ -6,7 +6,7 @@ These kinds are matrices, contacts and user-defined operators.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,6 +22,10 @@ from warp_lcp.benchmarks.hostile.case import (
     Refusal,
     box_case,
 )
+from warp_lcp.host_problem import Matrix
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import LinearOperator
 
 Rng = np.random.Generator
 
@@ -97,7 +101,7 @@ def singular(rng: Rng) -> HostileCase:
     if kind == "Reynolds":
         return _reynolds(rng)
     if kind in ("path", "cycle"):
-        A: Any = draw.laplacian(rng, max(n, 3), weighted=rng.random() < 0.5, cycle=kind == "cycle")
+        A = draw.laplacian(rng, max(n, 3), weighted=rng.random() < 0.5, cycle=kind == "cycle")
     elif kind in ("plane", "periodic plane"):
         side = max(3, int(n**0.5))
         A = draw.plane_laplacian(
@@ -238,7 +242,7 @@ def sign(rng: Rng) -> HostileCase:
         s[some] = -1
         A = draw.scaled(A, s, np.ones(n))
     else:
-        A = (A.toarray() if sp.issparse(A) else A).copy()
+        A = (A if isinstance(A, np.ndarray) else A.toarray()).copy()
         if way == "negative diagonal":
             A[some, some] *= -1
         else:
@@ -272,6 +276,9 @@ def friction(rng: Rng) -> HostileCase:
         normal = np.repeat(3 * np.arange(k), 3)
         normal[::3] = -1
         b = J @ rng.standard_normal(J.shape[1])  # velocities of bodies, so that a solution exists
+        low: float | np.ndarray | wl.AffineBounds
+        high: float | np.ndarray | wl.AffineBounds
+        system_A: Matrix
         name, system_A, system_b = f"random boxed friction, mu {mu:.1f}", W, b
         low, high = wl.AffineBounds.friction(normal, mu)
     else:
@@ -297,6 +304,7 @@ def friction(rng: Rng) -> HostileCase:
             BoxedModel() if rng.random() < 0.75 or len(system.q) > 300 else StewartTrinkleModel(4)
         )
         boxed = model.problem(system)
+        assert not isinstance(boxed.A, wl.GridPoisson)
         name, system_A, system_b, low, high = (
             f"{boxed.name}",
             boxed.A,
@@ -335,7 +343,7 @@ def friction(rng: Rng) -> HostileCase:
     return box_case(rng, name, box, named=named, bounds=(low, high), share=0.3)
 
 
-def _side(side: Any, x: np.ndarray) -> np.ndarray:
+def _side(side: float | np.ndarray | wl.AffineBounds, x: np.ndarray) -> np.ndarray:
     """Return constant_i + coefficient_i x_(index_i)."""
     if not isinstance(side, wl.AffineBounds):
         return np.broadcast_to(np.asarray(side, dtype=float), x.shape)
@@ -427,7 +435,7 @@ def malformed(rng: Rng) -> HostileCase:
     )
 
 
-def _as_coo(M: Any) -> Any:
+def _as_coo(M: sp.csr_array) -> sp.sparray:
     """Return a COO array of the same raw arrays, not validated."""
     count = np.diff(np.clip(M.indptr, 0, len(M.indices)))
     row = np.repeat(np.arange(M.shape[0]), np.maximum(count, 0))[: len(M.data)]
@@ -436,14 +444,14 @@ def _as_coo(M: Any) -> Any:
     return N
 
 
-def _as_csc(M: Any) -> Any:
+def _as_csc(M: sp.csr_array) -> sp.sparray:
     """Return a CSC array of the same raw arrays, not validated."""
     N = sp.csc_array(M.shape, dtype=M.dtype)
     N.indptr, N.indices, N.data = M.indptr, M.indices, M.data
     return N
 
 
-def _form(M: Any, form: str) -> Any:
+def _form(M: sp.csr_array, form: str) -> sp.sparray:
     """Return M in another valid form."""
     if form in ("coo", "csc", "dia", "bsr"):
         return M.asformat(form)
@@ -561,7 +569,7 @@ def odd(rng: Rng) -> HostileCase:
     return box_case(rng, name, box, share=0.35)
 
 
-def _operator(A: Any, buffer: bool) -> Any:
+def _operator(A: Matrix, buffer: bool) -> wl.LinearOperator | LinearOperator:
     """Return a LinearOperator of a function that may return the same buffer each time."""
     out = np.empty(A.shape[0])
 
@@ -576,11 +584,15 @@ def _operator(A: Any, buffer: bool) -> Any:
     )
 
 
-def _frozen(A: Any) -> Any:
+def _frozen(A: Matrix) -> Matrix:
     """Return A with read-only arrays; a dense A is in Fortran order."""
-    B: Any = A.copy() if sp.issparse(A) else np.asfortranarray(A)
-    (B.data if sp.issparse(A) else B).setflags(write=False)
-    return B
+    if isinstance(A, np.ndarray):
+        A = np.asfortranarray(A)
+        A.setflags(write=False)
+        return A
+    A = A.copy()
+    A.data.setflags(write=False)
+    return A
 
 
 def _pairs(box: HostileBox) -> HostileAnswer:

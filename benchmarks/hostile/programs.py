@@ -5,7 +5,7 @@ There are also bounds with infinity written as a number.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,6 +19,10 @@ from warp_lcp.benchmarks.hostile.case import (
     HostileProgram,
     box_case,
 )
+from warp_lcp.files.tables import Tables
+
+if TYPE_CHECKING:
+    import qpsolvers
 
 Rng = np.random.Generator
 INFINITIES = (1e20, 1e30, 1e100, 1e300, np.inf)
@@ -131,7 +135,7 @@ def program(rng: Rng, scale: float) -> HostileCase:
     plain_h = np.where(open_rows, np.inf, h)
     keep = ~open_rows
 
-    def problem(cost: float, r: Any, e: Any, loosely: bool) -> Any:
+    def problem(cost: float, r: np.ndarray, e: np.ndarray, loosely: bool) -> qpsolvers.Problem:
         g_rows, sides = (
             (G * r[:, None], np.where(open_rows, loose, h * r))
             if loosely
@@ -172,7 +176,7 @@ def program(rng: Rng, scale: float) -> HostileCase:
     )
 
 
-def solve_program(problem: Any) -> HostileAnswer:
+def solve_program(problem: qpsolvers.Problem) -> HostileAnswer:
     """Solve by qpsolvers and "warp_lcp"."""
     import qpsolvers
 
@@ -214,7 +218,7 @@ def low_rank(rng: Rng) -> HostileCase:
     d = int(rng.integers(1, max(2, n // 3)))
     F = rng.standard_normal((n, d)) * np.sign(rng.standard_normal((n, 1)))
     Q = F @ F.T
-    box: dict[str, Any] = {"rtol": draw.tolerance(rng), "solvable": True, "monotone": True}
+    box: Tables = {"rtol": draw.tolerance(rng), "solvable": True, "monotone": True}
     none, one = np.full(n, np.inf), np.ones(n)
     if kind == "box":
         b = rng.choice([-one, rng.standard_normal(n)])

@@ -22,11 +22,14 @@ import time
 import traceback
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from warp_lcp.benchmarks.mutants.formulas import FORMULAS
 from warp_lcp.benchmarks.mutants.mutations import FORMULA, Mutant, draw, mutated, of_formulas
 from warp_lcp.benchmarks.mutants.tests_of import tests_of
+
+if TYPE_CHECKING:
+    import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 HANGS = 40  # CPU seconds that no single test exceeds
@@ -68,13 +71,13 @@ class MutantBudget:
         self.seconds, self.brief, self.began = seconds, brief, 0.0
         self.spent: defaultdict[str, float] = defaultdict(float)
 
-    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Keep the first parameter of each function."""
         if self.brief:
             items[:] = {item.nodeid.split("[")[0]: item for item in reversed(items)}.values()
             items.reverse()
 
-    def pytest_runtest_setup(self, item: Any) -> None:
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Skip a test that starts too late."""
         import pytest
 

@@ -10,7 +10,7 @@ import random
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import parso
 from cosmic_ray.ast import ast_nodes
@@ -19,6 +19,9 @@ from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator
 
 from warp_lcp.benchmarks.mutants.formulas import FORMULAS
+
+if TYPE_CHECKING:
+    from parso.tree import NodeOrLeaf
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
 # Lines whose changes show only to a type checker, a clock or a reader.
@@ -66,10 +69,13 @@ NATIVE = re.compile(
 )
 
 
+Position = tuple[int, int]  # line and column
+
+
 class LeaveOut(Operator):
     """Replace a call statement or an in-place change of a variable by `pass`."""
 
-    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+    def mutation_positions(self, node: NodeOrLeaf) -> Iterator[tuple[Position, Position]]:
         """Yield the start and the end of such a statement."""
         statement = node.parent is not None and node.parent.type == "simple_stmt"
         call = node.type == "atom_expr" and getattr(node.children[-1], "children", [""])[0] == "("
@@ -79,7 +85,7 @@ class LeaveOut(Operator):
         if statement and (call or inplace):
             yield node.start_pos, node.end_pos
 
-    def mutate(self, node: Any, index: int) -> Any:
+    def mutate(self, node: NodeOrLeaf, index: int) -> NodeOrLeaf:
         """Return `pass`."""
         return parso.python.tree.Keyword("pass", node.start_pos, node.get_first_leaf().prefix)
 
@@ -212,7 +218,7 @@ def _places(module: str, source: str) -> list[tuple[int, str, int]]:
     return places
 
 
-def _inert(node: Any) -> bool:
+def _inert(node: NodeOrLeaf) -> bool:
     """Return whether a node is in an annotation, a decorator or a raise statement.
 
     Also whether it is a bare `*` between parameters.

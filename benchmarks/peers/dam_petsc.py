@@ -7,7 +7,6 @@ import gc
 import json
 import sys
 import time
-from typing import Any
 
 import numpy as np
 import petsc4py
@@ -75,8 +74,8 @@ def main():
     start_time = time.perf_counter()
     nx, ny, levels = request["coarsest"][0], request["coarsest"][1], request["levels"]
     dm = PETSc.DMDA().create([nx, ny], dof=1, stencil_width=1)
-    snes: Any = None
-    x: Any = None
+    snes: PETSc.SNES | None = None
+    x: PETSc.Vec | None = None
     guess, steps = None, []
     for level in range(levels):
         if level:
@@ -85,6 +84,7 @@ def main():
             guess = finer.createGlobalVector()
             interpolation.mult(x, guess)
             interpolation.destroy()
+            assert snes is not None and x is not None
             snes.destroy()
             x.destroy()
             gc.collect()
@@ -99,6 +99,7 @@ def main():
                 snes.getConvergedReason(),
             )
         )
+    assert snes is not None and x is not None
     w = x.getArray().reshape(ny, nx)
     answer = {
         "seconds": time.perf_counter() - start_time,

@@ -11,12 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer, PeerAnswer, PeerFailed, Question
 from warp_lcp.benchmarks.problems import BOUNDS
+from warp_lcp.files.tables import Tables, TableView
 
 VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interpreter
 PROBE_SECONDS = 120.0
@@ -132,7 +132,7 @@ class Worker:
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
         self.name = name
-        pipes: dict[str, Any] = {
+        pipes: Tables = {
             "stdin": subprocess.PIPE,
             "stdout": subprocess.PIPE,
             "text": True,
@@ -141,7 +141,7 @@ class Worker:
         self.process = subprocess.Popen(command, env=environment(), **pipes)
         self.version = str(self._read()["version"])
 
-    def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+    def ask(self, request: TableView) -> Tables:
         """Return the answer to a request.
 
         Raises:
@@ -164,12 +164,12 @@ class Worker:
         """End the process."""
         self.process.communicate()
 
-    def _read(self) -> dict[str, Any]:
+    def _read(self) -> Tables:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             raise PeerFailed(f"{self.name} has ended with exit code {self.process.wait()}")
-        reply: dict[str, Any] = json.loads(line)
+        reply: Tables = json.loads(line)
         return reply
 
 
@@ -192,7 +192,7 @@ def asked(
     if not path.exists():
         for old in folder.glob("*.npz"):
             old.unlink()
-        fields: dict[str, Any] = {
+        fields: Tables = {
             f"lower_{name}": Question(question.scene, name).lower for name in INEQUALITIES
         }
         fields |= {

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-Request = dict[str, Any]
-Reply = dict[str, Any]
+Request = dict[str, Any]  # JSON
+Reply = dict[str, Any]  # JSON
 COARSEST = 500  # largest number of unknowns for a direct solver
 NEWTON_STEPS = 200
 LINEAR_ITERATIONS = 10_000
@@ -69,7 +69,7 @@ problem_of = lru_cache(maxsize=1)(PetscProblem)  # keeps the last problem
 
 
 @contextmanager
-def options(values: dict[str, Any]) -> Iterator[None]:
+def options(values: dict[str, object]) -> Iterator[None]:
     """Set PETSc options for the time in which a solver reads them."""
     for name, value in values.items():
         PETSc.Options()[name] = value
@@ -80,7 +80,7 @@ def options(values: dict[str, Any]) -> Iterator[None]:
             PETSc.Options().delValue(name)
 
 
-def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
+def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[PETSc.Mat]:
     """Return prolongations by 2 x 2 x 2 aggregates of cells, finest first.
 
     They are constant on each aggregate. Trilinear ones need fewer iterations and three times the
@@ -105,7 +105,7 @@ def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
     return prolongations
 
 
-def give(pc: Any, prolongations: list[Any]) -> None:
+def give(pc: PETSc.PC, prolongations: list[PETSc.Mat]) -> None:
     """Make a preconditioner PETSc's multigrid, with these prolongations.
 
     Coarse matrices are Galerkin products.
@@ -153,11 +153,11 @@ class ReducedMultigrid:
     It aggregates the free unknowns and is rebuilt when they change.
     """
 
-    def __init__(self, problem: PetscProblem, snes: Any) -> None:
+    def __init__(self, problem: PetscProblem, snes: PETSc.SNES) -> None:
         self.problem, self.snes, self.building = problem, snes, 0.0
-        self.ksp: Any = None
+        self.ksp: PETSc.KSP | None = None
 
-    def setUp(self, pc: Any) -> None:
+    def setUp(self, pc: PETSc.PC) -> None:
         """Build the hierarchy of the current free set.
 
         Its transfers are computed in NumPy; this time is not PETSc's.
@@ -177,8 +177,9 @@ class ReducedMultigrid:
             self.ksp.setFromOptions()
             self.ksp.setUp()
 
-    def apply(self, pc: Any, r: Any, z: Any) -> None:
+    def apply(self, pc: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
         """Set z to the result of a V-cycle applied to r."""
+        assert self.ksp is not None, "set up"
         self.ksp.solve(r, z)
 
 
@@ -194,7 +195,7 @@ def inequality(request: Request) -> Reply:
     x, residual, high = b.duplicate(), b.duplicate(), b.duplicate()
     high.set(PETSc.INFINITY)
 
-    def function(snes: Any, x: Any, y: Any) -> None:
+    def function(snes: PETSc.SNES, x: PETSc.Vec, y: PETSc.Vec) -> None:
         problem.A.mult(x, y)
         y.axpy(1.0, b)
 
@@ -229,7 +230,13 @@ def inequality(request: Request) -> Reply:
 
 
 def _answer(
-    request: Request, x: Any, setup: float, solve: float, iterations: int, reason: int, solver: Any
+    request: Request,
+    x: PETSc.Vec,
+    setup: float,
+    solve: float,
+    iterations: int,
+    reason: int,
+    solver: PETSc.SNES | PETSc.KSP,
 ) -> Reply:
     """Write x and return the other results."""
     np.save(request["answer"], x.array_r)

@@ -6,12 +6,12 @@ import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
 
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
+from warp_lcp.files.tables import Tables
 from warp_lcp.run.trial import BIN, Trial, trial
 from warp_lcp.scene.presets import changed, price_table
 from warp_lcp.scene.scene import Scene
@@ -100,7 +100,7 @@ class Runs:
     def record(self, run: TradeoffRun) -> BenchmarkRecord:
         """Return the record of a run."""
         setting, scene = run.setting, self.scene().scene.name
-        facts: dict[str, Any] = {
+        facts: Tables = {
             "scene": scene,
             "kind": "run",
             "curve": setting.curve,

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,6 +17,8 @@ from warp_lcp.benchmarks.extremes.exact import Exact
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
+from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.problem.solve import Solver
 from warp_lcp.recorded_problem import RecordedProblem, files, load
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.stepping import plan_dt
@@ -30,7 +31,7 @@ from warp_lcp.solvers.registry import grid_methods
 # Numbers of problems of a run of liquid and of states of sand, at equal distances.
 PROBLEMS, STATES = 4, 3
 EXACT = wl.StoppingCriteria(rtol=1e-13, max_iterations=500)
-EXACT_STEP = {
+EXACT_STEP: dict[str, float | str] = {
     "solver.tolerance": 1e-7,
     "solver.max_iterations": 30000,
     "solver.method": "accelerated-projection",
@@ -57,7 +58,7 @@ class SolveProbe(ABC):
     warm = 0  # solves before the first that counts, which load kernels
     tolerances: tuple[float, ...]
     residual: float  # largest of the reference solutions
-    problems: list[Any]
+    problems: list[TableValue]  # a tuple for each, see the classes
     methods: dict[str, tuple[str, str]]  # method and precision, by their label in records
 
     def __init__(self, scene: Scene, device: str) -> None:
@@ -161,8 +162,9 @@ class Reference:
             problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=EXACT, x0=problem.x0
         )
         sparse = problem.sparse()
+        assert isinstance(sparse.lower, np.ndarray) and isinstance(sparse.upper, np.ndarray)
         self._exact = Exact(sparse.A, sparse.b, sparse.lower, sparse.upper)
-        self._fluid = problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == wl.FLUID
+        self._fluid = problem.grid.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == wl.FLUID
         self._unit = self._exact.residual(self._exact.start) or 1.0
         self._x = result.x.numpy().ravel()[self._fluid]
         self.residual_of_solution = self.residual(result.x.numpy())
@@ -231,7 +233,7 @@ class Pressures(SolveProbe):
         self,
         problem: RecordedProblem,
         reference: Reference,
-        solver: Any,
+        solver: Solver,
         stopping: wl.StoppingCriteria,
     ) -> Callable[[], Found]:
         lcp, before = problem.lcp(), array_bytes()
@@ -284,7 +286,7 @@ class Steps(SolveProbe):
         self, method: str, precision: str, tolerance: float
     ) -> Iterator[Callable[[], Found]]:
         """Yield a function that takes the step from each state."""
-        keys = {
+        keys: dict[str, float | str] = {
             "solver.method": method,
             "solver.tolerance": tolerance,
             "solver.max_iterations": MOST_SAND,
@@ -292,7 +294,9 @@ class Steps(SolveProbe):
         for problem in self.problems:
             yield partial(self._solve, changed(self.scene, keys), *problem)
 
-    def _solve(self, scene: Scene, state: Any, dt: float, exact: np.ndarray) -> Found:
+    def _solve(
+        self, scene: Scene, state: Mapping[str, np.ndarray], dt: float, exact: np.ndarray
+    ) -> Found:
         velocity, row, taken = self._step(scene, state, dt)
         error = float(np.sqrt(np.mean(np.sum((velocity - exact) ** 2, axis=1)))) / (
             self.gravity * dt
@@ -300,8 +304,8 @@ class Steps(SolveProbe):
         return Found(taken, row["solve_iterations"], row["coupled_residual"], error)
 
     def _step(
-        self, scene: Scene, state: Any, dt: float
-    ) -> tuple[np.ndarray, dict[str, Any], float]:
+        self, scene: Scene, state: Mapping[str, np.ndarray], dt: float
+    ) -> tuple[np.ndarray, Tables, float]:
         """Take a step from a state.
 
         Return the particles' velocities [m/s], the row of the log and the seconds.

@@ -6,7 +6,7 @@ The front and the height are compared with experiments. The volume must stay con
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from warp_lcp.benchmarks.validation.signals import (
     stays,
     surface_height,
 )
+from warp_lcp.files.tables import TableValue
 from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (12, 24)  # cells of the column's base a
@@ -181,7 +182,7 @@ def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> Non
 
 
 def create(
-    cells: int, numerics: Numerics, length: float = LENGTH, **tables: Any
+    cells: int, numerics: Numerics, length: float = LENGTH, **tables: TableValue
 ) -> LiquidSimulation:
     """Return a column on a free-slip floor in a tank.
 

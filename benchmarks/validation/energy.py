@@ -7,11 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import numpy as np
 
+from warp_lcp.fluids.simulator import LiquidSimulation
+from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rigid.body import RigidBody
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Ledger:
         simulation: particle simulation; it stays wrapped, since its parts are observed.
     """
 
-    def __init__(self, simulation: Any) -> None:
+    def __init__(self, simulation: LiquidSimulation | SandSimulation) -> None:
         self.simulation = simulation
         self._dt, self._given, self._displaced, self._carried = (
             simulation.last_dt,
@@ -155,7 +159,7 @@ class Ledger:
         motion = 0.5 * s.particle_mass * float(np.square(velocity).sum())
         return motion + 0.5 * self._dt * float(s.gravity @ self._momentum()) + self._potential()
 
-    def _bodies(self) -> Sequence[Any]:
+    def _bodies(self) -> Sequence[RigidBody]:
         return [] if self.simulation.bodies is None else self.simulation.bodies.bodies
 
     def _energy_of_bodies(self) -> float:
@@ -202,7 +206,8 @@ class Ledger:
 
         The impulse of a cell is rho dx^d times the pressure. The flow of sources pushes back.
         """
-        s: Any = self.simulation
+        s = self.simulation
+        assert isinstance(s, LiquidSimulation), "has a projection"
         flow = s.scene.physics.density * s.grid.cell_volume * s.projection.pressure.numpy()
         self._given -= float((flow * wall_outflow(s)).sum())
 
@@ -226,14 +231,14 @@ class Ledger:
     def _watch(
         self,
         name: str,
-        part: Any,
+        part: object,
         before: Callable[[], None] | None,
         after: Callable[[], None] | None,
     ) -> None:
         """Call functions before and after a method of a part."""
         method = getattr(part, name)
 
-        def watched(*given: Any, **named: Any) -> Any:
+        def watched(*given: object, **named: object) -> object:
             if before is not None:
                 before()
             result = method(*given, **named)
@@ -244,7 +249,7 @@ class Ledger:
         setattr(part, name, watched)
 
 
-def wall_outflow(simulation: Any) -> np.ndarray:
+def wall_outflow(simulation: LiquidSimulation) -> np.ndarray:
     """Return the outflow of each cell [m/s] into moving walls and sources.
 
     It is in the stored shape, and bodies do not count. On a face of the open fraction a_f it is s_f
@@ -256,7 +261,11 @@ def wall_outflow(simulation: Any) -> np.ndarray:
     for axis, field in enumerate(boundary.velocity):
         along = 2 - axis
         if boundary.open:
-            wall = np.where(np.isin(boundary.cut.wall[axis].numpy(), bodies), 0.0, field.numpy())
+            wall = np.where(
+                np.isin(cast(CutBoundary, boundary).cut.wall[axis].numpy(), bodies),
+                0.0,
+                field.numpy(),
+            )
             passes = (1.0 - boundary.open[axis].numpy()) * wall
         else:
             passes = np.where(

@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from inspect import signature
-from typing import Any
 
 import numpy as np
 
@@ -129,7 +128,7 @@ class ValidationCheck:
 
     about: str  # what the check tests
     # Functions with their cases; a case is an argument, or a tuple of several.
-    trials: Sequence[tuple[Callable[..., ValidationTrial], Sequence[Any]]]
+    trials: Sequence[tuple[Callable[..., ValidationTrial], Sequence[object]]]
     # A comparison of the trials: its description and its function.
     across: tuple[str, Callable[[Findings, Sequence[ValidationTrial]], None]] | None = None
     charts: Sequence[Drawing] = ()
@@ -164,7 +163,7 @@ def check_at(
 
     def decorated(run: Callable[..., None]) -> Callable[..., ValidationTrial]:
         @wraps(run)
-        def trial(*given: Any, **named: Any) -> ValidationTrial:
+        def trial(*given: object, **named: object) -> ValidationTrial:
             arguments = signature(run).bind(None, *given, **named)
             arguments.apply_defaults()
             return attempt(

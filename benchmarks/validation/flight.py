@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,10 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
 )
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
+from warp_lcp.files.tables import TableValue
 from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.fluids.simulator import LiquidSimulation
+from warp_lcp.granular.simulator import SandSimulation
 
 # Cells along the domain of thrown material, cells per meter for a spinning drop.
 RESOLUTIONS = (32, 64)
@@ -105,15 +107,17 @@ def off(moved: np.ndarray, velocity: np.ndarray, duration: float) -> float:
     return float(np.linalg.norm(moved - way) / np.linalg.norm(way))
 
 
-def _liquid(cells: int, numerics: scenes.Numerics, liquid: Row = BLOCK, **tables: Any) -> Any:
+def _liquid(
+    cells: int, numerics: scenes.Numerics, liquid: Row = BLOCK, **tables: TableValue
+) -> LiquidSimulation:
     return create_liquid(numerics, SIZE, cells, [liquid], **tables)
 
 
-def _sand(cells: int, sand: Row = BLOCK, **tables: Any) -> Any:
+def _sand(cells: int, sand: Row = BLOCK, **tables: TableValue) -> SandSimulation:
     return create_sand(SIZE, cells, [sand], tables.pop("solid", []), **tables)
 
 
-THROWN: dict[str, Callable[..., Any]] = {
+THROWN: dict[str, Callable[..., LiquidSimulation | SandSimulation]] = {
     "liquid, whole cells": partial(_liquid, numerics=VOXEL),
     "liquid, sub-cell": partial(_liquid, numerics=SUB_CELL),
     "liquid, unilateral": partial(_liquid, numerics=VOXEL, pressure={"model": "unilateral"}),

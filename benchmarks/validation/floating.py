@@ -5,8 +5,6 @@ The iterations of a solve must not depend on the weight of the bodies.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at
@@ -20,6 +18,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     create_liquid,
     steps,
 )
+from warp_lcp.files.tables import Tables
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import Window
 
@@ -254,7 +253,7 @@ def _iterations(cells: int, ratio: float, *, corrected: bool) -> int:
     return int(simulation.step(2e-3)["solve_iterations"])  # type: ignore[arg-type]
 
 
-def _down(dimension: int) -> dict[str, Any]:
+def _down(dimension: int) -> Tables:
     return {"physics": {"gravity": [0.0, -GRAVITY, 0.0][:dimension]}}
 
 

@@ -20,7 +20,6 @@ sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
     tilted,
 )
+from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.solids import SandSolids
@@ -118,7 +118,7 @@ def bagnold(found: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> 
 
     The control is constant friction.
     """
-    beads: dict[str, Any] = {"material": {"friction_angle": STATIC}}
+    beads: Tables = {"material": {"friction_angle": STATIC}}
     growing = beads | {
         "friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}
     }
@@ -167,7 +167,7 @@ def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:
     )
 
 
-def steady(cells: int, angle: float, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
+def steady(cells: int, angle: float, **tables: TableValue) -> tuple[np.ndarray, np.ndarray]:
     """Return heights [m] of rows of steadily running sand and mean speeds [m/s]."""
     simulation = _create(cells, angle, 0.0, **tables)
     velocity = simulation.particles.velocity.numpy()
@@ -185,7 +185,7 @@ def accelerates(angle: float) -> float:
     return GRAVITY * (math.sin(math.radians(angle)) - COEFFICIENT * math.cos(math.radians(angle)))
 
 
-def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> float:
+def runs(cells: int, angle: float, *, speed: float = START, **tables: TableValue) -> float:
     """Return the acceleration of running sand on a slope [m/s^2].
 
     It is measured in the second half of the run; the slope is in degrees.
@@ -196,7 +196,7 @@ def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> fl
     return float(np.polyfit(time[half], mean[half], 1)[0])
 
 
-def rests(cells: int, angle: float, **tables: Any) -> tuple[float, float]:
+def rests(cells: int, angle: float, **tables: TableValue) -> tuple[float, float]:
     """Return the acceleration [g] of sand that settled level and is then tilted.
 
     The results are over all of RESTS, and over its second half; the slope is in degrees.
@@ -214,7 +214,7 @@ def rests(cells: int, angle: float, **tables: Any) -> tuple[float, float]:
 
 
 def _create(
-    cells: int, angle: float, speed: float, floor: float | str = ROUGH, **tables: Any
+    cells: int, angle: float, speed: float, floor: float | str = ROUGH, **tables: TableValue
 ) -> SandSimulation:
     size, resolution = [LENGTH, 1.5 * DEPTH], 3 * cells // 2
     layer: Row = {
@@ -372,7 +372,7 @@ def discharge(shift: float, cells: int, *, whole: bool = False) -> list[float]:
     """
     dx, t, parts = WIDTH / cells, math.radians(STEEP), np.linspace(FROM, TO, PARTS + 1)
     middle, foot = 0.5 * WIDTH + shift * dx, 0.2 + 0.61 * shift * dx
-    walls: list[dict[str, Any]] = []
+    walls: list[Tables] = []
     for side in (-1.0, 1.0):
         x = middle + side * (0.5 * SLOT + LIP)
         end = [x + side * 0.6 * math.cos(t), foot + 0.6 * math.sin(t)]

@@ -10,7 +10,7 @@ import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     tilted,
 )
 from warp_lcp.benchmarks.validation.signals import enclosed_cells, mode, period
+from warp_lcp.files.tables import TableValue
 
 RESOLUTIONS = (20, 40)  # cells along a side
 SIDE, LEVEL = 0.8, 0.4  # [m] side of the domain, and level of a pool
@@ -176,7 +177,7 @@ def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes
 
 
 def settle(
-    resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any
+    resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: TableValue
 ) -> Rest:
     """Let a liquid rest for a time [s].
 

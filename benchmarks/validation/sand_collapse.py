@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     share_solved,
     steps,
 )
+from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
 
 # Aspect ratios by the number of cells of a column's width.
@@ -155,7 +156,9 @@ def _compare(
     judge(f"{label}: height over Lube's", c.height, low=1.0 - HEIGHT, high=1.0 + HEIGHT)
 
 
-def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -> SandCollapse:
+def collapse(
+    aspect: float, cells: int, *, length: float = 0.0, **tables: TableValue
+) -> SandCollapse:
     """Let a column collapse.
 
     Args:
@@ -164,7 +167,7 @@ def collapse(aspect: float, cells: int, *, length: float = 0.0, **tables: Any) -
         length: length of the domain [widths]; by default from the experiments.
         tables: further tables of the scene.
     """
-    more = {"solver": {"max_iterations": MOST}} if aspect * cells >= HIGH else {}
+    more: Tables = {"solver": {"max_iterations": MOST}} if aspect * cells >= HIGH else {}
     simulation = column(
         aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], **(more | tables)
     )
@@ -276,7 +279,7 @@ def _reach(x: np.ndarray) -> float:
 def _laws(trials: Sequence[ValidationTrial]) -> RecordLines:
     a = np.geomspace(0.4, 10.0, 60).tolist()
     laws = {"Lube et al. 2005": lube, "Lajeunesse et al. 2005": lajeunesse}
-    curves: dict[str, Any] = {name: (a, [law(x) for x in a]) for name, law in laws.items()}
+    curves: Tables = {name: (a, [law(x) for x in a]) for name, law in laws.items()}
     for label, side in (("20 % below both", 0), ("20 % above both", 1)):
         curves[label] = (a, [envelope(x)[side] for x in a])
     curves |= {t.resolution: t.curves.get("runout", ([], [])) for t in trials[:-1]}
@@ -429,7 +432,7 @@ def resting(found: Findings, cells: int, watches: int = WATCHES) -> None:
     )
 
 
-def rest(cells: int, watches: int, **tables: Any) -> list[tuple[float, float]]:
+def rest(cells: int, watches: int, **tables: TableValue) -> list[tuple[float, float]]:
     """Return the drift of all and of the inside of a pile, in each observation.
 
     Drifts are in heights / s.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -23,6 +23,7 @@ from warp_lcp.benchmarks.validation.finding import (
     plot,
 )
 from warp_lcp.benchmarks.validation.scenes import box, create_sand, positions, share_solved, steps
+from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
 
 ANGLES = (20.0, 30.0, 40.0)  # degrees, at which a layer stops
@@ -96,7 +97,7 @@ def half_as_steep(angle: float) -> float:
     return math.degrees(math.atan(0.5 * math.tan(math.radians(angle))))
 
 
-def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> Heap:
+def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: TableValue) -> Heap:
     """Pour a heap and observe it.
 
     Args:
@@ -109,8 +110,8 @@ def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> He
     seed = box([middle - 0.5 * SEED_WIDTH, 0.0], [middle + 0.5 * SEED_WIDTH, SEED_HEIGHT])
     low, high = [middle - 0.5 * MOUTH, DROP], [middle + 0.5 * MOUTH, DROP + LIP]
     source = [box(low, high, velocity=[0.0, -SPEED], stop=stop)]
-    tables = {"walls": "stick", "material": {"friction_angle": angle}, "source": source} | tables
-    simulation = create_sand([LENGTH, HEIGHT], cells, [seed], **tables)
+    merged: Tables = {"walls": "stick", "material": {"friction_angle": angle}, "source": source}
+    simulation = create_sand([LENGTH, HEIGHT], cells, [seed], **(merged | tables))
     rows = list(steps(simulation, stop)) + list(steps(simulation, stop + SETTLES))
     first, *_ = fit(outline(simulation), wedge)
     rows += steps(simulation, stop + lasts)
@@ -120,7 +121,7 @@ def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: Any) -> He
     return Heap(first, creep, misses / top, share_solved(rows), (x, y))
 
 
-def lost(cells: int, angle: float, *, duration: float = STANDS, **tables: Any) -> float:
+def lost(cells: int, angle: float, *, duration: float = STANDS, **tables: TableValue) -> float:
     """Return the relative height that a wedge loses in a time.
 
     The wedge is `BELOW` flatter than `angle` [degrees].
@@ -134,13 +135,13 @@ def lost(cells: int, angle: float, *, duration: float = STANDS, **tables: Any) -
     return 1.0 - height(simulation) / before
 
 
-def cut_wedge(cells: int, slope: float, **tables: Any) -> SandSimulation:
+def cut_wedge(cells: int, slope: float, **tables: TableValue) -> SandSimulation:
     """Return a wedge of a slope [degrees], cut from a box of sand."""
     middle, tangent = 0.5 * LENGTH, math.tan(math.radians(slope))
     top, dx = 0.5 * BASE * tangent, LENGTH / cells
     sand = box([middle - 0.5 * BASE, 0.0], [middle + 0.5 * BASE, top])
     size = [LENGTH, math.ceil(top / dx + 4.0) * dx]
-    simulation = create_sand(size, cells, [sand], **({"walls": "stick"} | tables))
+    simulation = create_sand(size, cells, [sand], **(Tables(walls="stick") | tables))
     x, y = positions(simulation).T
     keep = y < top - np.abs(x - middle) * tangent
     simulation.particles.assign(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     share_solved,
     steps,
 )
+from warp_lcp.files.tables import Tables, TableValue
 
 OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells of the slot, by refinement
 # [m] Bin, initial sand, and the room below.
@@ -120,7 +121,9 @@ def trial(refinement: int, openings: tuple[int, ...] = ()) -> ValidationTrial:
     return attempt("sand hourglass", f"cells of {1000.0 * SPACING / refinement:g} mm", run)
 
 
-def sand(cells: int, refinement: int, floor: float | str = "stick", **tables: Any) -> Discharge:
+def sand(
+    cells: int, refinement: int, floor: float | str = "stick", **tables: TableValue
+) -> Discharge:
     """Simulate sand that runs through a slot on a floor with friction."""
     dx = SPACING / refinement
     size, solids, fill, drain = _bin(cells * dx, DEPTH)
@@ -178,9 +181,7 @@ def _empty(
     return np.array(time), np.array(left) * area
 
 
-def _bin(
-    slot: float, depth: float
-) -> tuple[list[float], list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
+def _bin(slot: float, depth: float) -> tuple[list[float], list[Tables], Tables, Tables]:
     """Return the scene of a bin.
 
     It has the size of the domain, the halves of the floor, the fill, and a drain below.
@@ -207,7 +208,7 @@ def _rates(
 
 
 def _law(trials: Sequence[ValidationTrial]) -> RecordLines:
-    laws: dict[str, Any] = {t.resolution: t.curves["law"] for t in trials if "law" in t.curves}
+    laws: Tables = {t.resolution: t.curves["law"] for t in trials if "law" in t.curves}
     laws["rate = sqrt(g D^3)"] = ([0.0, 0.09], [0.0, 0.09 * GRAVITY ** (1.0 / 3.0)])
     marked, y = frozenset(t.resolution for t in trials), "(rate)^(2/3) [m^(4/3) / s^(2/3)]"
     return RecordLines(

@@ -16,13 +16,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
+from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
@@ -78,7 +79,7 @@ def trial(
 
     The silo runs as it is, with short steps, under a lid, and between walls without friction.
     """
-    more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3}
+    more: Tables = {"deep": deep or DEEP[dimension], "square": dimension == 3}
     depths = range(1, math.ceil(more["deep"]))
     for friction in frictions:
         bears(
@@ -208,7 +209,7 @@ def fill(
     lid: float = 0.0,
     square: bool = False,
     rise: float = 0.0,
-    **tables: Any,
+    **tables: TableValue,
 ) -> SandSimulation:
     """Return a filled silo at rest.
 
@@ -261,14 +262,14 @@ def rest(
         tiny: length of a short step after `PERIOD` others [s]; 0 for none.
         each: called before each step with its length [s].
     """
-    heights: list[Any] = []
+    heights: list[float] = []
     while simulation.time < duration:
         dt = min(simulation.stable_dt(), simulation.scene.time.dt_max)
         if tiny and simulation.step_count % PERIOD == PERIOD // 2:
             dt = tiny
         if each is not None:
             each(simulation, dt)
-        heights.append(simulation.step(dt)["center_of_mass_y"])
+        heights.append(float(simulation.step(dt)["center_of_mass_y"] or 0.0))
     grid, packing = simulation.grid, simulation.packing
     inner = tuple(
         slice(low, high) for low, high in zip(grid.domain.low, grid.domain.high, strict=True)

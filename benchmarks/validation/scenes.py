@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.fluids import FluidsSimulator, LiquidScene, LiquidSimulation
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
@@ -28,12 +28,12 @@ FRICTION_ANGLE = 30.0  # degrees
 WALL_FRICTION = math.tan(math.radians(FRICTION_ANGLE))
 WIDTH = 0.2  # [m] width of a column of sand
 FLOOR, HEADROOM = 2, 4  # cells of the solid below columns, and cells above a column
-CORRECTED: dict[str, Any] = {"density_correction": {}}
+CORRECTED: Tables = {"density_correction": {}}
 TOLERANCE = 1e-3  # tolerance of the stresses [rho g dx]
 FRONT = 99.0  # percentile of the particles that defines the front
 FULL = 0.5  # least fraction of a cell that is part of a pile
 
-Row = dict[str, Any]
+Row = Tables
 Simulation = LiquidSimulation | SandSimulation
 
 
@@ -59,7 +59,7 @@ def create_liquid(
     liquid: list[Row],
     *,
     folder: Path | None = None,
-    **tables: Any,
+    **tables: TableValue,
 ) -> LiquidSimulation:
     """Return a simulation of a liquid.
 
@@ -89,7 +89,11 @@ def create_liquid(
 
 
 def create_sand(
-    size: list[float], resolution: int, sand: list[Row], solids: Sequence[Row] = (), **tables: Any
+    size: list[float],
+    resolution: int,
+    sand: list[Row],
+    solids: Sequence[Row] = (),
+    **tables: TableValue,
 ) -> SandSimulation:
     """Return a simulation of sand.
 
@@ -115,7 +119,7 @@ def column(
     length: float,
     angle: float = FRICTION_ANGLE,
     floor: float = WALL_FRICTION,
-    **tables: Any,
+    **tables: TableValue,
 ) -> SandSimulation:
     """Return a column of sand on a rough floor, at a wall without friction.
 
@@ -135,7 +139,7 @@ def column(
     return create_sand([nx * dx, ny * dx], max(nx, ny), [sand], [ground], **tables)
 
 
-def box(low: list[float], high: list[float], **more: Any) -> Row:
+def box(low: list[float], high: list[float], **more: object) -> Row:
     """Return the table of a box."""
     return {"shape": "box", "min": low, "max": high, **more}
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_lcp.benchmarks.validation.energy import Ledger
 from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
@@ -21,6 +21,9 @@ from warp_lcp.benchmarks.validation.scenes import (
     create_liquid,
     create_sand,
 )
+from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.fluids.simulator import LiquidSimulation
+from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.operators.grid_poisson import FLUID
 
 RESOLUTIONS = (24, 48)  # cells along the domain
@@ -37,7 +40,8 @@ HALVINGS = 4
 MOMENTS = np.array([0.04, 0.08, 0.12, 0.16, 0.2])
 MOST = 1e-3  # share of the total energy that a step may add
 CHANGE = 5e-3  # share of the total energy that the last halving may change
-Watched = Callable[[Any], None]
+Simulation = SandSimulation | LiquidSimulation
+Watched = Callable[..., None]  # of a simulation
 
 
 @check_at("time steps", "{what}, {cells} cells")
@@ -90,12 +94,12 @@ def collapse(
     Returns:
         The energy at the moments, and the largest gain of a step, both over the initial energy.
     """
-    simulation: Any
+    simulation: Simulation
     if what == "sand":
         simulation = create_sand(SIZE, cells, [COLUMN], walls=0.5)
     else:
         numerics = SUB_CELL if what == "liquid, sub-cell" else VOXEL
-        tables: dict[str, Any] = (
+        tables: Tables = (
             {"pressure": {"model": "unilateral"}} if what == "liquid, unilateral" else {}
         )
         simulation = create_liquid(numerics, SIZE, cells, [COLUMN], **tables)
@@ -110,7 +114,7 @@ def collapse(
     return np.array(energy), float(most)
 
 
-def _push_sand_apart(simulation: Any) -> None:
+def _push_sand_apart(simulation: SandSimulation) -> None:
     """Push out a fifth of the excess density within a step, as a velocity.
 
     The fraction does not depend on the length of the step.
@@ -118,18 +122,20 @@ def _push_sand_apart(simulation: Any) -> None:
     packing = simulation.packing
     update = packing.update
 
-    def pushed(density: Any, velocity: Any, dt: float, *more: Any) -> None:
+    def pushed(density: wp.array, velocity: list[wp.array], dt: float, *more: TableValue) -> None:
         update(density, velocity, dt, *more)
-        phi = density.numpy() / np.maximum(simulation.boundary.capacity.numpy(), 0.1)
+        capacity = simulation.boundary.capacity
+        assert capacity is not None
+        phi = density.numpy() / np.maximum(capacity.numpy(), 0.1)
         excess = np.where(packing.flags.numpy() != 0, np.maximum(phi - 1.0, 0.0), 0.0)
         packing.drive.assign(
             (packing.drive.numpy() - 0.2 * excess * simulation.grid.spacing / dt).astype(np.float32)
         )
 
-    packing.update = pushed
+    packing.update = pushed  # type: ignore[assignment, method-assign]
 
 
-def _push_liquid_apart(simulation: Any) -> None:
+def _push_liquid_apart(simulation: LiquidSimulation) -> None:
     """Push out all excess density within a step, as a velocity.
 
     The amount does not depend on the length of the step.
@@ -137,18 +143,18 @@ def _push_liquid_apart(simulation: Any) -> None:
     projection = simulation.projection
     prepare = projection.prepare
 
-    def pushed(velocity: Any, dt: float, *given: Any) -> bool:
+    def pushed(velocity: list[wp.array], dt: float, *given: TableValue) -> bool:
         has_liquid: bool = prepare(velocity, dt, *given)
-        excess = np.maximum(
-            simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0
-        )
+        density, capacity = simulation.surface.density, simulation.boundary.capacity
+        assert density is not None and capacity is not None
+        excess = np.maximum(density.numpy() - capacity.numpy(), 0.0)
         inside = projection._unknown.numpy() == FLUID
         projection._b.assign(
             projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt
         )
         return has_liquid
 
-    projection.prepare = pushed
+    projection.prepare = pushed  # type: ignore[assignment, method-assign]
 
 
 PUSHED_APART: dict[str, Watched] = {

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,11 +17,12 @@ from warp_lcp.benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+from warp_lcp.kernels.types import DeviceArray
 
 RESOLUTIONS = (16, 32)  # cells along a side
 PER_CELL = 4
 RANDOM_SEED = 4711
-REALS: dict[str, tuple[Any, Any, Any, float]] = {
+REALS: dict[str, tuple[type, type, type, float]] = {
     "float32": (wp.float32, wp.vec3, np.float32, 1e-5),
     "float64": (wp.float64, wp.vec3d, np.float64, 1e-12),
 }
@@ -37,11 +38,11 @@ class Cloud:
     """Particles away from the walls, and the fields of their transfers."""
 
     grid: StaggeredGrid
-    position: wp.array[Any]
-    velocity: wp.array[Any]
-    affine: list[wp.array[Any]]
-    fields: list[wp.array[Any]]
-    weights: list[wp.array[Any]]
+    position: DeviceArray
+    velocity: DeviceArray
+    affine: list[DeviceArray]
+    fields: list[DeviceArray]
+    weights: list[DeviceArray]
 
     def round_trip(self) -> None:
         """Transfer to the faces and back."""
@@ -223,7 +224,12 @@ def vortex_error(n: int, *, off: float = 0.0) -> float:
 
 
 def carried(
-    start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: float = 0.0
+    start: np.ndarray,
+    n: int,
+    dt: float,
+    count: int,
+    rate: Callable[[np.ndarray], np.ndarray],
+    off: float = 0.0,
 ) -> np.ndarray:
     """Return positions [m] after `count` steps in a steady field.
 

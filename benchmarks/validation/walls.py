@@ -6,7 +6,7 @@ The walls must not hold anything back.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -24,6 +24,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
     velocities,
 )
+from warp_lcp.files.tables import TableValue
 from warp_lcp.fluids import LiquidSimulation
 
 DURATION = 0.25  # [s]
@@ -123,7 +124,7 @@ def _hold(simulation: LiquidSimulation) -> None:
     extend, contact = simulation.boundary.extrapolate_velocity, simulation.projection.contact
     nothing = wp.zeros_like(contact)
 
-    def forgetful(*given: Any) -> None:
+    def forgetful(*given: TableValue) -> None:
         extend(*(nothing if a is contact else a for a in given))
 
     simulation.boundary.extrapolate_velocity = forgetful  # type: ignore[assignment, method-assign]

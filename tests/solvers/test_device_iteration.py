@@ -15,6 +15,7 @@ import warp_lcp as wl
 from default_run import few
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.kernels.readback import BYTES, LINE, DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.reduced.device_iteration import DeviceIteration
@@ -25,7 +26,7 @@ emulated = pytest.mark.skipif(
 SOLVER = wl.ProjectedMultigrid()
 
 
-def random_problem(rng: np.random.Generator, bodies: int = 0) -> tuple[wl.LCP, wp.array[Any]]:
+def random_problem(rng: np.random.Generator, bodies: int = 0) -> tuple[wl.LCP, DeviceArray]:
     """Return a random problem in place and its right-hand side.
 
     In place, as simulators have them, of any shape, cells, bounds and size. With bodies A has a
@@ -64,7 +65,7 @@ def random_weights(rng: np.random.Generator, bodies: int) -> np.ndarray:
     return W
 
 
-def change(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator) -> None:
+def change(problem: wl.LCP, b: DeviceArray, rng: np.random.Generator) -> None:
     """Set another right-hand side: rough or smooth, large or small, sometimes 0."""
     inside = problem.unknown.numpy() == 1
     values = (
@@ -117,7 +118,7 @@ def test_solves_are_those_of_the_host(
 
 
 def solved_in_turn(
-    problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator, works: tuple[Any, ...], bodies: int
+    problem: wl.LCP, b: DeviceArray, rng: np.random.Generator, works: tuple[Any, ...], bodies: int
 ) -> None:
     """Solve problems with bodies one after another from both workspaces.
 
@@ -377,7 +378,7 @@ def test_what_is_not_finite_is_found_by_both(wrong: float, both: Any) -> None:
     assert one[2] is other[2] is wl.SolveStatus.NON_FINITE
 
 
-def liquid_below_air(least: float) -> tuple[wl.LCP, wp.array[Any]]:
+def liquid_below_air(least: float) -> tuple[wl.LCP, DeviceArray]:
     """Return a problem of cells with air above and one lower bound.
 
     Its right-hand side is returned too.

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 import warp as wp
@@ -21,6 +21,7 @@ from warp_lcp.cli.view_commands import export, looked_on, render, serve, view
 from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.extras.viewer import check_window
+from warp_lcp.files.tables import Tables
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.protocol import families
@@ -459,7 +460,7 @@ def solve(
     rank_timeout: RankTimeout = LIMIT,
 ) -> None:
     """Solve y = A x + b, lower <= x <= upper, from files or a recorded problem."""
-    options: dict[str, Any] = {
+    options: Tables = {
         "method": method,
         "tolerance": tolerance,
         "max_iterations": max_iterations,
@@ -584,7 +585,7 @@ def bench(
         if compare is not None:
             tell(installed[suite].compare(*compare))
             return
-        options: dict[str, Any] = ({"scene": scene} if scene else {}) | (
+        options: Tables = ({"scene": scene} if scene else {}) | (
             {} if seed is None else {"seed": seed}
         )
         if not shared:  # called on every rank

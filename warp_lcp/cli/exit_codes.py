@@ -6,7 +6,7 @@ import errno
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 import typer
 
@@ -17,7 +17,7 @@ from warp_lcp.simulation import InputError
 
 FAILED = 1
 WRONG_INPUT = 2
-_SHOW: Any = warnings.showwarning
+_SHOW = warnings.showwarning
 
 
 @contextmanager

@@ -12,14 +12,16 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from warp_lcp.files.size_limits import ClaimError, check_claim, free_host_memory, read_whole
 
-PACKED: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open}
+PACKED: dict[str, Callable[[Path], gzip.GzipFile | bz2.BZ2File]] = {
+    ".gz": gzip.open,
+    ".bz2": bz2.open,
+}
 HEADER = re.compile(
     rb"%%MatrixMarket[ \t]+matrix[ \t]+(?P<form>coordinate|array)[ \t]+"
     rb"(?P<field>real|double|integer|unsigned-integer|pattern|complex)[ \t]+"
@@ -31,6 +33,7 @@ HEADER = re.compile(
 COPIES = 5  # copies of the text in memory: the shortest number has 2 bytes, and 8 after conversion
 NUMBER = 8  # bytes
 HEAD = 1 << 16  # bytes that are searched for a header before the whole file is read
+Matrix = scipy.sparse.csr_array | np.ndarray  # of a file, float64
 Fits = Callable[[int, int], bool]  # whether a matrix of these sizes is allowed
 
 
@@ -64,7 +67,7 @@ def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
     return rows, columns
 
 
-def read_market(path: Path, fits: Fits, expected: str) -> Any:
+def read_market(path: Path, fits: Fits, expected: str) -> Matrix:
     """Read a matrix: scipy.sparse (CSR) or numpy, as in the file, float64.
 
     Args:
@@ -139,7 +142,7 @@ def _sparse(
     table = _numbers(
         body, width * entries, what, NUMBER * (rows + columns + 2 * width * entries)
     ).reshape(entries, width)
-    kind: Any = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
+    kind: type[np.integer] = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
     with np.errstate(invalid="ignore"):  # conversion changes an index that is no whole number
         row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.io
 import scipy.sparse
 from rich.table import Table
 
-from warp_lcp.cli.matrix_market import Fits, MarketError, read_market, read_shape
+from warp_lcp.cli.matrix_market import Fits, MarketError, Matrix, read_market, read_shape
 from warp_lcp.default import solve
 from warp_lcp.files.atomic import replacing
 from warp_lcp.operators import DenseOperator, SparseOperator
@@ -21,6 +20,7 @@ from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import families
 from warp_lcp.problem.result import SolveResult
+from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.settings import SettingError
@@ -43,7 +43,7 @@ class FileOutcome:
     """
 
     problem: LCP
-    solver: Any
+    solver: Solver | None
     name: str
     result: SolveResult
 
@@ -182,7 +182,7 @@ def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> Stopp
         raise ProblemError(f"--{option} {error.value}: must be {error.rule}") from error
 
 
-def read_matrix(path: Path) -> Any:
+def read_matrix(path: Path) -> Matrix:
     """Return a square matrix, scipy.sparse or numpy, as stored in the file.
 
     Raises:
@@ -200,7 +200,7 @@ def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
         ProblemError: the file cannot be read, or is no such vector.
     """
     matrix = _read(path, *_vector_of(n), infinite=infinite)
-    return (matrix.toarray() if scipy.sparse.issparse(matrix) else matrix).ravel()
+    return (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).ravel()
 
 
 def write_vector(path: Path, x: np.ndarray) -> None:
@@ -245,14 +245,14 @@ def _told(path: Path) -> Iterator[None]:
         raise ProblemError(f"{path}: {error}") from error
 
 
-def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> Any:
+def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> Matrix:
     """Return the matrix in a file of an allowed shape, with finite real numbers.
 
     Or also infinite ones, if `infinite` is set.
     """
     with _told(path):
         matrix = read_market(path, fits, expected)
-    values = matrix.data if scipy.sparse.issparse(matrix) else matrix
+    values = matrix if isinstance(matrix, np.ndarray) else matrix.data
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     if wrong.any():
         raise ProblemError(
@@ -286,7 +286,7 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
     return side if side.ndim else float(side)
 
 
-def method_named(name: str, family: str, *, shared: bool = False) -> Any:
+def method_named(name: str, family: str, *, shared: bool = False) -> Solver:
     """Return a method by its name, for a family of operators.
 
     With `shared`, for several ranks.

@@ -9,7 +9,7 @@ import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from warp_lcp.cli.solve_file import FileOutcome, criteria, method_named
 from warp_lcp.default import solve
 from warp_lcp.default_chain import default_chain
 from warp_lcp.files.atomic import replacing, replacing_by_name
+from warp_lcp.files.tables import Tables
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import FLOAT32_ROUNDING
@@ -179,9 +180,9 @@ def _problem(
     cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
     # Tolerances below the accuracy of float32 need the file's own precision.
     kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32
-    coefficients: dict[str, Any] = {**kept, "device": device, "dtype": kind}
+    coefficients: Tables = {**kept}
     return LCP(
-        GridPoisson(cells, decomposition=decomposition, **coefficients),
+        GridPoisson(cells, decomposition=decomposition, device=device, dtype=kind, **coefficients),
         b,
         _bound(lower),
         _bound(upper),

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import timedelta
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated
 
 import typer
 
@@ -31,6 +31,7 @@ from warp_lcp.render.photo.photo import (
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.run.devices import devices
+from warp_lcp.run.log import Value
 from warp_lcp.run.progress import Count, Observer
 from warp_lcp.run.terminal import Terminal, say, tell
 
@@ -165,20 +166,29 @@ def render(
             if fps is not None and film is None:
                 raise RenderError("--fps: needs --film")
             refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)
-            exposure: Any = {
-                "samples": SAMPLES if samples is None else samples,
-                "shutter": SHUTTER if shutter is None else shutter,
-            }
             settings = PhotoSettings(
-                size=parse_size(size), show=show, overrides=overrides or (), **exposure
+                size=parse_size(size),
+                show=show,
+                overrides=overrides or (),
+                samples=SAMPLES if samples is None else samples,
+                shutter=SHUTTER if shutter is None else shutter,
             )
             draw = (
                 partial(photograph_film, film=film, rate=check_rate(fps))
                 if film
                 else photograph_run
             )
-            report: Any = {"told": counter, "estimated": estimated, "noted": partial(say, console)}
-            images = list(draw(folder, frames=frame, settings=settings, out=out, **report))
+            images = list(
+                draw(
+                    folder,
+                    frames=frame,
+                    settings=settings,
+                    out=out,
+                    told=counter,
+                    estimated=estimated,
+                    noted=partial(say, console),
+                )
+            )
             tell(f"{film}: {len(images)} frames" if film else _listed(images))
             return
         if samples is not None or shutter is not None:
@@ -321,8 +331,17 @@ class _BegunRun:
     def __init__(self, observer: Observer, begin: Callable[[], None]) -> None:
         self._observer, self._begin = observer, begin
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._observer, name)
+    def note(self, text: str) -> None:
+        """Forward a remark."""
+        self._observer.note(text)
+
+    def step(self, row: Mapping[str, Value]) -> None:
+        """Forward a step's log row."""
+        self._observer.step(row)
+
+    def frame(self, index: int, last: int) -> None:
+        """Forward the number of a frame."""
+        self._observer.frame(index, last)
 
     def start(self, time: float, end: float) -> None:
         """Forward start and end time [s], and call the function."""
@@ -348,4 +367,4 @@ def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> 
                     start_new_session=True,
                 )
 
-        yield cast(Observer, _BegunRun(observer, begin)) if page or window else observer
+        yield _BegunRun(observer, begin) if page or window else observer

@@ -62,17 +62,15 @@ class ArticulatedFigure:
                 f"parents = {self.parents}: expected at least one hinge, and each parent before "
                 "its children"
             )
-        for name, shape in (
-            ("axes", (n, 3)),
-            ("offsets", (n, 3)),
-            ("tips", (e, 3)),
-            ("lower", (n,)),
-            ("upper", (n,)),
+        for name, values, shape in (
+            ("axes", self.axes, (n, 3)),
+            ("offsets", self.offsets, (n, 3)),
+            ("tips", self.tips, (e, 3)),
+            ("lower", self.lower, (n,)),
+            ("upper", self.upper, (n,)),
         ):
-            if np.shape(getattr(self, name)) != shape:
-                raise ValueError(
-                    f"{name} has shape {np.shape(getattr(self, name))}: expected {shape}"
-                )
+            if np.shape(values) != shape:
+                raise ValueError(f"{name} has shape {np.shape(values)}: expected {shape}")
         if e == 0 or not all(0 <= j < n for j in self.effectors):
             raise ValueError(
                 f"effectors = {self.effectors}: expected at least one, each the number of a hinge"

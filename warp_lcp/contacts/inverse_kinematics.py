@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
 
 from warp_lcp.contacts.articulated_figure import ArticulatedFigure
 from warp_lcp.default_chain import default_chain
@@ -45,11 +46,11 @@ class StepProblem:
     lower: Vector
     upper: Vector
 
-    def lcp(self, *, device: Any = None) -> LCP:
+    def lcp(self, *, device: wp.DeviceLike = None) -> LCP:
         """Return the boxed LCP in the step itself: y = H d + c, l <= d <= u."""
         return LCP(DenseOperator(self.H, device=device), self.c, self.lower, self.upper)
 
-    def multipliers(self, *, device: Any = None) -> LCP:
+    def multipliers(self, *, device: wp.DeviceLike = None) -> LCP:
         """Return the book's LCP in the 2n multipliers of the limits.
 
         [Book] eq. 1.143-1.144; all limits must be finite. With B = [I; -I]: H d + c = B'x, so that
@@ -163,7 +164,7 @@ class InverseKinematics(Settings):
     max_iterations: CountOrZero = 500
     curvature: bool = False
     multipliers: bool = False
-    device: Any = None
+    device: wp.DeviceLike = None
 
     def solve(
         self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None
@@ -281,7 +282,7 @@ class InverseKinematics(Settings):
         return radius
 
 
-def _checked(values: Any, shape: tuple[int, ...], name: str) -> Vector:
+def _checked(values: ArrayLike, shape: tuple[int, ...], name: str) -> Vector:
     """Return an array after checks of its shape and of finite numbers."""
     values = np.asarray(values, dtype=np.float64)
     if values.shape != shape:

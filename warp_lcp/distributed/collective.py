@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
 from warp_lcp.distributed.interruptible_wait import finish, waiting
 from warp_lcp.distributed.ranks import Ranks
@@ -24,6 +24,7 @@ from warp_lcp.distributed.watchdog import Watchdog
 # interrupted.
 PATIENCE = 5.0
 SHOWN = 3  # failures in one message
+ValueT = TypeVar("ValueT")
 
 
 class RankFailed(RuntimeError):
@@ -105,11 +106,11 @@ class Collective:
         """Return the context of a block that the root rank executes for all."""
         return self._block(named=False)
 
-    def exchange(self, value: Any) -> list[Any]:
+    def exchange(self, value: ValueT) -> list[ValueT]:
         """Gather an object of every rank."""
         return self._own.collect(value)
 
-    def share(self, value: Any) -> Any:
+    def share(self, value: ValueT) -> ValueT:
         """Broadcast the object of the root rank."""
         return self._own.share(value)
 
@@ -171,7 +172,8 @@ class Collective:
         planned = isinstance(error, self._planned)
         kind = type(error) if planned else RankFailed
         text = str(error) if planned else f"{type(error).__name__}: {error}"
-        return Failure(kind, text, getattr(error, "errno", None), planned, error is self._told)
+        errno = error.errno if isinstance(error, OSError) else None
+        return Failure(kind, text, errno, planned, error is self._told)
 
     def _meet(self, error: BaseException | None, failure: Failure | None) -> list[Failure | None]:
         """Gather the outcome of a block on every rank."""
@@ -234,14 +236,31 @@ def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
         yield f"and {len(ranks) - SHOWN} other messages"
 
 
-def on_root(method: Callable[..., Any]) -> Callable[..., Any]:
+class HasCollective(Protocol):
+    """An object of which the ranks have one each."""
+
+    @property
+    def collective(self) -> Collective:
+        """Collective blocks of the ranks."""
+
+
+HasCollectiveT = TypeVar("HasCollectiveT", bound=HasCollective)
+ArgumentsT = ParamSpec("ArgumentsT")
+ResultT = TypeVar("ResultT")
+
+
+def on_root(
+    method: Callable[Concatenate[HasCollectiveT, ArgumentsT], ResultT],
+) -> Callable[Concatenate[HasCollectiveT, ArgumentsT], ResultT | None]:
     """Run a method on the root rank alone; errors are raised on all ranks.
 
     The object has a `collective`. The other ranks get None.
     """
 
     @functools.wraps(method)
-    def collective(self: Any, *arguments: Any, **options: Any) -> Any:
+    def collective(
+        self: HasCollectiveT, *arguments: ArgumentsT.args, **options: ArgumentsT.kwargs
+    ) -> ResultT | None:
         with self.collective.led():
             return method(self, *arguments, **options) if self.collective.ranks.is_root else None
 

@@ -12,7 +12,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +21,11 @@ from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
+from warp_lcp.kernels.fields import Array
 from warp_lcp.settings import renamed_method
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
 
 # The largest part may exceed an even share by this factor, so that cuts lie at multiples of large
 # powers of two.
@@ -175,12 +179,15 @@ class Decomposition:
         """The ranks as the communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
-    def together(self) -> AbstractContextManager[Any]:
+    def together(self) -> AbstractContextManager[None]:
         """Return a block in which an exception of one rank is raised on all."""
         return self.collective.together()
 
     def check_operator(
-        self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
+        self,
+        shape: tuple[int, ...],
+        periodic: Sequence[bool],
+        coefficients: Mapping[str, Array | None],
     ) -> None:
         """Check that a grid operator fits the boxes; collective.
 
@@ -211,7 +218,8 @@ class Decomposition:
                         "at least two"
                     )
         kinds = [
-            (name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items())
+            (name, (value is not None and np.ndim(value) > 0) or value)
+            for name, value in sorted(coefficients.items())
         ]
         self.ranks.agree("the kind of coefficients", kinds)
 
@@ -226,7 +234,7 @@ class Decomposition:
         return Collective(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
 
     @cached_property
-    def dmda(self) -> Any:
+    def dmda(self) -> PETSc.DMDA:
         """DMDA of PETSc with these boxes: one value per cell, 7-point stencils."""
         PETSc = petsc()
         made = PETSc.DMDA().create(

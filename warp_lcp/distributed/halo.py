@@ -19,8 +19,11 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
+    from petsc4py import PETSc
+
     from warp_lcp.distributed.decomposition import Decomposition
 
 
@@ -56,7 +59,7 @@ class Halo:
         self._forest = (
             star_forest(decomposition.ranks, boxes, stored, shifts=shifts) if several else None
         )
-        self._staging: dict[Any, np.ndarray] = {}
+        self._staging: dict[type, np.ndarray] = {}
         self._coarser: dict[tuple[int, int, int], Halo | None] = {}
 
     @property
@@ -145,7 +148,7 @@ class Halo:
         """Gathering of the fields of all ranks on every rank."""
         return Gathering(self.decomposition)
 
-    def fill(self, field: wp.array[Any] | np.ndarray) -> None:
+    def fill(self, field: DeviceArray | np.ndarray) -> None:
         """Fill the ghost cells of a contiguous field; collective.
 
         The field has shape `shape`, or as many elements.
@@ -157,7 +160,7 @@ class Halo:
             return
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
-    def filling(self, field: wp.array[Any]) -> Task:
+    def filling(self, field: DeviceArray) -> Task:
         """Return the halo exchange of a field, to run now or within a recorded program.
 
         For more than one rank.
@@ -170,7 +173,7 @@ class Halo:
             partial(exchanging, self._forest, field.numpy(), field.numpy()),
         )
 
-    def _fill_through_host(self, field: wp.array[Any]) -> None:
+    def _fill_through_host(self, field: DeviceArray) -> None:
         """Fill a field on a device.
 
         Cells within `width` of the cuts are copied through the host's memory, so that PETSc needs
@@ -227,14 +230,14 @@ class Gathering:
             tuple(n + 2 for n in reversed(decomposition.counts)),
         )
 
-    def collect(self, mine: wp.array[Any], whole: wp.array[Any]) -> None:
+    def collect(self, mine: DeviceArray, whole: DeviceArray) -> None:
         """Write the ranks' cells to the whole grid's field on every rank."""
         source, target = mine.numpy(), whole.numpy()
         exchange(self._forest, source, target)
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def collecting(self, mine: wp.array[Any], whole: wp.array[Any]) -> Task:
+    def collecting(self, mine: DeviceArray, whole: DeviceArray) -> Task:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
             return Task(partial(self.collect, mine, whole))
@@ -243,7 +246,7 @@ class Gathering:
             partial(exchanging, self._forest, mine.numpy(), whole.numpy()),
         )
 
-    def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = launch_now) -> None:
+    def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:
         """Write this rank's part of the whole grid's field to its own, with ghost cells."""
         given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
         launch(take_kernel, self._shape[:2], given, device=mine.device)
@@ -279,13 +282,13 @@ class StarForest:
             content.
     """
 
-    def __init__(self, made: Any) -> None:
+    def __init__(self, made: PETSc.SF) -> None:
         self.handle, self.free = (ctypes.c_uint64 * 1)(), weakref.finalize(self, made.destroy)
         self.made = made
         self.handle[0] = made.handle
-        self.pairs: dict[tuple[int, ...], Any] = {}
+        self.pairs: dict[tuple[int, ...], ctypes.Array[ctypes.c_uint64]] = {}
 
-    def replace(self, made: Any) -> None:
+    def replace(self, made: PETSc.SF) -> None:
         """Free the forest and use another one, also in recorded exchanges; collective."""
         self.free()
         self.made, self.free = made, weakref.finalize(self, made.destroy)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import ctypes
 import math
 import time
-from typing import Any, Self
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 # Seconds that a wait polls: between two operations ranks rarely differ by more.
 AWAKE = 1e-3
@@ -62,7 +65,7 @@ class InterruptibleWait:
 waiting = InterruptibleWait()  # MPI's world is one per process, and only its main thread uses MPI
 
 
-def finish(request: Any, seconds: float = math.inf) -> bool:
+def finish(request: MPI.Request, seconds: float = math.inf) -> bool:
     """Wait for an MPI request for some seconds; return whether it has ended.
 
     The wait does not use a core.

@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping
-from typing import Any
+from types import ModuleType
 
 # Directory of Debian's builds, from which petsc4py chooses by PETSC_DIR.
 DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"
@@ -66,7 +66,7 @@ def find_petsc() -> None:
         sys.path.append(os.path.join(directory, "lib", "python3", "dist-packages"))
 
 
-def petsc() -> Any:
+def petsc() -> ModuleType:
     """Return the PETSc module, with MPI initialized.
 
     Raises:

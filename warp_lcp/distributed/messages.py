@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,8 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.thread_pool import Operation, launched_alone
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from warp_lcp.distributed.halo import StarForest
 
 COUNT, DATA = 7101, 7102  # tags of messages
@@ -42,7 +44,7 @@ class MpiMailbox:
         comm: of mpi4py.
     """
 
-    def __init__(self, comm: Any) -> None:
+    def __init__(self, comm: MPI.Comm) -> None:
         self._comm = comm
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
@@ -193,14 +195,16 @@ class _Library:
 _library = cache(_Library)
 
 
-def handle(of: Any) -> Any:
+def handle(of: MPI.Comm | MPI.Datatype | MPI.Op) -> ctypes.c_int | ctypes.c_void_p:
     """Return the C handle of an mpi4py object.
 
     Open MPI's handles are pointers, MPICH's are numbers.
     """
     from mpi4py import MPI
 
-    kind = ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
+    kind: type[ctypes.c_int] | type[ctypes.c_void_p] = (
+        ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
+    )
     return kind.from_buffer_copy(ctypes.string_at(MPI._addressof(of), MPI._sizeof(of)))
 
 
@@ -244,7 +248,7 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
     listed = [
         (library.units[a.dtype.itemsize].value, a.ctypes.data, b.ctypes.data) for a, b in pairs
     ]
-    key = tuple(word & (1 << 64) - 1 for pair in listed for word in pair)
+    key = tuple((word or 0) & (1 << 64) - 1 for pair in listed for word in pair)
     words = forest.pairs.setdefault(key, (ctypes.c_uint64 * len(key))(*key))
     given = [
         *functions,
@@ -256,7 +260,7 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
     return _operation(exchange_kernel, given, (forest, words, pairs))
 
 
-def adding(comm: Any, sums: np.ndarray) -> Operation:
+def adding(comm: MPI.Comm, sums: np.ndarray) -> Operation:
     """Return an operation that replaces float64 sums by those over all ranks.
 
     The partial sums are added in the order of the ranks. The operation runs in the thread pool.
@@ -274,9 +278,9 @@ def adding(comm: Any, sums: np.ndarray) -> Operation:
     )
 
 
-def _operation(kernel: Any, given: list[Any], kept: Any) -> Operation:
+def _operation(kernel: wp.Kernel, given: Sequence[int | None], kept: object) -> Operation:
     # Handles of MPICH may be negative.
-    words = [word & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]
+    words = [(word or 0) & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]
     launch = wp.launch(kernel, 1, words, device="cpu", record_cmd=True)
     operation = launched_alone(launch, kept)
     operation.check = _check_native

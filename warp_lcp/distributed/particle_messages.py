@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.grid.particles import MOST_A_CELL, Particles
-from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.memory import Scalar, Slot
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
@@ -41,7 +43,7 @@ class Buffer:
         host: the same as a NumPy array.
     """
 
-    def __init__(self, dtype: Any) -> None:
+    def __init__(self, dtype: type) -> None:
         self._dtype, self._slot = dtype, Slot()
         self._allocate(1)
 
@@ -61,7 +63,7 @@ class Buffer:
         self.host[: values.size] = values.ravel()
 
     def _allocate(self, count: int) -> None:
-        self.array: wp.array[Any] = wp.empty(count, dtype=self._dtype, device="cpu")
+        self.array: DeviceArray = wp.empty(count, dtype=self._dtype, device="cpu")
         self.host: np.ndarray = self.array.numpy()
         self._slot.point_to(self.array)
 
@@ -89,7 +91,7 @@ class ParticleMessages:
         self._bounds = bounds_of(part)
         self._end = beyond(part.decomposition.counts, part.grid.spacing)
         self._ends = self._take_boxes()
-        self._copies: dict[str, wp.array[Any]] = {}
+        self._copies: dict[str, DeviceArray] = {}
         # Columns of a GPU are copied to new arrays in each run.
         copied = particles.grid.device.is_cuda
         launches = (
@@ -209,7 +211,7 @@ class ParticleMessages:
         for name, column in self._copies.items():
             self._particles.arrays()[name].assign(column)
 
-    def _columns(self, positions_only: bool = False) -> dict[str, wp.array[Any] | None]:
+    def _columns(self, positions_only: bool = False) -> dict[str, DeviceArray | None]:
         """Return the columns in the host's memory."""
         arrays = self._copies or self._particles.arrays()
         return dict.fromkeys(COLUMNS) | (
@@ -284,7 +286,7 @@ class ParticleMessages:
         self._bind(GIVE_PLACES, given | numbers)
 
     @property
-    def _border_found(self) -> dict[str, wp.array[Any]]:
+    def _border_found(self) -> dict[str, DeviceArray]:
         return {
             "boxes": self._boxes.array,
             "border": self._border.array,
@@ -293,15 +295,11 @@ class ParticleMessages:
         }
 
     @property
-    def _placed(self) -> dict[str, Any]:
-        placement = self.part.grid.placement
-        return {
-            name: getattr(placement, name)
-            for name in ("planes", "dx", "inverse_dx", "before_x", "before_y", "before_z")
-        }
+    def _placed(self) -> dict[str, float | int]:
+        return asdict(self.part.grid.placement)
 
-    def _bind(self, kernel: Any, given: dict[str, Any]) -> None:
-        kernel.bind(Rows.entries(1, self._device), **given).launch()
+    def _bind(self, kernel: StencilKernel, given: Mapping[str, object]) -> None:
+        kernel.bind_arguments(Rows.entries(1, self._device), (), dict(given)).launch()
 
 
 def bounds_of(part: Subdomain) -> dict[str, float]:

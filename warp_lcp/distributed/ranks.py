@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 import warp as wp
@@ -15,6 +16,14 @@ from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import adding
 from warp_lcp.kernels.thread_pool import Operation
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+    from petsc4py import PETSc
+
+
+ValueT = TypeVar("ValueT")
+NumbersT = TypeVar("NumbersT", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Ranks:
         comm: of mpi4py.
     """
 
-    comm: Any
+    comm: MPI.Comm
 
     @classmethod
     def world(cls) -> Ranks:
@@ -58,7 +67,7 @@ class Ranks:
         """Whether this is rank 0, which writes files and prints."""
         return self.rank == 0
 
-    def gather(self, values: Any) -> np.ndarray:
+    def gather(self, values: float | Sequence[float] | np.ndarray) -> np.ndarray:
         """Return an array of every rank (MPI allgather).
 
         All arrays have the same shape; the result has shape (ranks, *values.shape).
@@ -71,21 +80,21 @@ class Ranks:
             self.comm.Allgather(mine, everyone)
         return everyone
 
-    def collect(self, value: Any) -> list[Any]:
+    def collect(self, value: ValueT) -> list[ValueT]:
         """Return an object of every rank, in rank order; objects must be picklable."""
         if self.size == 1:
             return [value]
         with waiting("a gather"):
             return list(self.comm.allgather(value))
 
-    def share(self, value: Any) -> Any:
+    def share(self, value: ValueT) -> ValueT:
         """Return the object of the root rank (broadcast); it must be picklable."""
         if self.size == 1:
             return value
         with waiting("a broadcast"):
             return self.comm.bcast(value)
 
-    def sum(self, values: Any) -> Any:
+    def sum(self, values: NumbersT) -> NumbersT:
         """Return the sum over the ranks of a number or an array."""
         return self._shaped(self.gather(values).sum(axis=0), values)
 
@@ -103,24 +112,24 @@ class Ranks:
             self.comm.Allreduce(counts, everyone)
         return everyone
 
-    def max(self, values: Any) -> Any:
+    def max(self, values: NumbersT) -> NumbersT:
         """Return the maximum over the ranks, entry by entry; NaN if any is NaN."""
         return self._shaped(self.gather(values).max(axis=0), values)
 
-    def min(self, values: Any) -> Any:
+    def min(self, values: NumbersT) -> NumbersT:
         """Return the minimum over the ranks, entry by entry; NaN if any is NaN."""
         return self._shaped(self.gather(values).min(axis=0), values)
 
     def any(self, condition: bool) -> bool:
         """Return whether a condition holds on any rank."""
-        return bool(self.gather(np.uint8(bool(condition))).any())
+        return bool(self.gather(np.array(bool(condition), dtype=np.uint8)).any())
 
     def join(self, key: bytes) -> bytes:
         """Return a 16-byte key computed from the keys of all ranks."""
         mine = np.frombuffer(hashlib.blake2b(key, digest_size=16).digest(), dtype=np.uint8)
         return hashlib.blake2b(self.gather(mine).tobytes(), digest_size=16).digest()
 
-    def agree(self, name: str, value: Any) -> None:
+    def agree(self, name: str, value: object) -> None:
         """Check that a picklable value is the same on all ranks.
 
         Raises:
@@ -153,8 +162,8 @@ class Ranks:
         return _in_rows(self.comm.py2f(), count)
 
     @staticmethod
-    def _shaped(found: np.ndarray, values: Any) -> Any:
-        return found if np.ndim(values) else found.item()
+    def _shaped(found: np.ndarray, values: NumbersT) -> NumbersT:
+        return cast(NumbersT, found if np.ndim(values) else found.item())
 
 
 @cache
@@ -171,7 +180,7 @@ def _in_rows(handle: int, count: int) -> Ranks:
 
 
 @cache
-def _world() -> Any:
+def _world() -> PETSc.Comm:
     """Return PETSc's own communicator of all ranks, kept for the life of this process.
 
     PETSc creates it with the first object on a communicator, which is a collective operation, and

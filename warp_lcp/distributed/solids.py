@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,16 +45,22 @@ def boundary_of_part(
     """
     grid, ranks, domain = part.grid, part.ranks, scene.domain
     ends = part.cuts | side_bits(domain.open)
-    walls: dict[str, Any] = {"wall_separating": domain.wall == "separating", "remarks": False}
+    separating = domain.wall == "separating"
     sides = PeriodicSides(grid, scene.endless) if scene.endless else None
     shapes: list[Geometry] = []
     if domain.solids == "cut-cell":
         open_sides = side_bits(domain.open)
         thin = make_thin_walls(scene, grid, solids, open_sides, crossing=False)
         crossing = make_thin_walls(scene, grid, solids, open_sides, crossing=True)
-        left_out = crossing.everywhere if crossing is not None else ()
-        held = crossing.numbers if crossing is not None else ()
-        cut = CutCells(grid, solids, open_sides=ends, left_out=left_out, held=held, **walls)
+        cut = CutCells(
+            grid,
+            solids,
+            open_sides=ends,
+            left_out=crossing.everywhere if crossing is not None else (),
+            held=crossing.numbers if crossing is not None else (),
+            wall_separating=separating,
+            remarks=False,
+        )
         if thin is not None or ranks.any(not cut.whole_cells):
             barriers = Barriers(grid, crossing, cut) if crossing is not None else None
             grid.divide(barriers)
@@ -63,9 +69,15 @@ def boundary_of_part(
             return boundary, [*cut.notes, *(barriers.notes() if barriers is not None else ())]
         shapes = [solid.geometry for solid in solids]
     notes = start_notes(solids, grid)
-    voxels = voxelize(grid, solids, open_sides=with_periodic(ends, sides), **walls)
+    voxels = voxelize(
+        grid,
+        solids,
+        open_sides=with_periodic(ends, sides),
+        wall_separating=separating,
+        remarks=False,
+    )
     notes += small_notes(
-        (solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing
+        (solid.name for solid in solids), ranks.sum(np.array([*voxels.covered, 0])), grid.spacing
     )
     part.fill(voxels.index)
     still = np.zeros((1 + len(solids), 3)) if scene.source else None

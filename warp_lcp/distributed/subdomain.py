@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
-from typing import Any, no_type_check
+from typing import Any, cast, no_type_check
 
 import numpy as np
 import warp as wp
@@ -20,15 +20,17 @@ from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exc
 from warp_lcp.distributed.migration import cuts_of, migrate
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
+from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.grid.cell_box import CellBox
-from warp_lcp.grid.part import BodyNumbers, Corner, GridPart
+from warp_lcp.grid.part import BodyNumbers, Corner, FieldT, GridPart
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Task, is_recording, launch, run_table
 from warp_lcp.kernels.thread_pool import Operation, OperationTable, team
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, convert
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
@@ -75,7 +77,7 @@ def _stays(field: wp.array | np.ndarray) -> bool:
     return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
 
 
-def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
+def copy_cells(to: DeviceArray, source: DeviceArray) -> None:
     """Copy cells of a field to another, now or recorded; both may be views."""
     if is_recording():
         launch(copy_kernel, to.shape[:2], [to, source], device=to.device)
@@ -127,6 +129,8 @@ class Subdomain(GridPart):
     """
 
     shared = True
+    decomposition: Decomposition
+    ranks: Ranks
 
     def __init__(
         self,
@@ -134,7 +138,7 @@ class Subdomain(GridPart):
         *,
         spacing: float,
         dimension: int,
-        device: Any,
+        device: wp.DeviceLike,
         layers: int,
         mailbox: Mailbox | None = None,
         balance: Balance = DEFAULT_BALANCE,
@@ -146,9 +150,9 @@ class Subdomain(GridPart):
             tuple(decomposition.joined),
         )
         self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
-        self._fillings: dict[Any, OperationTable] = {}
+        self._fillings: dict[Hashable, OperationTable] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
-        self._gathering: Any = None
+        self._gathering: StarForest | None = None
         self._trees: TreesAtCuts | None = None
         self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # key: layers around the box
         for axis in decomposition.cut_axes:
@@ -343,7 +347,7 @@ class Subdomain(GridPart):
         ).grid
 
     @property
-    def row_ranks(self) -> Any:
+    def row_ranks(self) -> Ranks | None:
         """Ranks with cells of the same rows along x, in order; None if x is not cut."""
         return (
             self.ranks.in_rows(self.decomposition.processes[0])
@@ -460,7 +464,7 @@ class Subdomain(GridPart):
         operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
         return Task(partial(_fill, forest, fields), operation)
 
-    def _fill_again(self, forest: StarForest, fields: Sequence[Any]) -> None:
+    def _fill_again(self, forest: StarForest, fields: Sequence[wp.array]) -> None:
         """Fill fields that were filled before, by the exchange set up then."""
         key = forest, *((field.ptr, field.dtype) for field in fields)
         if key not in self._fillings:
@@ -496,7 +500,7 @@ class Subdomain(GridPart):
         """Write this part's values of a whole-grid field to a field of the part."""
         wp.copy(field, whole[self._cells(self.box).grown(1).moved((1, 1, 1)).slices])
 
-    def box_of(self, field: wp.array, ring: int = 0) -> Any:
+    def box_of(self, field: FieldT, ring: int = 0) -> FieldT:
         """Return the view of a field on the box and some cells around it.
 
         The field may be on the host or a device, and may have layers.
@@ -504,7 +508,7 @@ class Subdomain(GridPart):
         low, high = self.owned.low, self.owned.high
         edge = (ring if self.dimension == 3 else 0, ring, ring)
         box = (slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))
-        return field[(slice(None),) * (field.ndim - 3) + tuple(box)]
+        return cast(FieldT, field[(slice(None),) * (field.ndim - 3) + tuple(box)])
 
     @property
     def known(self) -> CellBox:
@@ -518,7 +522,7 @@ class Subdomain(GridPart):
         """Return the view of a host field on the cells that this rank owns."""
         return field[self.known.slices]
 
-    def stored_box_of(self, field: wp.array) -> Any:
+    def stored_box_of(self, field: wp.array) -> wp.array:
         """Return the view of a field on the box and one cell around it.
 
         It has the stored shape of such a box.

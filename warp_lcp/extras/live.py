@@ -19,19 +19,24 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any
+from typing import cast
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.files.atomic import open_in_place
-from warp_lcp.grid.motion import Pose
+from warp_lcp.files.tables import Tables
+from warp_lcp.grid.motion import Motion, Pose
+from warp_lcp.grid.solids import Geometry
 from warp_lcp.render.recording import PALETTES, Recording, RenderError, Show
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.run.folder import read_record
 from warp_lcp.scene.camera import viewpoint
 from warp_lcp.simulation import InputError
+
+ClientAddress = tuple[str, int]  # of TCP/IP: host and port
+Request = socket.socket | tuple[bytes, socket.socket]  # of `socketserver`; here a connection
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765  # default
@@ -79,13 +84,13 @@ class Live:
         late = self.show is None and liquid and getattr(output, "surface", False)
         return Recording(self.folder, show=Show.SURFACE) if late else recording
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Tables:
         """Return the numbers of the frames, and the data needed to draw them.
 
         The data exist once there is a frame.
         """
         record = read_record(self.folder)
-        state: dict[str, Any] = {
+        state: Tables = {
             "status": record.get("status", "not begun"),
             "reason": record.get("reason", ""),
             "frames": [],
@@ -166,7 +171,7 @@ class Live:
         return self._recording.particle_spacing()
 
     @cached_property
-    def _solids(self) -> list[tuple[Any, Any]]:
+    def _solids(self) -> list[tuple[Geometry, Motion | None]]:
         scene = self._recording.scene
         return [
             (
@@ -281,7 +286,7 @@ class LiveServer(ThreadingHTTPServer):
         """Return the address for a browser."""
         return f"http://{LOOPBACK}:{self.server_port}/"
 
-    def get_request(self) -> tuple[socket.socket, Any]:
+    def get_request(self) -> tuple[socket.socket, ClientAddress]:
         """Accept a connection; without a free descriptor, wait before the error.
 
         The server's loop would try again at once.
@@ -292,7 +297,7 @@ class LiveServer(ThreadingHTTPServer):
             time.sleep(SHORTAGE)
             raise
 
-    def process_request(self, request: Any, client_address: Any) -> None:
+    def process_request(self, request: Request, client_address: ClientAddress) -> None:
         """Answer on a thread; the oldest connection is closed if there are too many."""
         with self._counting:
             full = self._answered >= MOST_ANSWERED
@@ -302,19 +307,19 @@ class LiveServer(ThreadingHTTPServer):
                 del self._open[oldest]
                 with suppress(OSError):
                     oldest.shutdown(socket.SHUT_RDWR)  # its thread gets an error and closes it
-            self._open[request] = None
+            self._open[cast(socket.socket, request)] = None
         if full:
             return self.shutdown_request(request)
         return super().process_request(request, client_address)
 
-    def shutdown_request(self, request: Any) -> None:
+    def shutdown_request(self, request: Request) -> None:
         """Close a connection, answered or not."""
         with self._counting:
-            self._open.pop(request, None)
+            self._open.pop(cast(socket.socket, request), None)
             self._answered -= 1
         super().shutdown_request(request)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, request: Request, client_address: ClientAddress) -> None:
         """Ignore errors of closed browsers."""
 
 

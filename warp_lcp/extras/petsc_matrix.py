@@ -12,7 +12,7 @@ import math
 import weakref
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import warp as wp
@@ -20,6 +20,7 @@ import warp as wp
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
@@ -27,8 +28,12 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.protocol import HasStencil
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
     from petsc4py import PETSc
 
+    from warp_lcp.distributed.decomposition import Decomposition
+
+ObjectT = TypeVar("ObjectT", bound="PETSc.Object")
 KERNELS = KernelFile(Path(__file__).parent / "headers/petsc_matrix.h")
 ENTER = KERNELS["vector_copies.enter"]
 LEAVE = KERNELS["vector_copies.leave"]
@@ -50,7 +55,7 @@ class VectorCopies:
         sizes: local and global length of the vectors, as PETSc takes them.
     """
 
-    def __init__(self, stencil: PaddedStencil, comm: Any) -> None:
+    def __init__(self, stencil: PaddedStencil, comm: MPI.Comm | PETSc.Comm) -> None:
         self.stencil, self.comm, self.device = stencil, comm, stencil.device
         self._n = math.prod(stencil.padding.counts)
         self.sizes = self._n, None  # PETSc computes the sum over ranks
@@ -72,7 +77,7 @@ class VectorCopies:
         v.setType(PETSc.Vec.Type.STANDARD)
         return v
 
-    def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
+    def enter(self, v: PETSc.Vec, field: DeviceArray, scale: float = 1.0) -> None:
         """Set the field to scale v on the unknowns, and to 0 on the other cells.
 
         Ghost cells keep their values.
@@ -83,7 +88,7 @@ class VectorCopies:
         ).launch()
 
     def leave(
-        self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
+        self, field: DeviceArray, others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
     ) -> None:
         """Set v to scale times the field on the unknowns.
 
@@ -98,7 +103,7 @@ class VectorCopies:
         if self._staging:
             values[:] = target.numpy()
 
-    def _seen(self, values: np.ndarray, buffer: int) -> wp.array[Any]:
+    def _seen(self, values: np.ndarray, buffer: int) -> DeviceArray:
         """Return a vector's memory on the device: itself on the CPU, a copy on a GPU."""
         if not self._staging:
             return wp.array(
@@ -230,14 +235,14 @@ class PetscGrid:
         A: HasStencil,
         hierarchy: Hierarchy | None = None,
         *,
-        real: Any = wp.float32,
+        real: type = wp.float32,
         cycle: CycleSettings | None = None,
     ) -> None:
         self._A, comm = A, communicator(A)
         # Objects that ranks share are destroyed when all ranks have released them and PETSc
         # collects garbage.
         petsc().garbage_cleanup(comm)
-        self._kept: list[Any] = []
+        self._kept: list[PETSc.Object] = []
         weakref.finalize(self, _let_go, self._kept).atexit = False
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=False, settings=cycle)
         finest = self.hierarchy.finest.stencil
@@ -254,7 +259,7 @@ class PetscGrid:
             StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat()
         )
 
-    def vector(self, field: Any = None) -> PETSc.Vec:
+    def vector(self, field: np.ndarray | None = None) -> PETSc.Vec:
         """Return a vector with the values of a field of A's shape; zeros if None."""
         v = self.copies.vector()
         if field is not None:
@@ -265,7 +270,7 @@ class PetscGrid:
         """Return the values of a vector as a field of A's shape, a copy."""
         return v.getArray(readonly=True).reshape(self._A.shape).copy()
 
-    def hold(self, free: wp.array[Any]) -> None:
+    def hold(self, free: DeviceArray) -> None:
         """Set another free set, a stored uint8 field; other unknowns are held fixed."""
         self.hierarchy.hold(self._A.stencil.d, free)
         self.hierarchy.rebuild_changed()
@@ -292,7 +297,7 @@ class PetscGrid:
         self._keep(ksp.getPC())
         return ksp
 
-    def _keep(self, thing: Any) -> Any:
+    def _keep(self, thing: ObjectT) -> ObjectT:
         """Return a proxy of a Python object with one reference more.
 
         The reference lives as long as this grid. At the end of a program PETSc destroys its
@@ -303,13 +308,13 @@ class PetscGrid:
         return thing
 
 
-def _let_go(kept: list[Any]) -> None:
+def _let_go(kept: list[PETSc.Object]) -> None:
     """Make PETSc destroy objects that are no longer referenced."""
     for thing in kept:
         thing.decRef()
 
 
-def communicator(A: HasStencil) -> Any:
+def communicator(A: HasStencil) -> MPI.Comm | PETSc.Comm:
     """Return PETSc's or mpi4py's communicator of the ranks that share an operator."""
-    decomposition: Any = getattr(A, "decomposition", None)
+    decomposition: Decomposition | None = getattr(A, "decomposition", None)
     return petsc().COMM_SELF if decomposition is None else decomposition.ranks.comm

@@ -8,18 +8,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.files.atomic import make_folder, replacing_by_name
+from warp_lcp.grid.motion import Motion
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
 from warp_lcp.render.recording import WITH_PARTICLES, WITH_SURFACE, Recording, RenderError, Show
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.shapes import PlaneTable
 from warp_lcp.simulation import Surface
+
+if TYPE_CHECKING:
+    from pxr import Gf, Usd, UsdGeom, Vt
 
 INSTALL = "pip install 'warp-lcp[usd]'"
 TEXT = ".usda"
@@ -148,7 +152,7 @@ class UsdStage:
             self._surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         self._particles = self._points(color) if recording.show in WITH_PARTICLES else None
         self._moving = self._solids()
-        self._bodies: dict[int, tuple[np.ndarray, Any]] = {}
+        self._bodies: dict[int, tuple[np.ndarray, UsdGeom.XformOp]] = {}
 
     def add(self, number: int) -> None:
         """Add a frame.
@@ -199,7 +203,7 @@ class UsdStage:
         """
         return round(self._time.frame_time(number) * self._rate, 6)
 
-    def _solids(self) -> list[tuple[Any, Any]]:
+    def _solids(self) -> list[tuple[Motion, UsdGeom.XformOp]]:
         """Write the prescribed solids; return motions and transforms of moving ones."""
         moving = []
         for number, solid in enumerate(prescribed_solids(self._recording.scene)):
@@ -231,7 +235,7 @@ class UsdStage:
                 _matrix(Rotation.align_vectors(points, at_first)[0].as_matrix(), middle), code
             )
 
-    def _shape(self, name: str, color: str) -> Any:
+    def _shape(self, name: str, color: str) -> UsdGeom.Mesh | UsdGeom.BasisCurves:
         """Define a mesh of triangles, in 2-D curves of one segment each."""
         from pxr import UsdGeom
 
@@ -246,7 +250,7 @@ class UsdStage:
         shape.CreateDisplayColorAttr(_color(color))
         return shape
 
-    def _points(self, color: str) -> Any:
+    def _points(self, color: str) -> UsdGeom.Points:
         """Define the particles."""
         from pxr import UsdGeom
 
@@ -257,10 +261,10 @@ class UsdStage:
 
     def _set_shape(
         self,
-        shape: Any,
+        shape: UsdGeom.Mesh | UsdGeom.BasisCurves,
         points: np.ndarray,
         corners: np.ndarray,
-        when: Any,
+        when: Usd.TimeCode | float,
         velocity: np.ndarray | None = None,
     ) -> None:
         counts = _integers(np.full(len(corners), corners.shape[1]))
@@ -292,7 +296,11 @@ def vertex_normals(surface: Surface) -> np.ndarray:
 
 
 def _set_points(
-    prim: Any, points: np.ndarray, when: Any, velocity: np.ndarray | None, width: float
+    prim: UsdGeom.PointBased,
+    points: np.ndarray,
+    when: Usd.TimeCode | float,
+    velocity: np.ndarray | None,
+    width: float,
 ) -> None:
     """Set points [m], velocities [m/s] and extent of a prim at a time code."""
     prim.GetPointsAttr().Set(_vectors(points), when)
@@ -306,7 +314,7 @@ def _set_points(
     prim.GetExtentAttr().Set(_vectors(np.asarray(extent)), when)
 
 
-def _set_width(prim: Any, width: float) -> None:
+def _set_width(prim: UsdGeom.Points | UsdGeom.Curves, width: float) -> None:
     """Set one width [m] for all points of curves or of a point cloud."""
     from pxr import UsdGeom
 
@@ -314,19 +322,19 @@ def _set_width(prim: Any, width: float) -> None:
     prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
 
 
-def _vectors(values: np.ndarray) -> Any:
+def _vectors(values: np.ndarray) -> Vt.Vec3fArray:
     from pxr import Vt
 
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(np.nan_to_num(values), dtype=np.float32))
 
 
-def _integers(values: np.ndarray) -> Any:
+def _integers(values: np.ndarray) -> Vt.IntArray:
     from pxr import Vt
 
     return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32))
 
 
-def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Any:
+def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Gf.Matrix4d:
     """Return a transform as a USD matrix, for row vectors."""
     from pxr import Gf
 
@@ -335,7 +343,7 @@ def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Any:
     return Gf.Matrix4d(matrix.tolist())
 
 
-def _color(code: str) -> Any:
+def _color(code: str) -> Vt.Vec3fArray:
     """Return a color such as #4aa9ee as a USD color."""
     parts = [int(code[place : place + 2], 16) / 255 for place in (1, 3, 5)]
     return _vectors(np.array([parts]) ** DISPLAY_GAMMA)

@@ -11,13 +11,17 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from warp_lcp.render.page import INK
 from warp_lcp.render.recording import Recording, RenderError
 from warp_lcp.render.render import INSTALL, Looks
 from warp_lcp.render.solid_meshes import EDGE
 from warp_lcp.run.folder import read_record
+
+if TYPE_CHECKING:
+    import pyvista
+    from vtkmodules.vtkInteractionWidgets import vtkSliderWidget
 
 WINDOW = 1280, 720  # initial size in pixels
 # Fallbacks of VTK without a display.
@@ -38,7 +42,10 @@ class Viewer:
     """
 
     def __init__(
-        self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter
+        self,
+        recording: Recording,
+        plotter: pyvista.Plotter,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         from warp_lcp.render.picture import Picture
 
@@ -48,7 +55,7 @@ class Viewer:
         # Time and index at the start of playing.
         self.playing_since: tuple[float, int] | None = None
         self._looked = clock()
-        self._slider: Any = None
+        self._slider: vtkSliderWidget | None = None
         self._add_controls()
         self.go(0)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self, cast
+from typing import Literal, Protocol, Self, cast
 
 from warp_lcp.files.atomic import make_folder, write_text
 from warp_lcp.frames.meshio_format import (
@@ -41,7 +41,7 @@ END = b"</VTKFile>\n"  # end of complete files
 
 GridFormat = Literal["vtu", "vti"]
 # Writer and file size of a part, by format.
-OWN_FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {
+OWN_FORMATS: dict[str, tuple[Callable[..., None], Callable[..., int]]] = {
     "vtu": (write_vtu, vtu_bytes),
     "vti": (write_vti, vti_bytes),
     "nvdb": (write_nvdb, nvdb_bytes),

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,6 +21,9 @@ import numpy as np
 from warp_lcp.files.atomic import replacing_by_name
 from warp_lcp.frames.vtu import Mesh, mesh_of, vtu_bytes
 from warp_lcp.simulation import Cells, Points, Surface, Volume
+
+if TYPE_CHECKING:
+    import meshio
 
 FrameFormat = Literal[  # formats that meshio reads back unchanged
     "vtu",
@@ -71,7 +75,7 @@ SUFFIXES = {  # suffixes of meshio's formats, by name; the first uncompressed on
 WRITTEN_ONLY = {"mdpa", "tecplot"}  # meshio's readers of these accept truncated files
 FORMAT_OF = {suffix: name for name, suffix in SUFFIXES.items()}
 MODULES = {"dolfin-xml": "dolfin"}  # modules of meshio whose names differ from the format's
-OPTIONS: dict[str, dict[str, Any]] = {
+OPTIONS: dict[str, dict[str, str | bool]] = {
     "xdmf": {"data_format": "XML"},  # one file; HDF would be a second one, which needs h5py
     "stl": {"binary": True},
 }
@@ -127,7 +131,7 @@ class Holds:
     why: str = ""
 
 
-def to_meshio(part: Points | Cells | Surface | Volume) -> Any:
+def to_meshio(part: Points | Cells | Surface | Volume) -> meshio.Mesh:
     """Return a part of a frame as a `meshio.Mesh`.
 
     Points [m], cells, and its fields as point data or cell data. Points become vertices, surfaces
@@ -144,7 +148,7 @@ def to_meshio(part: Points | Cells | Surface | Volume) -> Any:
     return meshio_of(mesh_of(_active(part) if isinstance(part, Volume) else part))
 
 
-def from_meshio(mesh: Any) -> Mesh:
+def from_meshio(mesh: meshio.Mesh) -> Mesh:
     """Return the content of a `meshio.Mesh` with one kind of cells.
 
     Vectors that were stored as three fields are joined again.
@@ -361,7 +365,7 @@ def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return joined
 
 
-def meshio_of(mesh: Mesh) -> Any:
+def meshio_of(mesh: Mesh) -> meshio.Mesh:
     """Return a mesh as a `meshio.Mesh`."""
     import meshio
 
@@ -380,14 +384,15 @@ def _write(path: Path, mesh: Mesh, name: str) -> None:
         _module(name).write(str(path), meshio_of(mesh), **OPTIONS.get(name, {}))
 
 
-def _module(name: str) -> Any:
+def _module(name: str) -> ModuleType:
     """Return meshio's module of a format.
 
     meshio's own `read` ends the process for a damaged file.
     """
     import meshio
 
-    return getattr(meshio, MODULES.get(name, name))
+    module: ModuleType = getattr(meshio, MODULES.get(name, name))
+    return module
 
 
 def _faults() -> tuple[type[Exception], ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from warp_lcp.frames.frames import FRAME_FILE
 from warp_lcp.frames.meshio_format import FORMAT_OF, WRITTEN_ONLY, meshio_of, read_meshio, to_meshio
@@ -14,7 +14,10 @@ from warp_lcp.frames.vti import read_vti
 from warp_lcp.frames.vtu import Mesh, read_vtu
 from warp_lcp.simulation import Cells
 
-READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {
+if TYPE_CHECKING:
+    import meshio
+
+READERS: dict[str, tuple[Callable[[Path], Mesh | Cells], Callable[..., Mesh | Cells]]] = {
     "vtu": (read_vtu, one_mesh),
     "vti": (read_vti, one_grid),
 }
@@ -47,7 +50,7 @@ def read_part(file: Path) -> Mesh | Cells:
     raise ValueError(f"{file}: is not a readable frame: names no pieces")
 
 
-def read_frame(file: str | PathLike[str]) -> Any:
+def read_frame(file: str | PathLike[str]) -> meshio.Mesh:
     """Read a file of a run's `frames` as a `meshio.Mesh`.
 
     meshio itself reads neither VTU files without cells, as frames before the first drop are, nor

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_lcp.gallery.rigid_world import Assembly, World
 from warp_lcp.operators.sparse import SparseOperator
@@ -92,7 +92,7 @@ class ContactStepper:
         rate: float = 0.2,
         stopping: StoppingCriteria | None = None,
         warm: bool = True,
-        device: Any = None,
+        device: wp.DeviceLike = None,
     ) -> None:
         if stabilization not in STABILIZATIONS:
             raise ValueError(
@@ -141,9 +141,7 @@ class ContactStepper:
     def _solve(self, assembly: Assembly) -> tuple[np.ndarray, int, float, SolveStatus]:
         """Return impulses, iterations, relative residual and status of the problem."""
         system = assembly.system
-        method: Any = self.method
-        if not hasattr(method, "step"):
-            method = method(system)
+        method = self.method if isinstance(self.method, Solver) else self.method(system)
         problem = self.model.problem(system).lcp(device=self.device)
         x0 = (
             self.model.guess(system, self._guess(assembly))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,7 +13,7 @@ from warp_lcp.gallery.planted import Plant, poisson
 from warp_lcp.host_problem import Problem
 
 
-def _some(seed: int) -> Any:
+def _some(seed: int) -> np.random.Generator:
     """Return a random generator for a problem's size and settings.
 
     It is independent of the one for the problem's numbers.
@@ -22,12 +21,22 @@ def _some(seed: int) -> Any:
     return np.random.default_rng([seed, 20150205])
 
 
-def _poisson(seed: int, *, plant: Plant, **options: Any) -> Problem:
+def _poisson(
+    seed: int, *, plant: Plant, air: float = 0.0, solid: float = 0.0, coefficients: str = "uniform"
+) -> Problem:
     rng = _some(seed)
     shape = tuple(
         int(n) for n in (rng.integers(3, 9, 2) if rng.random() < 0.5 else rng.integers(2, 5, 3))
     )
-    return poisson(shape, plant=plant, seed=seed, dtype=wp.float64, **options)
+    return poisson(
+        shape,
+        plant=plant,
+        air=air,
+        solid=solid,
+        coefficients=coefficients,
+        seed=seed,
+        dtype=wp.float64,
+    )
 
 
 FAMILIES: dict[str, Callable[[int], Problem]] = {

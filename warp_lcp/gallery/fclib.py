@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
@@ -25,6 +25,9 @@ import scipy.sparse.linalg
 from warp_lcp.files.archive import DEFLATED
 from warp_lcp.files.size_limits import ClaimError, check_claim
 from warp_lcp.rigid.contact_models import ContactSystem
+
+if TYPE_CHECKING:
+    import h5py
 
 UNWRITTEN = 2**24  # most bytes of a dataset that was never written, which is read as zeros
 
@@ -70,7 +73,7 @@ def read_fclib(path: Path | str) -> FclibProblem:
         ) from error
 
 
-def _read(file: Any, path: Path) -> FclibProblem:
+def _read(file: h5py.File, path: Path) -> FclibProblem:
     """Return the problem of an open file."""
     kind = next((name for name in ("fclib_local", "fclib_global") if name in file), None)
     if kind is None:
@@ -97,7 +100,7 @@ def _read(file: Any, path: Path) -> FclibProblem:
     return FclibProblem(system, _solution(file, len(q), joints, path), title)
 
 
-def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
+def _local(group: h5py.Group, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
     """Return B = [W, V; V', R], (q, s) and the number of joint rows."""
     q = _values(group, "vectors/q", path)
     W = _matrix(group, "W", (len(q), len(q)), path)
@@ -112,7 +115,7 @@ def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, 
     )
 
 
-def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
+def _global(group: h5py.Group, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
     """Return B = C'M^-1 C, C'M^-1 f + (w, b) and the number of joint rows.
 
     C = (H, G).
@@ -137,7 +140,9 @@ def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray,
     return _symmetric(C.T @ response, path), C.T @ np.asarray(solve(f)) + q, joints
 
 
-def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.sparse.csr_array:
+def _matrix(
+    group: h5py.Group, name: str, shape: tuple[int, int], path: Path
+) -> scipy.sparse.csr_array:
     """Return a matrix of a given shape, in one of FCLIB's three formats."""
     if name not in group:
         raise ValueError(f"{path}: {group.name} has no matrix {name}")
@@ -163,7 +168,7 @@ def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.
         raise ValueError(f"{path}: {group.name}/{name} is not a sparse matrix: {error}") from error
 
 
-def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
+def _symmetric(B: scipy.sparse.sparray, path: Path) -> scipy.sparse.csr_array:
     """Return B without the asymmetry due to rounding."""
     B = scipy.sparse.csr_array(B)
     if 0 in B.shape or not np.isfinite(B.data).all():
@@ -173,7 +178,7 @@ def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array(0.5 * B + 0.5 * B.T)
 
 
-def _values(group: Any, name: str, path: Path, kinds: str = "iuf") -> np.ndarray:
+def _values(group: h5py.Group, name: str, path: Path, kinds: str = "iuf") -> np.ndarray:
     """Return a dataset of numbers of given kinds as a vector."""
     found = np.asarray(_dataset(group, name, path)[()])
     if found.dtype.kind not in kinds or not np.isfinite(found).all():
@@ -181,7 +186,7 @@ def _values(group: Any, name: str, path: Path, kinds: str = "iuf") -> np.ndarray
     return np.atleast_1d(found).ravel()
 
 
-def _number(group: Any, name: str, path: Path) -> int:
+def _number(group: h5py.Group, name: str, path: Path) -> int:
     """Return a dataset of one integer."""
     values = _values(group, name, path, "iu")
     if len(values) != 1:
@@ -189,7 +194,7 @@ def _number(group: Any, name: str, path: Path) -> int:
     return int(values[0])
 
 
-def _dataset(group: Any, name: str, path: Path) -> Any:
+def _dataset(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     """Return a dataset of this file, with a size that its stored bytes allow."""
     import h5py
 
@@ -211,7 +216,7 @@ def _dataset(group: Any, name: str, path: Path) -> Any:
     return member
 
 
-def _inside(group: Any, name: str, path: Path) -> Any:
+def _inside(group: h5py.Group, name: str, path: Path) -> h5py.Group | h5py.Dataset:
     """Return the member of a group, if it is in the same file."""
     import h5py
 
@@ -222,7 +227,7 @@ def _inside(group: Any, name: str, path: Path) -> Any:
     return group[name]
 
 
-def _text(group: Any, name: str, path: Path) -> str:
+def _text(group: h5py.Group, name: str, path: Path) -> str:
     """Return an optional string of a file."""
     if name not in group:
         return ""
@@ -230,7 +235,7 @@ def _text(group: Any, name: str, path: Path) -> str:
     return value.decode(errors="replace").rstrip("\0") if isinstance(value, bytes) else str(value)
 
 
-def _solution(file: Any, rows: int, joints: int, path: Path) -> np.ndarray | None:
+def _solution(file: h5py.File, rows: int, joints: int, path: Path) -> np.ndarray | None:
     """Return the impulses (r, l) of /solution, if there are any."""
     if "solution/r" not in file:
         return None

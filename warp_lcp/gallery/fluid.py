@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -12,7 +11,7 @@ import warp as wp
 
 from warp_lcp.host_problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
-from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson, PoissonArguments
 from warp_lcp.problem.lcp import LCP
 
 BOUNDS = ("linear", "walls", "everywhere")
@@ -35,7 +34,7 @@ class Splash:
     cells: np.ndarray
     b: np.ndarray
     wall: np.ndarray
-    faces: dict[str, Any] = field(default_factory=dict)
+    faces: PoissonArguments = field(default_factory=PoissonArguments)
 
     def lower(self, bounds: str) -> float | np.ndarray:
         """Return the lower bound, a number or a field.
@@ -46,7 +45,7 @@ class Splash:
             return np.where(self.wall, 0.0, -np.inf)
         return {"linear": -np.inf, "everywhere": 0.0}[bounds]
 
-    def lcp(self, bounds: str, *, device: Any = None, b: Any = None) -> LCP:
+    def lcp(self, bounds: str, *, device: wp.DeviceLike = None, b: np.ndarray | None = None) -> LCP:
         """Return the problem for a solver, with float32 coefficients.
 
         Args:
@@ -58,7 +57,7 @@ class Splash:
         A = GridPoisson(self.cells, device=device, **self.faces)
         return LCP(A, self.b if b is None else b, self.lower(bounds))
 
-    def problem(self, bounds: str, device: str, b: Any = None) -> LCP:
+    def problem(self, bounds: str, device: str, b: np.ndarray | None = None) -> LCP:
         """Return `lcp(bounds, device=device, b=b)`; deprecated, use `lcp`."""
         warnings.warn(
             "Splash.problem is now Splash.lcp(bounds, device=...)", DeprecationWarning, stacklevel=2
@@ -69,7 +68,9 @@ class Splash:
         """Return A on the FLUID cells in their order, as a sparse matrix."""
         return grid_matrix(GridPoisson(self.cells, device="cpu", dtype=wp.float64, **self.faces))
 
-    def named(self, bounds: str, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
+    def named(
+        self, bounds: str, *, device: wp.DeviceLike = None, dtype: type = wp.float32
+    ) -> Problem:
         """Return the splash as a gallery problem, without a known solution.
 
         Args:

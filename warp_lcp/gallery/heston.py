@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import scipy.interpolate
@@ -86,9 +85,16 @@ class Heston:
 
     def __post_init__(self) -> None:
         """Check that all numbers are in range."""
-        for name in ("strike", "expiry", "reversion", "mean", "volatility"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be > 0 and finite")
+        positive = {
+            "strike": self.strike,
+            "expiry": self.expiry,
+            "reversion": self.reversion,
+            "mean": self.mean,
+            "volatility": self.volatility,
+        }
+        for name, value in positive.items():
+            if not 0 < value < np.inf:
+                raise ValueError(f"{name} = {value}: must be > 0 and finite")
         if not 0 <= self.rate < np.inf:
             raise ValueError(f"rate = {self.rate}: must be >= 0 and finite")
         if not -1 < self.correlation < 1:
@@ -152,7 +158,7 @@ class Heston:
         return a
 
     def put(
-        self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None
+        self, ns: int, nv: int, steps: int, *, american: bool = True, device: wp.DeviceLike = None
     ) -> Prices:
         """Return the prices of the put at time 0.
 
@@ -205,7 +211,15 @@ class Heston:
         return Prices(S, v, u)
 
     def extrapolated(
-        self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any
+        self,
+        spot: float | np.ndarray,
+        variance: float,
+        ns: int,
+        nv: int,
+        steps: int,
+        *,
+        american: bool = True,
+        device: wp.DeviceLike = None,
     ) -> np.ndarray:
         """Return Richardson-extrapolated prices from this grid and one twice as fine.
 
@@ -217,10 +231,12 @@ class Heston:
             ns: intervals of S of the coarse grid.
             nv: intervals of v.
             steps: number of time steps.
-            options: options of `put`.
+            american: as of `put`.
+            device: as of `put`.
         """
         coarse, fine = (
-            self.put(k * ns, k * nv, k * steps, **options).at(spot, variance) for k in (1, 2)
+            self.put(k * ns, k * nv, k * steps, american=american, device=device).at(spot, variance)
+            for k in (1, 2)
         )
         return (4 * fine - coarse) / 3
 
@@ -239,7 +255,7 @@ class Prices:
     v: np.ndarray
     u: np.ndarray
 
-    def at(self, spot: Any, variance: float) -> Any:
+    def at(self, spot: float | np.ndarray, variance: float) -> np.ndarray:
         """Return interpolated prices: cubic splines, first in v, then in S."""
         return scipy.interpolate.CubicSpline(
             self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance)

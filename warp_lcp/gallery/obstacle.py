@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
 from warp_lcp.host_problem import M_MATRIX, Problem
-from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
+from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson, PoissonArguments
 
 RADIUS = 0.697965148223374  # a, where the membrane leaves the ball: a^2 (log 2 - log a) = 1 - a^2
 # Radius beyond which the ball is extended by its tangent cone, so that psi is defined on the
@@ -34,7 +32,7 @@ def membrane_height(r: np.ndarray) -> np.ndarray:
     return np.where(r <= RADIUS, ball_height(r), SLOPE * np.log(2 / np.maximum(r, RADIUS)))
 
 
-def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
+def ball_obstacle(n: int, *, device: wp.DeviceLike = None, dtype: type = wp.float32) -> Problem:
     """Return Bueler's ball obstacle problem on [-2, 2]^2.
 
     -Laplace u >= 0, u >= psi, with the exact solution's values on the border. The operator is h^2
@@ -74,7 +72,12 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
 
 
 def torsion(
-    n: int, load: float = 5.0, *, border: float = 1.0, device: Any = None, dtype: Any = wp.float32
+    n: int,
+    load: float = 5.0,
+    *,
+    border: float = 1.0,
+    device: wp.DeviceLike = None,
+    dtype: type = wp.float32,
 ) -> Problem:
     """Return the elastic-plastic torsion of a square bar.
 
@@ -105,7 +108,7 @@ def torsion(
     return Problem(f"torsion {n}x{n}", A, b, -distance, distance, None, UNIQUE | {"boxed"})
 
 
-def _faces(cells: np.ndarray, x: float, y: float, border: float) -> dict[str, Any]:
+def _faces(cells: np.ndarray, x: float, y: float, border: float) -> PoissonArguments:
     """Return face coefficients x and y, with those on a border times `border`.
 
     The border is one cell wide. They are numbers if `border` is 1.
@@ -122,7 +125,12 @@ def _faces(cells: np.ndarray, x: float, y: float, border: float) -> dict[str, An
 
 
 def sine_obstacle(
-    nx: int, ny: int, *, between: bool = False, device: Any = None, dtype: Any = wp.float32
+    nx: int,
+    ny: int,
+    *,
+    between: bool = False,
+    device: wp.DeviceLike = None,
+    dtype: type = wp.float32,
 ) -> Problem:
     """Return the membrane of Dembo and Tulowitzki: -Laplace u >= 1 over an obstacle.
 
@@ -170,8 +178,8 @@ def journal_bearing(
     eccentricity: float = 0.1,
     *,
     half_width: float = 10.0,
-    device: Any = None,
-    dtype: Any = wp.float64,
+    device: wp.DeviceLike = None,
+    dtype: type = wp.float64,
 ) -> Problem:
     """Return the pressure u >= 0 of the film in a journal bearing.
 
@@ -221,8 +229,8 @@ def dam(
     width: float = 16.0,
     high: float = 24.0,
     low: float = 4.0,
-    device: Any = None,
-    dtype: Any = wp.float32,
+    device: wp.DeviceLike = None,
+    dtype: type = wp.float32,
 ) -> Problem:
     """Return the problem of water seepage through a dam.
 

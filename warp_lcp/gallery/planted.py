@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.ndimage
 import warp as wp
 
-from warp_lcp.host_problem import M_MATRIX, Problem
+from warp_lcp.host_problem import M_MATRIX, Matrix, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
 from warp_lcp.settings import Part, Positive, Settings
@@ -39,7 +38,7 @@ class Plant(Settings):
 
 
 def planted(
-    A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]
+    A: Matrix, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]
 ) -> Problem:
     """Return a problem with a given matrix and a planted solution.
 
@@ -123,8 +122,8 @@ def poisson(
     ring: bool = True,
     coefficients: str = "uniform",
     seed: int = 2015,
-    device: Any = None,
-    dtype: Any = wp.float32,
+    device: wp.DeviceLike = None,
+    dtype: type = wp.float32,
 ) -> Problem:
     """Return a planted problem with the 5- or 7-point operator of a grid.
 
@@ -169,6 +168,7 @@ def poisson(
         return out
 
     assert flat.solution is not None
+    assert isinstance(flat.lower, np.ndarray) and isinstance(flat.upper, np.ndarray)
     x = field(flat.solution)
     return Problem(
         f"{flat.name}, {coefficients}",

@@ -158,10 +158,8 @@ class World:
         bias, gap = np.zeros((len(contacts), 3)), contacts.gap
         bias[:, 0] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
         bias = np.concatenate([bias.ravel(), *(rows.bias(dt, rate) for rows in joints)])
-        low, high = (
-            np.concatenate([np.zeros(0), *(getattr(rows, name) for rows in joints)])
-            for name in ("lower", "upper")
-        )
+        low = np.concatenate([np.zeros(0), *(rows.lower for rows in joints)])
+        high = np.concatenate([np.zeros(0), *(rows.upper for rows in joints)])
         B = scipy.sparse.csr_array(J @ response)
         B = scipy.sparse.csr_array(0.5 * (B + B.T))  # rounding must not make it unsymmetric
         system = ContactSystem(

@@ -6,7 +6,6 @@ It is solved as a sequence of LCPs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -71,16 +70,16 @@ class IceDome:
             raise ValueError(
                 f"nodes = {self.nodes}: must be >= 3, the nodes along a side, border included"
             )
-        for name, least in (
-            ("side", 0),
-            ("radius", 0),
-            ("height", 0),
-            ("exponent", 1),
-            ("softness", 0),
-            ("slope", 0),
+        for name, value, least in (
+            ("side", self.side, 0),
+            ("radius", self.radius, 0),
+            ("height", self.height, 0),
+            ("exponent", self.exponent, 1),
+            ("softness", self.softness, 0),
+            ("slope", self.slope, 0),
         ):
-            if not least < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be > {least} and finite")
+            if not least < value < np.inf:
+                raise ValueError(f"{name} = {value}: must be > {least} and finite")
         if not 0 < self.regularization <= 1:
             raise ValueError(f"regularization = {self.regularization}: must be in (0, 1]")
 
@@ -170,7 +169,7 @@ class IceDome:
         )
         return F.reshape(N, N), J.tocsr()
 
-    def solve(self, *, device: Any = None) -> np.ndarray:
+    def solve(self, *, device: wp.DeviceLike = None) -> np.ndarray:
         """Return the discrete H at the nodes [m] by Newton's method.
 
         Shape (nodes, nodes). Each step is a linear complementarity problem, H >= 0. The share of
@@ -191,7 +190,7 @@ class IceDome:
                 return H
             share = max(share / 10 ** (1 / 3), self.regularization)
 
-    def _newton(self, H: np.ndarray, share: float, device: Any) -> np.ndarray:
+    def _newton(self, H: np.ndarray, share: float, device: wp.DeviceLike) -> np.ndarray:
         """Return the solution for a share of the constant diffusivity from a guess.
 
         Each step solves the LCP of the linearization, F(H_k) - m + J (H - H_k) complementary to H

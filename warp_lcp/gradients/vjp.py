@@ -9,19 +9,21 @@ gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_i
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve
-from warp_lcp.gradients.names import flat
+from warp_lcp.gradients.names import Name, flat
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, Sums, Tally, rows_of
 from warp_lcp.operators import SparseOperator, Stencil
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import (
     HasBlocks,
@@ -73,10 +75,10 @@ class Gradients:
         relative_residual: ||g_F + A_FF'mu_F|| over ||g_F||, recomputed in float64.
     """
 
-    b: wp.array[Any]
-    lower: Any
-    upper: Any
-    coefficients: dict[str, Any]
+    b: DeviceArray
+    lower: DeviceArray | float
+    upper: DeviceArray | float
+    coefficients: dict[str, DeviceArray | float | dict[Hashable, DeviceArray]]
     free: int
     degenerate: int
     status: SolveStatus
@@ -88,7 +90,7 @@ class Gradients:
         return self.status is SolveStatus.CONVERGED
 
     @property
-    def by_name(self) -> dict[Any, Any]:
+    def by_name(self) -> dict[Name, DeviceArray | float]:
         """All gradients by name.
 
         Those of a stencil's offset have pairs as names, such as ("coefficients", (0, 1)).
@@ -174,7 +176,7 @@ def _rows(problem: LCP) -> Rows:
     return problem.A.stencil.rows if has(problem.A, HasStencil) else Rows.of_fields(problem.layout)
 
 
-def _as_given(problem: LCP, stored: wp.array[Any]) -> wp.array[Any]:
+def _as_given(problem: LCP, stored: DeviceArray) -> DeviceArray:
     """Return a stored field in the layout of the result's x."""
     return (
         stored.reshape(problem.layout.stored_shape)
@@ -183,7 +185,7 @@ def _as_given(problem: LCP, stored: wp.array[Any]) -> wp.array[Any]:
     )
 
 
-def _checked(result: Any, allow_inexact: bool) -> LCP:
+def _checked(result: SolveResult, allow_inexact: bool) -> LCP:
     """Return the problem of a result, if the result has gradients."""
     if not isinstance(result, SolveResult):
         raise ValueError(f"result is a {type(result).__name__}: expected what wl.solve returned")
@@ -214,8 +216,8 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
 
 
 def _classified(
-    problem: LCP, result: SolveResult, x: Any, g: Any
-) -> tuple[Any, Any, Any, int, int]:
+    problem: LCP, result: SolveResult, x: DeviceArray, g: DeviceArray
+) -> tuple[DeviceArray, DeviceArray, DeviceArray, int, int]:
     """Classify the unknowns of a result as free or held.
 
     Returns y, the cell types with 0 where an unknown is held, the bound that holds it, and the
@@ -261,8 +263,13 @@ def _classified(
 
 
 def _adjoint(
-    problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stopping: StoppingCriteria
-) -> tuple[SolveResult, wp.array[Any]]:
+    problem: LCP,
+    cells: DeviceArray,
+    g: DeviceArray,
+    count: int,
+    on_grid: bool,
+    stopping: StoppingCriteria,
+) -> tuple[SolveResult, DeviceArray]:
     """Solve A_FF' mu_F = -g_F.
 
     Returns the result of the solve, and mu as a stored field, 0 elsewhere. Operators with blocks
@@ -273,7 +280,9 @@ def _adjoint(
     if count == 0:  # the system solved is 1 x = 0
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
     if has(A, HasBlocks):
-        block = _transposed(A).on_cells(cells.numpy())
+        transposed = _transposed(A)
+        assert has(transposed, HasBlocks), "as A"
+        block = transposed.on_cells(cells.numpy())
         right = _projected(_floating(block), g, cells)  # its value in AIR has no effect
         result = solve(
             LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping
@@ -303,7 +312,7 @@ def _adjoint(
     return result, layout.load(result.x, f64)
 
 
-def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.array[Any]) -> None:
+def _gather(problem: LCP, multiplier: DeviceArray, g: DeviceArray, z: DeviceArray) -> None:
     """Compute z = g + A'mu."""
     A, shape = problem.A, problem.layout.stored_shape
     if A.symmetric:
@@ -313,12 +322,14 @@ def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.arr
         ADD.bind(rows_of(z), z=g, x=z).launch()
 
 
-def _floating(A: Operator) -> Any:
+def _floating(A: Operator) -> FloatingComponents | None:
     """Return the components on which an operator is singular, None if unknown."""
     return A.floating_components() if has(A, NamesComponents) else None
 
 
-def _projected(floating: Any, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[Any]:
+def _projected(
+    floating: FloatingComponents | None, g: DeviceArray, cells: DeviceArray
+) -> DeviceArray:
     """Return g without the part that A' cannot meet.
 
     On singular components that are free as a whole: the mean of g if their null space is the
@@ -330,7 +341,7 @@ def _projected(floating: Any, g: wp.array[Any], cells: wp.array[Any]) -> wp.arra
     return g
 
 
-def _transposed(A: Operator) -> Any:
+def _transposed(A: Operator) -> Operator:
     """Return A'."""
     if A.symmetric:
         return A
@@ -360,14 +371,14 @@ class Transpose(Operator):
         if has(A, HasCells):
             self.cells = A.cells
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A'x."""
         return self._A.apply_transpose(x, out)
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x."""
         return self._A.apply(x, out)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A."""
         return self._A.diagonal()

@@ -365,9 +365,8 @@ class Barriers:
             released: see there.
         """
         components, marks = velocity_kernels.Components(), velocity_kernels.Marks()
-        for name, field, mark in zip("uvw", velocity, known, strict=False):
-            setattr(components, name, field)
-            setattr(marks, name, mark)
+        components.u, components.v, components.w = three_components(velocity)
+        marks.u, marks.v, marks.w = three_components(known)
         for axis, (number, result) in enumerate(zip(self.number, self._scratch, strict=True)):
             given = [
                 self._barrier,

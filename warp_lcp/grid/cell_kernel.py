@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.grid.particle_loops import list_of
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.kernels.compiler import forward_kernel, project_module
 from warp_lcp.kernels.launch_graph import Launch, call, is_recording, launch, launch_ranges
@@ -174,9 +175,8 @@ def launch_list(
         launch: the launch function of a launch graph.
         ordered: whether several entries may write the same element.
     """
-    listed = (
-        next((a.listed for a in inputs if hasattr(a, "listed")), None) if is_recording() else None
-    )
+    found = (list_of(a) for a in inputs) if is_recording() else ()
+    listed = next((one for one in found if one is not None), None)
     inputs, sized = [wp.vec2i(0, 0), *inputs], 0 if listed is None else listed.entries
     extent = None if listed is None else listed.rows
     launch_ranges(
@@ -217,7 +217,7 @@ def _kernel(function: Callable, module: str) -> wp.Kernel:
 
 
 def _made(
-    function: Callable, module: str, first: tuple[str, Any], loop: str, before: str
+    function: Callable, module: str, first: tuple[str, object], loop: str, before: str
 ) -> wp.Kernel:
     """Make a kernel: insert the function's body into the loop over tasks.
 

@@ -3,6 +3,7 @@
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -10,6 +11,9 @@ from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel, next_to
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.kernels import KernelFile
+
+if TYPE_CHECKING:
+    from warp_lcp.grid.barriers import Barriers
 
 BLOCKED = -1  # mark of faces that are not filled
 UNKNOWN = 0  # mark of faces to fill; positive: layer in which a face became known, 1 at the start
@@ -68,7 +72,7 @@ def complete(
     weights: Sequence[wp.array],
     known: Sequence[wp.array],
     join: Callable[[wp.array, wp.array], None] | None = None,
-    barriers: typing.Any = None,
+    barriers: "Barriers | None" = None,
 ) -> None:
     """Extrapolate the particles' velocity to nearby faces without weight.
 

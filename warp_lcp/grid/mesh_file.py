@@ -10,7 +10,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -270,7 +269,7 @@ class _Records:
     """
 
     def __init__(self, body: bytes, order: str | None) -> None:
-        self.body: Any = body.split() if order is None else body
+        self.body, self.words = body, body.split() if order is None else []
         self.order, self.at = order, 0
 
     def claim(self, element: _Element) -> dict[str, int]:
@@ -280,7 +279,7 @@ class _Records:
         """
         each = 2 if self.order is None else 1
         least = sum(self._width(length or kind) for _, kind, length in element.properties)
-        return {"stored": each * element.count * least, "held": each * (len(self.body) - self.at)}
+        return {"stored": each * element.count * least, "held": each * (self._size - self.at)}
 
     def table(self, element: _Element) -> np.ndarray:
         """Return records without lists, float64 of shape (count, properties)."""
@@ -307,19 +306,26 @@ class _Records:
                     raise ValueError(f"a list of a {element.name} has {count} entries")
                 entries = self._take(kind, count, element)
                 if number == wanted:
-                    found.append(entries if self.order else [_index(word) for word in entries])
+                    if not isinstance(entries, np.ndarray):
+                        entries = np.array([_index(word) for word in entries], dtype=np.int64)
+                    found.append(entries)
         return found
+
+    @property
+    def _size(self) -> int:
+        """Number of bytes, or of words of a text."""
+        return len(self.words if self.order is None else self.body)
 
     def _width(self, kind: str) -> int:
         return 1 if self.order is None else int(kind[1])
 
-    def _take(self, kind: str, count: int, element: _Element) -> Any:
+    def _take(self, kind: str, count: int, element: _Element) -> Sequence[bytes] | np.ndarray:
         """Return the next numbers of a type, or words."""
         begin, self.at = self.at, self.at + count * self._width(kind)
-        if not begin <= self.at <= len(self.body):
+        if not begin <= self.at <= self._size:
             raise ValueError(f"it ends within a {element.name}")
         return (
-            self.body[begin : self.at]
+            self.words[begin : self.at]
             if self.order is None
             else np.frombuffer(self.body, self.order + kind, count, begin)
         )
@@ -360,7 +366,7 @@ def _number(word: str | bytes) -> float:
     return float(text)
 
 
-def _index(word: Any) -> int:
+def _index(word: str | bytes | int) -> int:
     """Return the number of a vertex, or of entries; limited to the largest mesh."""
     if isinstance(word, (str, bytes)) and ("_" if isinstance(word, str) else b"_") in word:  # type: ignore[operator]
         raise ValueError(f"a face names a vertex by {word!r}")

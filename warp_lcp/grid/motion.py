@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
@@ -38,7 +38,19 @@ UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of an unbound
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
-def keep_checked(frozen: Any, error: float) -> None:
+class Placed(Protocol):
+    """A rotation and a translation, of a frozen dataclass."""
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """Rotation matrix, shape (3, 3)."""
+
+    @property
+    def translation(self) -> np.ndarray:
+        """[m], shape (3,)."""
+
+
+def keep_checked(frozen: Placed, error: float) -> None:
     """Check `rotation` and `translation` of a frozen dataclass; store them as float64.
 
     Args:
@@ -134,14 +146,14 @@ class RigidMotion(Motion, Protocol):
     """Motion of a body moved by forces: its velocity is part of a state."""
 
     @staticmethod
-    def poses_of(motions: Sequence[Any], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def poses_of(motions: Sequence[Motion], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return rotations, shape (m, n, 3, 3), and translations, shape (m, n, 3) [m].
 
         Poses of n such motions at m times [s].
         """
 
     @staticmethod
-    def velocity_fields_of(motions: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    def velocity_fields_of(motions: Sequence[Motion]) -> tuple[np.ndarray, np.ndarray]:
         """Return turns, shape (n, 3, 3) [1/s], and shifts, shape (n, 3) [m/s].
 
         A point x of a solid moves at turn x + shift.
@@ -331,17 +343,17 @@ class Motions:
     def __init__(self, motions: Sequence[Motion]) -> None:
         self.motions = tuple(motions)
         rigid = [isinstance(motion, RigidMotion) for motion in motions]
-        kinds = dict.fromkeys(
-            type(motion) for motion, is_rigid in zip(motions, rigid, strict=True) if is_rigid
-        )
+        kinds = dict.fromkeys(type(motion) for motion in motions if isinstance(motion, RigidMotion))
         of_kind = {
             kind: [n for n, motion in enumerate(motions) if type(motion) is kind] for kind in kinds
         }
-        self._groups: list[tuple[Any, list[int], list[Any]]] = [
+        self._groups: list[tuple[type[RigidMotion], list[int], list[Motion]]] = [
             (kind, numbers, [motions[n] for n in numbers]) for kind, numbers in of_kind.items()
         ]
         # The common type of all motions.
-        self._alone: Any = next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None
+        self._alone: type[RigidMotion] | None = (
+            next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None
+        )
         self._prescribed = [n for n, is_rigid in enumerate(rigid) if not is_rigid]
 
     def __len__(self) -> int:
@@ -356,7 +368,7 @@ class Motions:
         """
         times = np.asarray(times, dtype=np.float64)
         if self._alone is not None:
-            return cast(tuple[np.ndarray, np.ndarray], self._alone.poses_of(self.motions, times))
+            return self._alone.poses_of(self.motions, times)
         rotations, translations = (
             np.empty((len(times), len(self), 3, 3)),
             np.empty((len(times), len(self), 3)),
@@ -376,7 +388,7 @@ class Motions:
         time dt [s] that it takes, or the velocity of the state of a `RigidMotion`.
         """
         if self._alone is not None:
-            return cast(tuple[np.ndarray, np.ndarray], self._alone.velocity_fields_of(self.motions))
+            return self._alone.velocity_fields_of(self.motions)
         turns, shifts = np.empty((len(self), 3, 3)), np.empty((len(self), 3))
         for kind, numbers, members in self._groups:
             turns[numbers], shifts[numbers] = kind.velocity_fields_of(members)

@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from operator import ge
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warp_lcp.grid import node_distance_kernels as kernels
 from warp_lcp.grid.motion import UNLIMITED
 from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
-from warp_lcp.grid.solids_kernels import block_of, item_points
+from warp_lcp.grid.solids_kernels import Block, block_of, item_points
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.host_array import HostArray
@@ -27,8 +28,9 @@ from warp_lcp.kernels.host_kernel import HostKernel
 from warp_lcp.kernels.launch_graph import clear, copy
 
 NodeBox = tuple[Sequence[int], Sequence[int]]  # the first node (x, y, z) and one past the last
+SingleShape = Box | Sphere | Capsule | Plane | TriangleMesh
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
-KINDS: dict[Any, int] = {
+KINDS: dict[type, int] = {
     Box: kernels.BOX,
     Sphere: kernels.SPHERE,
     Capsule: kernels.CAPSULE,
@@ -69,8 +71,8 @@ class NodeDistances:
         self.near.fill_(FAR)
         self.next_near.fill_(FAR)
         self.struct = Nearest()
-        for name in ("near", "owner", "next_near", "next_owner"):
-            setattr(self.struct, name, getattr(self, name))
+        self.struct.near, self.struct.owner = self.near, self.owner
+        self.struct.next_near, self.struct.next_owner = self.next_near, self.next_owner
 
     @property
     def arrays(self) -> list[wp.array]:
@@ -158,10 +160,12 @@ class ShapeTable:
             for shape in shapes
         ]
         placements = [shape.placement for shape in shapes]
-        of_placements = [
-            [getattr(p, name) for p in placements] for name in ("rotation", "translation", "scale")
+        of_placements: list[ArrayLike] = [
+            [p.rotation for p in placements],
+            [p.translation for p in placements],
+            [p.scale for p in placements],
         ]
-        of_shapes = [
+        of_shapes: list[ArrayLike] = [
             [shape.origin() for shape in shapes],
             corners,
             [margin for _, margin in hulls],
@@ -373,7 +377,7 @@ class NodeSampler:
         geometry: Geometry,
         count: int,
         fill: wp.Kernel,
-        inputs: list[Any],
+        inputs: Sequence[object],
         *,
         unsigned: bool = False,
     ) -> wp.array:
@@ -394,10 +398,18 @@ class NodeSampler:
         low: np.ndarray,
         high: np.ndarray,
         before: tuple[int, int, int] | None = None,
-        **more: Any,
-    ) -> Any:
+        *,
+        stride: int = 1,
+        offset: float = 0.0,
+    ) -> Block:
         return block_of(
-            low, high, self.grid.spacing, self.grid.dimension, before or self.grid.origin, **more
+            low,
+            high,
+            self.grid.spacing,
+            self.grid.dimension,
+            before or self.grid.origin,
+            stride=stride,
+            offset=offset,
         )
 
     def measured(
@@ -409,7 +421,7 @@ class NodeSampler:
         stride: int = 1,
         offset: float,
         before: tuple[int, int, int] | None = None,
-    ) -> Iterator[tuple[Any, wp.array]]:
+    ) -> Iterator[tuple[Block, wp.array]]:
         """Yield blocks of a box of nodes that fit in memory, each with its distances [m].
 
         Blocks are planes or else rows.
@@ -437,21 +449,16 @@ class NodeSampler:
                     begin + np.array([high[0] - low[0], height * stride, depth * stride]), high
                 )
                 block = self._block(begin, end, before, stride=stride, offset=offset)
-                counts = block.counts
-                yield (
-                    block,
-                    self._measure(
-                        geometry, counts[0] * counts[1] * counts[2], item_points, [block]
-                    ),
-                )
+                nx, ny, nz = (int(n) for n in np.array(block.counts))
+                yield block, self._measure(geometry, nx * ny * nz, item_points, [block])
 
 
-def _parts(geometry: Geometry) -> list[Any]:
+def _parts(geometry: Geometry) -> list[SingleShape]:
     """Return the shapes of which a solid is the union."""
     return (
         [shape for part in geometry.parts for shape in _parts(part)]
         if isinstance(geometry, Union)
-        else [geometry]
+        else [cast(SingleShape, geometry)]
     )
 
 

@@ -12,19 +12,28 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar, Unpack, cast
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.launch_graph import Task
 from warp_lcp.kernels.vectors import convert
-from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.grid_poisson import GridPoisson, PoissonArguments
 
 if TYPE_CHECKING:
+    from warp_lcp.distributed.halo import StarForest
+    from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.distributed.subdomain import Subdomain
     from warp_lcp.grid.particles import Particles, ParticleTotals
     from warp_lcp.grid.staggered import StaggeredGrid, Window
     from warp_lcp.kernels.vectors import Communicator
+    from warp_lcp.operators.padded_stencil import CellDecomposition
+
+
+ValueT = TypeVar("ValueT")
+NumbersT = TypeVar("NumbersT", float, np.ndarray)
+FieldT = TypeVar("FieldT", bound=np.ndarray | wp.array)
 
 
 class OneProcess:
@@ -35,11 +44,11 @@ class OneProcess:
 
     size, rank, is_root = 1, 0, True
 
-    def sum(self, values: Any) -> Any:
+    def sum(self, values: NumbersT) -> NumbersT:
         """Return the sum over the processes of a number or an array."""
         return values
 
-    def max(self, values: Any) -> Any:
+    def max(self, values: NumbersT) -> NumbersT:
         """Return the maximum over the processes, entry by entry."""
         return values
 
@@ -47,15 +56,15 @@ class OneProcess:
         """Return whether a condition holds on any process."""
         return bool(condition)
 
-    def gather(self, values: Any) -> np.ndarray:
+    def gather(self, values: float | Sequence[float] | np.ndarray) -> np.ndarray:
         """Return an array of every process, shape (processes, *values.shape)."""
         return np.asarray(values)[None]
 
-    def share(self, value: Any) -> Any:
+    def share(self, value: ValueT) -> ValueT:
         """Return the object of the first process."""
         return value
 
-    def collect(self, value: Any) -> list[Any]:
+    def collect(self, value: ValueT) -> list[ValueT]:
         """Return an object of every process."""
         return [value]
 
@@ -124,6 +133,9 @@ class ParticleExchange:
     def appended(self, count: int) -> None:
         """Register particles that have been appended."""
 
+    def add_places(self, places: np.ndarray) -> None:
+        """Set the places of the last appended particles in the order of sums, int64."""
+
     def removing(self, marks: wp.array) -> None:
         """Register the particles that are about to be removed: those whose mark is not 0."""
 
@@ -181,6 +193,11 @@ class BodyNumbers:
     of_tree: np.ndarray | None = None
 
 
+def subdomain_of(grid: StaggeredGrid) -> Subdomain:
+    """Return the part of a grid that several ranks share, where `grid.part.shared` says so."""
+    return cast("Subdomain", grid.part)
+
+
 class GridPart:
     """Part of the grid that a process works on: here the whole grid.
 
@@ -204,8 +221,8 @@ class GridPart:
     layers = 0
     cuts = 0
     joined: tuple[int, ...] = ()
-    ranks: Any = ONE_PROCESS
-    decomposition: Any = None
+    ranks: OneProcess | Ranks = ONE_PROCESS
+    decomposition: CellDecomposition | None = None
 
     def __init__(self, grid: StaggeredGrid) -> None:
         self.grid = grid
@@ -327,7 +344,7 @@ class GridPart:
         """Return whether processes check for better parts in a step."""
         return False
 
-    def rebalance(self, particles: Particles, a_cell: int) -> GridPart | None:
+    def rebalance(self, particles: Particles, a_cell: int) -> Subdomain | None:
         """Return the part of the grid that this process should have; collective.
 
         See `should_rebalance`. Returns None if the part stays the same.
@@ -351,7 +368,7 @@ class GridPart:
         *fields: wp.array | np.ndarray,
         width: int | None = None,
         parts: int = 1,
-        forest: Any = None,
+        forest: StarForest | None = None,
     ) -> None:
         """Halo exchange: fill the ghost cells of fields from their owners; collective.
 
@@ -388,7 +405,7 @@ class GridPart:
         return self.grid.coarser()
 
     @property
-    def row_ranks(self) -> Any:
+    def row_ranks(self) -> Ranks | None:
         """Processes that share rows along x, in order; None if rows are whole."""
         return None
 
@@ -396,15 +413,13 @@ class GridPart:
         """Return the view of a host field on the cells that only this process stores."""
         return field
 
-    def box_of(self, field: Any) -> Any:
+    def box_of(self, field: FieldT) -> FieldT:
         """Return the view of a field, host or device, or of layers of one, on owned cells."""
         low, high = self.owned.low, self.owned.high
-        return field[
-            (slice(None),) * (field.ndim - 3)
-            + tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        ]
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        return cast(FieldT, field[(slice(None),) * (field.ndim - 3) + box])
 
-    def filling(self, *fields: wp.array | np.ndarray, forest: Any) -> Task:
+    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
         """Return the exchange of a `forest`'s cells as a task.
 
         It runs at once or within a launch graph.
@@ -417,8 +432,8 @@ class GridPart:
         width: int | None = None,
         *,
         which: np.ndarray | None = None,
-        into: Any = None,
-    ) -> Any:
+        into: StarForest | None = None,
+    ) -> StarForest | None:
         """Return an exchange restricted to some cells, for `fill`; collective.
 
         Args:
@@ -448,7 +463,7 @@ class GridPart:
         """
         convert(x.flatten(), field.flatten())
 
-    def poisson(self, cells: np.ndarray, **coefficients: Any) -> GridPoisson:
+    def poisson(self, cells: np.ndarray, **coefficients: Unpack[PoissonArguments]) -> GridPoisson:
         """Return the operator of all processes' problem on the owned cells.
 
         Coefficients are fields of `box_like`, see `GridPoisson`.

@@ -10,7 +10,7 @@ import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -18,6 +18,7 @@ from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import is_recording
 from warp_lcp.kernels.memory import Scalar, Slot, rows_memory
 from warp_lcp.kernels.thread_pool import get_threads
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -58,7 +59,7 @@ class ListMemory:
         self.touched = wp.empty(2, dtype=wp.int32, device=device)
         self.slot("touched of").point_to(self.touched)
 
-    def take(self, count: int, arrays: Mapping[str, wp.array[Any]]) -> None:
+    def take(self, count: int, arrays: Mapping[str, DeviceArray]) -> None:
         """Use a list of this length and these arrays.
 
         Recorded launches refer to the arrays by name.
@@ -90,7 +91,13 @@ class ListMemory:
             self.slot("touched of").point_to(self.touched)
 
 
-TOUCHED: dict[Any, StencilKernel] = {
+def list_of(array: object) -> ListMemory | None:
+    """Return the list whose memory an array is part of; None if it is of none."""
+    listed: ListMemory | None = getattr(array, "listed", None)
+    return listed
+
+
+TOUCHED: dict[type, StencilKernel] = {
     vector: KERNELS.kernel(
         "warp_lcp.grid.touched.touched",
         module=f"warp_lcp.grid.touched_{real.__name__}",
@@ -100,14 +107,14 @@ TOUCHED: dict[Any, StencilKernel] = {
 }
 
 
-def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[wp.int32] | None:
+def touched_planes(grid: "StaggeredGrid", position: DeviceArray) -> wp.array[wp.int32] | None:
     """Return the planes of a field that the particles of each chunk may add to.
 
     They are rows in 2-D. Returns None where one thread adds up all.
     """
     if grid.device.is_cuda or get_threads() == 1:
         return None
-    listed = getattr(position, "listed", None) if is_recording() else None
+    listed = list_of(position) if is_recording() else None
     touched = (
         wp.empty(2 * -(-max(len(position), 1) // CPU_GRAIN), dtype=wp.int32, device=grid.device)
         if listed is None
@@ -120,11 +127,11 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
 def scatter(
     passed: StencilKernel,
     grid: "StaggeredGrid",
-    position: wp.array[Any],
+    position: DeviceArray,
     touched: wp.array[wp.int32] | None,
     *structs: "DataclassInstance",
     runs: wp.array[wp.int32] | None = None,
-    **given: Any,
+    **given: object,
 ) -> None:
     """Launch a pass in which particles add to a field.
 
@@ -141,7 +148,7 @@ def scatter(
         given: likewise.
     """
     count, shares = len(position), 1
-    listed = getattr(position, "listed", None) if is_recording() else None
+    listed = list_of(position) if is_recording() else None
     if not count and listed is None:
         return
     number = count if listed is None else listed.count
@@ -194,7 +201,7 @@ def launch(
     count: int,
     grid: "StaggeredGrid",
     *structs: "DataclassInstance",
-    **given: Any,
+    **given: object,
 ) -> None:
     """Launch a pass over the first particles of a list.
 
@@ -203,8 +210,9 @@ def launch(
     """
     rows, listed = chunks(count, grid.device), None
     if is_recording():
-        arrays = [*given.values(), *(getattr(s, f.name) for s in structs for f in fields(s))]
-        listed = next((a.listed for a in arrays if hasattr(a, "listed")), None)
+        members = [getattr(s, f.name) for s in structs for f in fields(s)]
+        found = (list_of(a) for a in (*given.values(), *members))
+        listed = next((one for one in found if one is not None), None)
     if listed is not None:
         rows = replace(rows, memory=listed.rows)
     if count or listed is not None:

@@ -207,7 +207,7 @@ class Particles:
         self._removal = LaunchGraph(device, self._launch_removal)
         self._removed = DeviceScalar(device, 2, wp.int32)
         # Arrays and number of particles for which the launches were recorded.
-        self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None
+        self._marks: tuple[tuple[object, int], wp.array | None] = (None, 0), None
         self._stays: wp.array | None = None  # beside them
         self._total_rows = rows_memory(device, LIST_ROOM)
         if device.is_cuda:
@@ -356,12 +356,13 @@ class Particles:
             )
             return
         columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
-        counted: dict[str, typing.Any] = {
+        given: dict[str, object] = {
             "removed": self._removed.array,
             "marks": marks,
             "count": self._memory.count,
+            **columns,
         }
-        kernels.CLOSE_RANKS.bind(Rows.entries(1, device), **counted, **columns).launch()
+        kernels.CLOSE_RANKS.bind_arguments(Rows.entries(1, device), (), given).launch()
 
     def finish_removal(self, marks: wp.array) -> tuple[int, int]:
         """End the removal that has been launched.

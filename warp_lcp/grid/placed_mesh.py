@@ -6,7 +6,6 @@ The launches need no readback, so they can be recorded.
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -210,7 +209,7 @@ class PlacedMesh:
         self._window.launch(enter_mesh, [*inputs, snap, self._number, nodes.struct])
 
     def mark(
-        self, window: Window, near: wp.array, block: Any, marks: wp.array, *, begin: bool
+        self, window: Window, near: wp.array, block: Block, marks: wp.array, *, begin: bool
     ) -> None:
         """Unmark flat cells that the mesh covers, see `FlatCells`."""
         inputs = [self.grid.planes, near, block, self._frame.array, self._mesh, begin, marks]

@@ -265,7 +265,7 @@ class PeriodicSides:
 
 
 @functools.cache
-def wrap_kernel(dtype: typing.Any) -> wp.Kernel:
+def wrap_kernel(dtype: type) -> wp.Kernel:
     """Return the kernel that fills the ring of fields of a type."""
 
     @forward_kernel(module=f"warp_lcp.grid.periodic_{dtype.__name__}")

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -159,7 +159,7 @@ class _Shape(ABC):
     placement: Placement = field(default_factory=Placement)
     invert: bool = False
 
-    kernel: ClassVar[Any]
+    kernel: ClassVar[wp.Kernel]
     cost: ClassVar[int] = 8  # work of a point, in cells of a usual pass
 
     def signed_distance(
@@ -178,7 +178,7 @@ class _Shape(ABC):
             raise ValueError(f"out has shape {out.shape}, points have {points.shape}")
         self._measure(self.kernel, points, out)
 
-    def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
+    def _measure(self, kernel: wp.Kernel, points: wp.array, out: wp.array) -> None:
         inputs = [points, self.frame(), *self.parameters(points.device), out]
         launch_list(kernel, points.shape[0], inputs, device=points.device, cost=self.cost)
 
@@ -227,7 +227,7 @@ class _Shape(ABC):
         return 1.0
 
     @abstractmethod
-    def parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[object]:
         """Return the kernel's arguments after the placement."""
 
     @abstractmethod
@@ -255,7 +255,7 @@ class Box(_Shape):
     lower: Vector
     upper: Vector
 
-    kernel: ClassVar[Any] = box_distance
+    kernel: ClassVar[wp.Kernel] = box_distance
 
     def __post_init__(self) -> None:
         """Check that low is below high."""
@@ -282,7 +282,7 @@ class Box(_Shape):
         half = 0.5 * (np.asarray(self.upper) - np.asarray(self.lower))
         return np.array([*half, np.inf][:3])
 
-    def parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[object]:
         """Return the kernel's arguments after the placement."""
         return [wp.vec3(*self.half_extents())]
 
@@ -320,7 +320,7 @@ class Sphere(_Shape):
     center: Vector
     radius: float
 
-    kernel: ClassVar[Any] = sphere_distance
+    kernel: ClassVar[wp.Kernel] = sphere_distance
 
     def __post_init__(self) -> None:
         """Check that center and radius are finite."""
@@ -331,7 +331,7 @@ class Sphere(_Shape):
         """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return in_space(self.center)
 
-    def parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[object]:
         """Return the kernel's arguments after the placement."""
         return [self.radius]
 
@@ -359,7 +359,7 @@ class Capsule(_Shape):
     end: Vector
     radius: float
 
-    kernel: ClassVar[Any] = capsule_distance
+    kernel: ClassVar[wp.Kernel] = capsule_distance
 
     def __post_init__(self) -> None:
         """Check that the ends are two points."""
@@ -383,7 +383,7 @@ class Capsule(_Shape):
         """
         return np.asarray(in_space(self.end) - in_space(self.start))
 
-    def parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[object]:
         """Return the kernel's arguments after the placement."""
         return [wp.vec3(*self.axis()), self.radius]
 
@@ -409,7 +409,7 @@ class Plane(_Shape):
     point: Vector
     normal: Vector
 
-    kernel: ClassVar[Any] = plane_distance
+    kernel: ClassVar[wp.Kernel] = plane_distance
 
     def __post_init__(self) -> None:
         """Check the point, and give the normal unit length."""
@@ -425,7 +425,7 @@ class Plane(_Shape):
         """Return the origin of the kernel's coordinates, in the shape's coordinates."""
         return in_space(self.point)
 
-    def parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[object]:
         """Return the kernel's arguments after the placement."""
         return [wp.vec3(*in_space(self.normal))]
 
@@ -449,7 +449,7 @@ class TriangleMesh(_Shape):
 
     surface: ClosedSurface
 
-    kernel: ClassVar[Any] = mesh_distance
+    kernel: ClassVar[wp.Kernel] = mesh_distance
     cost: ClassVar[int] = 500
 
     @classmethod
@@ -519,7 +519,7 @@ class TriangleMesh(_Shape):
         """Return the unit length of the kernel, in the shape's coordinates."""
         return self.surface.size
 
-    def parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[object]:
         """Return the kernel's arguments after the placement."""
         return [self.surface.on_device(device).id]
 

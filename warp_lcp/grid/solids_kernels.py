@@ -1,8 +1,9 @@
 # mypy: ignore-errors
 """Kernels of signed distances, one a shape, of sample points and of solid cells."""
 
-from typing import Any
+from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
@@ -242,15 +243,15 @@ def claim_cells(
 
 
 def block_of(
-    low: Any,
-    high: Any,
+    low: Sequence[int] | np.ndarray,
+    high: Sequence[int] | np.ndarray,
     spacing: float,
     dimension: int,
-    origin: Any,
+    origin: Sequence[int],
     *,
     stride: int = 1,
     offset: float = 0.0,
-) -> Any:
+) -> Block:
     """Return the block of nodes or cells low <= (x, y, z) < high.
 
     Items are groups of `stride` nodes along each axis; their points are moved by `offset` cells.

@@ -31,15 +31,19 @@ from warp_lcp.settings import renamed_names
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
+    from warp._src.codegen import StructInstance
+
+    from warp_lcp.grid.barriers import Barriers
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
-CLEAR: dict[typing.Any, StencilKernel] = {
+CLEAR: dict[type, StencilKernel] = {
     dtype: KERNELS.kernel(
         "warp_lcp.grid.clear.clear", module=f"warp_lcp.grid.clear_{dtype.__name__}", compute=dtype
     )
     for dtype in (wp.int8, wp.float32, wp.float64)
 }
 COPY = KERNELS["warp_lcp.grid.copy_box.copy"]
+FieldT = typing.TypeVar("FieldT")
 SEGMENT = 8  # cells of a row that are visited together in an active window
 
 
@@ -78,6 +82,11 @@ def inside(coordinate: float, count: int):
 def cell_index(coordinate: float, count: int):
     """Return the interior cell 1..count that a grid coordinate lies in."""
     return wp.min(int(inside(coordinate, count)), count)
+
+
+def is_ordered(kernel: wp.Kernel) -> bool:
+    """Return whether one CPU thread visits the cells in order, see `cell_kernel`."""
+    return bool(getattr(kernel, "ordered", False))
 
 
 def _corners(
@@ -121,7 +130,7 @@ class Window:
         return Window(low, high, self.device, self.near)
 
     @cached_property
-    def cells(self) -> typing.Any:
+    def cells(self) -> CellRange:
         """The CellRange that kernels take as their first argument."""
         return (
             self._cells(grain(self.high[2] - self.low[2], self.device))
@@ -148,7 +157,7 @@ class Window:
         made[:, 1, 1] = host[np.append(first[1:], len(host))[: len(first)] - 1, 1, 1]
         return wp.array(made, dtype=wp.vec2i, device=self.device)
 
-    def _cells(self, each: int) -> typing.Any:
+    def _cells(self, each: int) -> CellRange:
         box = CellRange()
         box.k, box.j, box.i = self.low
         box.end, box.grain = self.high[2], each
@@ -177,7 +186,7 @@ class Window:
         *structs: "DataclassInstance",
         whole: bool = False,
         launch: Launch | None = None,
-        **given: typing.Any,
+        **given: object,
     ) -> None:
         """Launch a pass over the box, or record it with `LaunchGraph.launch`.
 
@@ -228,7 +237,7 @@ class Window:
                 self.run(CLEAR[array.dtype], field=array)
 
     def launch(
-        self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None
+        self, kernel: wp.Kernel, inputs: typing.Sequence[object], *, launch: Launch | None = None
     ) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row).
 
@@ -236,7 +245,7 @@ class Window:
         """
         self._launch(kernel, self.cells, inputs, launch)
 
-    def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
+    def launch_rows(self, kernel: wp.Kernel, inputs: typing.Sequence[object]) -> None:
         """Launch kernel(cells, *inputs) with one thread per row (plane, row, 0).
 
         For sums that are the same on every run.
@@ -247,14 +256,23 @@ class Window:
         self._launch(kernel, cells, inputs, None)
 
     def _launch(
-        self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None
+        self,
+        kernel: wp.Kernel,
+        cells: CellRange,
+        inputs: typing.Sequence[object],
+        launch: Launch | None,
     ) -> None:
-        ordered = getattr(kernel, "ordered", False)
         dim, cost = (*self.rows, cells.chunks), cells.grain
         if self.near is not None:
             dim, cost = (1, 1, cells.chunks), self._visited // max(cells.chunks, 1)
         launch_ranges(
-            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered
+            kernel,
+            dim,
+            cost,
+            [cells, *inputs],
+            device=self.device,
+            launch=launch,
+            ordered=is_ordered(kernel),
         )
 
     @property
@@ -274,36 +292,36 @@ class Window:
 NO_CELLS, BOX_OF_CELLS = CellRange(), struct.Struct("7i")  # members of a CellRange from `rows` on
 
 
-def _native(made: typing.Any) -> typing.Any:
-    """Return the type of a Warp struct's memory."""
-    return type(made.__ctype__())
+def _memory(cells: "StructInstance") -> typing.Any:
+    """Return the memory of a Warp struct, a `ctypes.Structure` with its members."""
+    return cells.__ctype__()
 
 
 class _RangeMemory:
     """A CellRange that recorded launches read, and the number of its tasks."""
 
     def __init__(self) -> None:
-        self.range, self.tasks = _native(CellRange())(), ctypes.c_int64()
+        self.range, self.tasks = type(_memory(CellRange()))(), ctypes.c_int64()
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
         self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA now
         self.room: tuple[int, ...] = (1, 1, 1)  # largest dimensions so far
 
-    def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
+    def take_dim(self, cells: CellRange, dim: tuple[int, int, int]) -> None:
         """Set the CellRange on CUDA, with its threads."""
         self.take(cells, dim[0] * dim[1] * dim[2])
         self.extent, self.room = dim, larger(self.room, dim)
 
-    def take(self, cells: typing.Any, tasks: int) -> None:
+    def take(self, cells: CellRange, tasks: int) -> None:
         """Set the CellRange."""
-        ctypes.memmove(self.first[1], ctypes.addressof(cells.__ctype__()), self.first[2])
+        ctypes.memmove(self.first[1], ctypes.addressof(_memory(cells)), self.first[2])
         self.tasks.value = tasks
 
     def take_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
         """Set a box of whole rows, see `CellRange`."""
         ctypes.memset(self.first[1], 0, self.first[2])
         BOX_OF_CELLS.pack_into(
-            self.range, _native(NO_CELLS).rows.offset, rows, 1, k, j, i, end, end - i
+            self.range, type(_memory(NO_CELLS)).rows.offset, rows, 1, k, j, i, end, end - i
         )
         self.tasks.value = tasks
 
@@ -404,7 +422,7 @@ class ActiveWindow(Window):
         return replace(rows, memory=self._sums[planes])
 
     @property
-    def hull_pieces(self) -> typing.Any:
+    def hull_pieces(self) -> wp.array | None:
         """Pieces that sums over rows visit; None for all rows of the box."""
         return None if self.near is None else self._now._hulls
 
@@ -416,7 +434,7 @@ class ActiveWindow(Window):
     def _whole(self) -> Rows:
         return replace(self._now._whole, memory=self._rows[1])
 
-    def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
+    def launch_rows(self, kernel: wp.Kernel, inputs: typing.Sequence[object]) -> None:
         """Launch kernel(cells, *inputs) with one thread per row."""
         cells = (
             self._now._cells(self.high[2] - self.low[2])
@@ -428,8 +446,8 @@ class ActiveWindow(Window):
     def _launch(
         self,
         kernel: wp.Kernel,
-        cells: typing.Any,
-        inputs: list[typing.Any],
+        cells: CellRange,
+        inputs: typing.Sequence[object],
         launch: Launch | None,
         memory: _RangeMemory | None = None,
     ) -> None:
@@ -437,7 +455,6 @@ class ActiveWindow(Window):
         dim, cost = (*self.rows, cells.chunks), cells.grain
         if self.near is not None:
             dim, cost = (1, 1, cells.chunks), self._now._visited // max(cells.chunks, 1)
-        ordered = getattr(kernel, "ordered", False)
         launch_ranges(
             kernel,
             dim,
@@ -445,7 +462,7 @@ class ActiveWindow(Window):
             [cells, *inputs],
             device=self.device,
             launch=launch,
-            ordered=ordered,
+            ordered=is_ordered(kernel),
             first=memory.first,
             sized=memory.sized,
             extent=memory,
@@ -483,7 +500,7 @@ class DirtyRegion:
         )
 
 
-def _in_part(pieces: wp.array) -> typing.Any:
+def _in_part(pieces: wp.array) -> CellRange:
     """Return the CellRange of some pieces."""
     part = CellRange()
     part.pieces, part.rows, part.chunks = pieces, 1, len(pieces)
@@ -543,12 +560,12 @@ class StaggeredGrid:
     counts: tuple[int, int, int]
     spacing: float
     dimension: int
-    device: typing.Any = "cpu"
+    device: wp.Device = "cpu"  # a name is replaced by its device
     origin: tuple[int, int, int] = (0, 0, 0)
     whole: tuple[int, int, int] | None = None
     sparse: bool = field(default=False, compare=False)
     part: GridPart = field(default=None, compare=False, repr=False)  # type: ignore[assignment]  # set below
-    barriers: typing.Any = field(default=None, init=False, compare=False, repr=False)
+    barriers: "Barriers | None" = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the arguments and resolve the device."""
@@ -563,7 +580,7 @@ class StaggeredGrid:
         object.__setattr__(self, "device", checked_device(self.device))
         object.__setattr__(self, "part", self.part or GridPart(self))
 
-    def divide(self, barriers: typing.Any) -> None:
+    def divide(self, barriers: "Barriers | None") -> None:
         """Set the barriers that separate the material on their two sides."""
         object.__setattr__(self, "barriers", barriers)
 
@@ -624,11 +641,11 @@ class StaggeredGrid:
         nx, ny, nz = (-(-n // 2) for n in self.counts)
         return StaggeredGrid((nx, ny, nz), 2.0 * self.spacing, self.dimension, self.device)
 
-    def field(self, dtype: typing.Any = wp.float32) -> wp.array:
+    def field(self, dtype: type = wp.float32) -> wp.array:
         """Return a field of zeros with one value per stored cell."""
         return zeros(self.size, dtype, self.device, small_pages=self.sparse).reshape(self.shape)
 
-    def faces(self, dtype: typing.Any = wp.float32) -> list[wp.array]:
+    def faces(self, dtype: type = wp.float32) -> list[wp.array]:
         """Return a field of zeros for each component: [u, v] in 2-D, [u, v, w] in 3-D."""
         return [self.field(dtype) for _ in range(self.dimension)]
 
@@ -683,6 +700,6 @@ class StaggeredGrid:
 __getattr__ = renamed_names(__name__, Trail="DirtyRegion")
 
 
-def three_components(fields: Iterable[typing.Any]) -> list[typing.Any]:
+def three_components(fields: Iterable[FieldT]) -> list[FieldT | None]:
     """Return fields of three components; in 2-D the third is None."""
     return [*fields, None, None, None][:3]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise, product
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -24,6 +23,7 @@ from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, U
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import copy
+from warp_lcp.kernels.types import DeviceArray
 
 THIN = 3.0  # cells: particles meet thinner solids as exact shapes
 SHEET = 1.0  # cells: rigid bodies of at least this thickness cut cells
@@ -200,7 +200,7 @@ class ThinWalls:
 
     def _only_thin(
         self, shapes: Sequence[kernels.ThinShape], thickness: float
-    ) -> tuple[wp.array[Any], list[wp.Mesh]]:
+    ) -> tuple[DeviceArray, list[wp.Mesh]]:
         """Return the shapes with thin parts of meshes, and these meshes.
 
         Shapes are those of all solids, in the order of `_geometries`.
@@ -345,7 +345,7 @@ def _alike(one: Motion | None, other: Motion | None) -> bool:
         return False
 
 
-def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> Any:
+def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> kernels.ThinShape:
     """Return a shape as kernels take it, enlarged by a `skin` [m].
 
     A mesh is not enlarged.

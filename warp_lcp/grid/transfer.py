@@ -19,16 +19,15 @@ coordinate along z is that of the plane, and the plane above is the same one.
 import functools
 import typing
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.particle_loops import launch, scatter, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.memory import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # least weight of a face that particles touch
@@ -38,8 +37,25 @@ EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}
 KERNELS = KernelFile(Path(__file__).parent / "headers/transfer.h")
 
 
+@dataclass(frozen=True)
+class TransferKernels:
+    """Transfer kernels of a type.
+
+    Attributes:
+        scatter: sum over particles, each of which adds to its faces.
+        interpolate: its adjoint.
+        gather_weights: the sum by faces, each of which reads its particles.
+        normalize: division by the weights.
+    """
+
+    scatter: StencilKernel
+    interpolate: StencilKernel
+    gather_weights: StencilKernel
+    normalize: wp.Kernel
+
+
 @functools.cache
-def transfer_passes(real: Any) -> SimpleNamespace:
+def transfer_passes(real: type) -> TransferKernels:
     """Return the transfer kernels for float32 or float64.
 
     Two forms of the sum over particles, its adjoint `interpolate`, and the division by the weights.
@@ -58,7 +74,7 @@ def transfer_passes(real: Any) -> SimpleNamespace:
         else:
             field[k, j, i] = real(0.0)
 
-    return SimpleNamespace(
+    return TransferKernels(
         scatter=made("grid.transfer.scatter", module=f"grid.transfer_{real.__name__}"),
         interpolate=made("warp_lcp.grid.transfer.interpolate", module=name),
         gather_weights=made("warp_lcp.grid.transfer.gather_weights", module=name),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from warp_lcp.grid.staggered import KERNELS, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels import Rows, StencilKernel
+from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.vectors import Tally
 
@@ -52,7 +53,7 @@ class WindowTally:
                 Rows.flat(columns, device, serial=True),
             )
 
-    def take(self, window: Window, *structs: DataclassInstance, **given: Any) -> None:
+    def take(self, window: Window, *structs: DataclassInstance, **given: object) -> None:
         """Launch the pass, bound as by `StencilKernel.bind`, over a window."""
         rows_of_sums = window.rows_of_sums(self._planes)
         if self._tally is not None:
@@ -91,7 +92,7 @@ class WindowTally:
         else:
             self._tally.changed()
 
-    def on_device(self) -> Any:
+    def on_device(self) -> wp.array[wp.float64]:
         """Return the results on the device, a number a column."""
         return self._reading.array if self._tally is None else self._tally.found
 
@@ -101,14 +102,14 @@ class WindowTally:
         return [float(v) for v in found]
 
 
-def _numbers(window: Window) -> tuple[Any, ...]:
+def _numbers(window: Window) -> tuple[Scalar | int, Scalar | int, Scalar | int, Scalar | int]:
     """Return the first plane and row of a window, and the number of planes and rows."""
     if isinstance(window, ActiveWindow):
         return *window.first, *window.sizes
     return *window.low[:2], *window.rows
 
 
-def _hulls(window: Window) -> tuple[Any, Any]:
+def _hulls(window: Window) -> tuple[Scalar | int, wp.array | None]:
     """Return the pieces of rows of an active window, and their number.
 
     0 and None stand for the whole box.

@@ -32,6 +32,7 @@ from warp_lcp.kernels.launch_graph import (
 )
 from warp_lcp.kernels.layout import RowLayout, make_struct, threads
 from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
+from warp_lcp.kernels.types import DeviceArray
 
 ALIGNED = 16  # bytes
 FIRST = "tasks_"  # member of a kernel's arguments: number of its tasks
@@ -302,7 +303,7 @@ class DeviceGraph(CommandBuffer):
             self._commands[which] = made
         self._prepare_patches(image)
 
-    def _prepare_patches(self, image: wp.array[Any]) -> None:
+    def _prepare_patches(self, image: DeviceArray) -> None:
         """Create the buffer of changing arguments, its copy, and the patch launch.
 
         The launch writes the bytes to the image.
@@ -408,7 +409,7 @@ class Upload(DeviceGraph):
         array: of the same bytes, on the device; nothing else writes to it.
     """
 
-    def __init__(self, host: np.ndarray, array: wp.array[Any]) -> None:
+    def __init__(self, host: np.ndarray, array: DeviceArray) -> None:
         super().__init__(array.device)
         size = host.nbytes
         self._pinned = wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=wp.is_cuda_available())
@@ -440,6 +441,6 @@ def noted(device: wp.Device, event: Any) -> Any:
     return wp.get_stream(device).record_event(event) if device.is_cuda else None
 
 
-def host_view(pinned: wp.array[Any]) -> np.ndarray:
+def host_view(pinned: DeviceArray) -> np.ndarray:
     """Return a view of host memory as a writable array."""
     return np.frombuffer((ctypes.c_uint8 * pinned.size).from_address(pinned.ptr), dtype=np.uint8)

@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.log_filter import start_warp
+from warp_lcp.kernels.types import DeviceArray
 
 Array = Any  # a numpy array or a wp.array
 # Elements of a flat field that a CPU thread takes: its operands stay in the L2 cache between fused
@@ -45,7 +46,7 @@ def checked_device(device: Any) -> wp.Device:
 
 def zeros(
     n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_pages: bool = False
-) -> wp.array[Any]:
+) -> DeviceArray:
     """Return a field of zeros, flat or of a shape; memory is allocated on first write.
 
     On the CPU it is NumPy's memory: NumPy asks for huge pages, Warp does not. At 128^3 that makes a
@@ -90,22 +91,22 @@ def _width(dtype: Any) -> int:
     return int(wp.types.type_size_in_bytes(dtype))
 
 
-def nothing(dtype: Any, device: wp.Device) -> wp.array[Any]:
+def nothing(dtype: Any, device: wp.Device) -> DeviceArray:
     """Return the empty flat array of a type; it is shared."""
     return _nothing(dtype, device.alias)
 
 
 @cache
-def _nothing(dtype: Any, alias: str) -> wp.array[Any]:
+def _nothing(dtype: Any, alias: str) -> DeviceArray:
     return wp.empty(0, dtype=dtype, device=alias)
 
 
-def zeros_like(field: wp.array[Any]) -> wp.array[Any]:
+def zeros_like(field: DeviceArray) -> DeviceArray:
     """Return zeros in the shape of a field, by `zeros`."""
     return zeros(tuple(field.shape), field.dtype, field.device)
 
 
-def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> wp.array[Any]:
+def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> DeviceArray:
     """Return a copy of a host array on a device.
 
     On the CPU it is in NumPy's memory, as that of `zeros`.
@@ -147,7 +148,7 @@ def real_array(values: Any, name: str) -> np.ndarray:
     return host
 
 
-def overwrite(to: wp.array[Any], source: wp.array[Any]) -> None:
+def overwrite(to: DeviceArray, source: DeviceArray) -> None:
     """Copy a CPU array to another one of the same type and size, both contiguous.
 
     It takes a tenth of the time of `wp.copy`.
@@ -217,7 +218,7 @@ class Layout:
 
     across: Any = None
     inside: ClassVar[Any] = ...
-    chunks: wp.array[Any] | None = None
+    chunks: DeviceArray | None = None
     rows: Any = None
 
     def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
@@ -229,7 +230,7 @@ class Layout:
         """Number of elements of a stored field."""
         return math.prod(self.stored_shape)
 
-    def zeros(self, dtype: Any) -> wp.array[Any]:
+    def zeros(self, dtype: Any) -> DeviceArray:
         """Return a stored field of zeros."""
         return zeros(self.size, dtype, self.device)
 
@@ -246,7 +247,7 @@ class Layout:
             and field.is_contiguous
         )
 
-    def load(self, field: Array, dtype: Any, name: str = "field") -> wp.array[Any]:
+    def load(self, field: Array, dtype: Any, name: str = "field") -> DeviceArray:
         """Return `field` as a stored field; no copy is made if it is one already.
 
         Raises:
@@ -267,7 +268,7 @@ class Layout:
         """Return zeros of the stored shape on the host."""
         return zeros(self.size, dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
 
-    def copy(self, to: wp.array[Any], source: wp.array[Any]) -> None:
+    def copy(self, to: DeviceArray, source: DeviceArray) -> None:
         """Copy a stored field to another one of its type."""
         wp.copy(to, source)
 
@@ -293,7 +294,7 @@ class Layout:
             np.empty(self.shape) if like is None else like,
         ).ravel()
 
-    def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
+    def unload(self, stored: DeviceArray) -> DeviceArray:
         """Return a stored field as a contiguous field of the operator's shape.
 
         It is a copy unless both have the same layout.
@@ -315,7 +316,7 @@ class Padding:
     counts: tuple[int, int, int]
     small_pages: bool = False
 
-    def zeros(self, dtype: Any, device: wp.Device) -> wp.array[Any]:
+    def zeros(self, dtype: Any, device: wp.Device) -> DeviceArray:
         """Return a flat stored field of zeros."""
         return zeros(self.size, dtype, device, small_pages=self.small_pages)
 
@@ -378,7 +379,7 @@ class PaddedLayout(Layout):
         if self.sparse and taken(HUGE_PAGE) > 1.25 * taken(SMALL_PAGE):
             self.padding = replace(self.padding, small_pages=True)
 
-    def zeros(self, dtype: Any) -> wp.array[Any]:
+    def zeros(self, dtype: Any) -> DeviceArray:
         """Return a stored field of zeros."""
         return self.padding.zeros(dtype, self.device)
 
@@ -386,7 +387,7 @@ class PaddedLayout(Layout):
         """Return zeros of the stored shape on the host."""
         return self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
 
-    def copy(self, to: wp.array[Any], source: wp.array[Any]) -> None:
+    def copy(self, to: DeviceArray, source: DeviceArray) -> None:
         """Copy the part in use of a stored field to another one of its type.
 
         The target is 0 elsewhere.
@@ -419,7 +420,7 @@ class PaddedLayout(Layout):
                 within = slice(rows[0], rows[-1] + 1)
                 plane[within] = values[within]
 
-    def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
+    def unload(self, stored: DeviceArray) -> DeviceArray:
         """Return a stored field as a contiguous field of the operator's shape."""
         inner = stored.reshape(self.stored_shape)[1:-1, 1:-1, 1:-1]
         if self.sparse:

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.launch_graph import LaunchGraph
+from warp_lcp.kernels.types import DeviceArray
 
 
 class HostArray:
@@ -26,7 +27,7 @@ class HostArray:
     """
 
     def __init__(self, count: int | tuple[int, ...], dtype: Any, device: wp.Device) -> None:
-        self.array: wp.array[Any] = wp.zeros(count, dtype=dtype, device=device)
+        self.array: DeviceArray = wp.zeros(count, dtype=dtype, device=device)
         self._shared = wp.get_device(device).is_cpu
         self.host: Any = self.array.numpy() if self._shared else np.zeros_like(self.array.numpy())
         self._upload: Any = None  # the copy as a node of CUDA graphs

@@ -15,6 +15,7 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.layout import Rows
 from warp_lcp.kernels.memory import Scalar, rows_memory
 from warp_lcp.kernels.stencil_kernel import StencilKernel
+from warp_lcp.kernels.types import DeviceArray
 
 
 class HostKernel(threading.local):
@@ -101,7 +102,7 @@ class HostKernel(threading.local):
         self._graph = LaunchGraph(self._device, self._launch)
 
 
-def _warp(values: np.ndarray) -> wp.array[Any]:
+def _warp(values: np.ndarray) -> DeviceArray:
     """Return contiguous values with Warp's type, in the same memory."""
     return wp.array(
         values,

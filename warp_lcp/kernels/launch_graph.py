@@ -32,6 +32,7 @@ from warp_lcp.kernels.thread_pool import (
     ranges,
     team,
 )
+from warp_lcp.kernels.types import DeviceArray
 
 
 class _Recording(threading.local):
@@ -138,7 +139,7 @@ class Conditional:
     A graph or the thread pool decides, without the host.
     """
 
-    condition: wp.array[Any]
+    condition: DeviceArray
     program: CommandBuffer
 
     def launch(self) -> None:
@@ -150,7 +151,7 @@ class Conditional:
 class Loop:
     """A CUDA program repeated in a graph while a number on the device is not 0."""
 
-    condition: wp.array[Any]
+    condition: DeviceArray
     program: CommandBuffer
 
     def launch(self) -> None:
@@ -309,7 +310,7 @@ def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 
         program.launch(kernel, dim, inputs, device=device, block_dim=block_dim)
 
 
-def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
+def copy(to: DeviceArray, source: DeviceArray) -> None:
     """Copy an array to another one of the same type and size, now or recorded.
 
     Both are contiguous.
@@ -323,7 +324,7 @@ def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
         program.record(copied(to.ptr, source.ptr, _bytes_of(to), (to, source)))
 
 
-def clear(*arrays: wp.array[Any]) -> None:
+def clear(*arrays: DeviceArray) -> None:
     """Set contiguous arrays to 0, now or among recorded launches."""
     program = RECORDING.program
     for array in arrays:
@@ -339,8 +340,8 @@ def clear(*arrays: wp.array[Any]) -> None:
 class DeviceCopy:
     """Copy or clearing of an array on CUDA: a node of a graph."""
 
-    to: wp.array[Any]
-    source: wp.array[Any] | None
+    to: DeviceArray
+    source: DeviceArray | None
 
     def launch(self) -> None:
         """Copy now, or while a graph is captured."""
@@ -367,7 +368,7 @@ def call(function: Callable[[], object]) -> None:
     function() if program is None else program.record(DeviceCall(function))
 
 
-def _bytes_of(array: wp.array[Any]) -> int:
+def _bytes_of(array: DeviceArray) -> int:
     return int(array.size * wp.types.type_size_in_bytes(array.dtype))
 
 
@@ -471,7 +472,7 @@ class CommandBuffer:
                 stretch()
         self._runs += 1
 
-    def run_while(self, condition: wp.array[Any]) -> None:
+    def run_while(self, condition: DeviceArray) -> None:
         """Repeat all launches while the condition is not 0; the launches update it.
 
         Where loops run on the device, control does not return to the host: on CUDA, all but the
@@ -493,7 +494,7 @@ class CommandBuffer:
         else:
             wp.capture_while(condition, self._run_in_time)
 
-    def _loop(self, condition: wp.array[Any]) -> None:
+    def _loop(self, condition: DeviceArray) -> None:
         """Repeat all launches on the device while the condition is not 0."""
         if condition.ptr not in self._loops:
             self._loops[condition.ptr] = self._captured_loop(condition)
@@ -507,7 +508,7 @@ class CommandBuffer:
             return False
         return self._runs > 0  # the first run loads the kernels
 
-    def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
+    def _captured_loop(self, condition: DeviceArray) -> Callable[[], object]:
         """Return a function that repeats the launches.
 
         It launches a graph, or runs a table in the thread pool.

@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
+from warp_lcp.kernels.types import DeviceArray
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
 # Otherwise single cells, to compare both on a GPU.
@@ -323,7 +324,7 @@ class PrecomputedProduct:
 
     d: Any
     unit: float
-    y: wp.array[Any]
+    y: DeviceArray
     weights = None
 
     @functools.cached_property
@@ -528,7 +529,7 @@ class Rows:
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)), ends=high)
 
     @staticmethod
-    def in_part(pieces: wp.array[Any], cells: int, ends: tuple[int, int, int]) -> "Rows":
+    def in_part(pieces: DeviceArray, cells: int, ends: tuple[int, int, int]) -> "Rows":
         """Return row segments of a grid; a thread takes one.
 
         Args:

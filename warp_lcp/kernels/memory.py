@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.kernels.layout import RowLayout
+from warp_lcp.kernels.types import DeviceArray
 
 _BLANK: Any = RowLayout()
 LAYOUT = type(_BLANK.__ctype__())
@@ -99,13 +100,13 @@ class Slot:
         self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
         self._held: Any = None  # the last store passed to `point_to_first`
 
-    def point_to(self, array: wp.array[Any]) -> None:
+    def point_to(self, array: DeviceArray) -> None:
         """Make recorded launches use this array from now on."""
         self._held = None
         ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
         array.slot = self
 
-    def point_to_first(self, count: int, store: wp.array[Any]) -> None:
+    def point_to_first(self, count: int, store: DeviceArray) -> None:
         """Make recorded launches use the first elements of a flat array from now on."""
         if self._held is not store:
             ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)

@@ -26,6 +26,7 @@ import warp as wp
 from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.native import shared
+from warp_lcp.kernels.types import DeviceArray
 
 VARIABLE = "WARP_LCP_THREADS"
 # Environment variables in which MPI launchers give the number of ranks on this machine.
@@ -258,7 +259,7 @@ class Operation:
             else ", ".join(s.kept[0].kernel.key for s in self._kept if isinstance(s, OperationKind))
         )
 
-    def only_if(self, condition: wp.array[Any]) -> Operation:
+    def only_if(self, condition: DeviceArray) -> Operation:
         """Return the same operation, skipped where a number, shape (1,), wp.int32, is 0."""
         made = copy.copy(self)
         made._kept, made.condition = [*self._kept, condition], condition.ptr
@@ -320,7 +321,7 @@ class OperationTable:
             until it is 0. None: once.
     """
 
-    def __init__(self, operations: Iterable[Operation], again: wp.array[Any] | None = None) -> None:
+    def __init__(self, operations: Iterable[Operation], again: DeviceArray | None = None) -> None:
         self._kept = tuple(operations)
         self.checks = {operation.check for operation in self._kept} - {None}
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]

@@ -24,6 +24,7 @@ from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.native import HEADERS, text
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.thread_pool import Operation
+from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -236,8 +237,8 @@ class Reduction:
 
     def dot(
         self,
-        a: wp.array[Any],
-        b: wp.array[Any],
+        a: DeviceArray,
+        b: DeviceArray,
         slot: int,
         *,
         rows: Rows | None = None,
@@ -329,7 +330,7 @@ class Tally:
         self._places = 0
 
     @property
-    def found(self) -> wp.array[Any] | None:
+    def found(self) -> DeviceArray | None:
         """The results on a GPU, a number a column; None on the CPU."""
         return None if self._reading is None else self._reading.array
 
@@ -491,12 +492,12 @@ def _add_across(
         scalars[slots].assign(across.sum(scalars[slots].numpy()))
 
 
-def rows_of(field: wp.array[Any]) -> Rows:
+def rows_of(field: DeviceArray) -> Rows:
     """Return the rows of kernels over flat fields like this one."""
     return Rows.flat(field.size, field.device)
 
 
-def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = launch_now) -> None:
+def convert(a: DeviceArray, b: DeviceArray, *, launch: Launch = launch_now) -> None:
     """Convert b = a between float types.
 
     Between different types it may be recorded by `launch`.

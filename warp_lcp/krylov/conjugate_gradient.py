@@ -19,6 +19,7 @@ from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, LaunchGraph, cl
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, Reduction, rows_of
 
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
@@ -108,7 +109,7 @@ class LinearMap(Protocol):
     It uses `launch` if it consists of kernel launches only.
     """
 
-    def __call__(self, p: wp.array[Any], q: wp.array[Any], /, *, launch: Launch = ...) -> None:
+    def __call__(self, p: DeviceArray, q: DeviceArray, /, *, launch: Launch = ...) -> None:
         """Write q = A p."""
 
 
@@ -118,8 +119,8 @@ class KrylovPreconditioner(Protocol):
     It reads its own field `r` and writes its own field `z`.
     """
 
-    r: wp.array[Any]
-    z: wp.array[Any]
+    r: DeviceArray
+    z: DeviceArray
 
     def apply(self) -> None:
         """Write z = M r."""
@@ -156,7 +157,7 @@ class ConjugateGradient:
         product: LinearMap,
         preconditioner: KrylovPreconditioner,
         *,
-        weight: wp.array[Any] | None = None,
+        weight: DeviceArray | None = None,
         rows: Rows | None = None,
         across: Communicator | None = None,
     ) -> None:
@@ -190,7 +191,7 @@ class ConjugateGradient:
             out=self._reduction.partials,
         )
 
-    def _allocate(self, r: wp.array[Any], slots: int, square: int) -> None:
+    def _allocate(self, r: DeviceArray, slots: int, square: int) -> None:
         """Allocate x, p and device scalars.
 
         From slot `square` on these are r'r and the numbers of `next_iteration`.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +11,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.fields import zeros, zeros_like
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, Sums, rows_of
 from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
 
@@ -49,7 +49,7 @@ class GMRES:
         preconditioner: KrylovPreconditioner,
         *,
         restart: int = 30,
-        weight: wp.array[Any] | None = None,
+        weight: DeviceArray | None = None,
     ) -> None:
         r = preconditioner.r
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
@@ -135,7 +135,7 @@ class GMRES:
                 return k + 1
         return most
 
-    def _weigh(self, q: wp.array[Any], *, inverse: bool = False) -> None:
+    def _weigh(self, q: DeviceArray, *, inverse: bool = False) -> None:
         """Multiply a residual by w^(1/2), or by w^(-1/2) if `inverse`.
 
         The vectors of the basis are weighted residuals.
@@ -165,12 +165,12 @@ class GMRES:
 
     def _combine(
         self,
-        factors: wp.array[Any],
-        x: wp.array[Any],
+        factors: DeviceArray,
+        x: DeviceArray,
         count: int,
         *,
         sign: float = 1.0,
-        of: wp.array[Any] | None = None,
+        of: DeviceArray | None = None,
     ) -> None:
         """Compute x += sign times the sum of factors_j v_j.
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
@@ -18,12 +18,12 @@ NORM = KERNELS["krylov.norm"]
 class KrylovSystem:
     """A system that a Krylov method solves; `r` is its right-hand side."""
 
-    r: wp.array[Any]
+    r: DeviceArray
 
     def _iterate_by(
         self,
         method: Any,
-        weight: wp.array[Any] | None,
+        weight: DeviceArray | None,
         rows: Rows | None = None,
         across: Communicator | None = None,
     ) -> None:
@@ -39,7 +39,7 @@ class KrylovSystem:
             weight,
         )
 
-    def norm(self, field: wp.array[Any] | None = None) -> float:
+    def norm(self, field: DeviceArray | None = None) -> float:
         """Return the norm ||weight^(1/2) r||, or that of another field like r."""
         return float(
             np.sqrt(

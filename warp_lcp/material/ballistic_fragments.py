@@ -306,7 +306,7 @@ class BallisticFragments:
         whole, several = self._flight.sums.numpy()[:bodies], self._numbers.several
         if several:  # the same on all ranks
             whole = np.concatenate([self.grid.part.ranks.sum(whole[:several]), whole[several:]])
-        sums = whole.astype(np.float64)
+        sums: np.ndarray = whole.astype(np.float64)
         sums[:, 1 : kernels.LEAVES] /= self._quanta.value
         return sums
 
@@ -335,7 +335,9 @@ class BallisticFragments:
 
 def _about_center(sums: Sums) -> np.ndarray:
     """Return the angular momenta of bodies about their centers, shape (bodies, 3)."""
-    return sums[:, 7:10] - np.cross(sums[:, 1:4], sums[:, 4:7]) / np.maximum(sums[:, :1], 1.0)
+    orbital = np.cross(sums[:, 1:4], sums[:, 4:7]) / np.maximum(sums[:, :1], 1.0)
+    momenta: np.ndarray = sums[:, 7:10] - orbital
+    return momenta
 
 
 def _about_mean(sums: Sums) -> np.ndarray:
@@ -343,7 +345,9 @@ def _about_mean(sums: Sums) -> np.ndarray:
 
     The shape is (bodies,).
     """
-    return sums[:, 16] - (sums[:, 4:7] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+    of_mean = (sums[:, 4:7] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+    squares: np.ndarray = sums[:, 16] - of_mean
+    return squares
 
 
 def _turning(sums: Sums, *momenta: np.ndarray) -> list[np.ndarray]:

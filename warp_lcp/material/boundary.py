@@ -12,11 +12,12 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
+from warp_lcp.grid.advection import advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
 from warp_lcp.grid.motion import Motions, boxes_of, kinks
+from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window

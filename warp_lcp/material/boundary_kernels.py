@@ -1,8 +1,6 @@
 # mypy: ignore-errors
 """Kernels of cells and faces beside solids; they run when solids are placed."""
 
-import typing
-
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_below, cell_kernel
@@ -21,7 +19,7 @@ _AIR = wp.constant(wp.int8(AIR))
 _SOLID = wp.constant(wp.int8(SOLID))
 
 
-options: dict[str, typing.Any] = {"module": "warp_lcp.material.boundary"}
+options: dict[str, str] = {"module": "warp_lcp.material.boundary"}
 
 
 @cell_kernel("warp_lcp.material.boundary")

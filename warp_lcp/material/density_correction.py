@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -25,6 +25,7 @@ from warp_lcp.kernels.memory import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 
@@ -51,6 +52,7 @@ def displacement_pass(cut: bool) -> StencilKernel:
 
 
 @forward_kernel(module="warp_lcp.material.density_correction.count")
+@no_type_check
 def add_kernel(
     a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), sum: wp.array(dtype=wp.float64)
 ):
@@ -239,7 +241,7 @@ class DensityCorrection:
         self,
         grid: StaggeredGrid,
         boundary: Boundary,
-        solver: Any,
+        solver: Solver,
         *,
         particles_a_cell: int,
         max_density: float,

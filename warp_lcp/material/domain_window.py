@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -160,7 +161,7 @@ class DomainWindow:
         )
 
 
-def start_of(scene: ParticleScene, device: Any) -> tuple[DomainWindow, StaggeredGrid]:
+def start_of(scene: ParticleScene, device: wp.DeviceLike) -> tuple[DomainWindow, StaggeredGrid]:
     """Return the grid window of a scene, and its first grid.
 
     The grid covers the materials at the start and the sources.

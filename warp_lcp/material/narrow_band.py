@@ -37,7 +37,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -311,14 +310,23 @@ class NarrowBand:
 
     def _launch_carry(self, velocity: list[wp.array]) -> None:
         """Launch the advection, and the sums over cells without particles."""
-        more: dict[str, Any] = {"level": self._now, "least": 0.0, "before": self._before}
-        more |= {"grid": self.grid, "window": self._inner, "velocity": velocity, "way": self._way}
         for axis, field, out in [
             (CENTERS, self._now, self.depth),
             *zip(range(3), velocity, self.velocity, strict=False),
         ]:
             clear(out)
-            carry_field(field=field, out=out, axis=axis, **more)
+            carry_field(
+                field=field,
+                out=out,
+                axis=axis,
+                level=self._now,
+                least=0.0,
+                before=self._before,
+                grid=self.grid,
+                window=self._inner,
+                velocity=velocity,
+                way=self._way,
+            )
         self.grid.part.fill(self.depth, *self.velocity)
         if self._here:
             self._launch_sums(self._owned)
@@ -483,7 +491,7 @@ class NarrowBand:
         """Return the sum of a count over all processes."""
         return int(self.grid.part.ranks.sum(count))
 
-    def _add_places(self, particles: Any, behind: int) -> None:
+    def _add_places(self, particles: Particles, behind: int) -> None:
         """Set the places of a rank's fresh particles in the order of the domain's cells."""
         counts = np.diff(self._total.numpy(), prepend=0)
         stored = np.flatnonzero(counts)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -16,6 +16,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.barriers import BARRIER, Barriers
 from warp_lcp.grid.cut_cells import DEEP, CutCells
+from warp_lcp.grid.part import subdomain_of
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
@@ -48,6 +49,9 @@ from warp_lcp.rigid.mass_properties import mass_properties
 from warp_lcp.rigid.obstacles import domain_walls, obstacle
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import Shape, SolidProperties
+
+if TYPE_CHECKING:
+    from warp_lcp.granular.solids import SandSolids
 
 
 def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
@@ -159,8 +163,8 @@ def make_boundary(
     """
     placed = placed_solids(scene, folder) if solids is None else solids
     if grid.part.shared:
-        part: Any = grid.part
-        return part.make_boundary(scene, placed)
+        shared, warnings = subdomain_of(grid).make_boundary(scene, placed)
+        return shared, tuple(warnings)
     around = PeriodicSides(grid, scene.endless) if scene.endless else None
     separating, covered = scene.domain.wall == "separating", grid.whole is not None
     sides = open_sides_of(grid, side_bits(scene.domain.open))
@@ -274,7 +278,7 @@ class Parts:
     boundary: Boundary
     sources: Sources | None = None
     band: NarrowBand | None = None
-    solids: Any = None
+    solids: SandSolids | None = None
 
 
 def make_spray(

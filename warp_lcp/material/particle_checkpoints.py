@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_lcp.grid.part import subdomain_of
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.domain_window import DomainWindow, carry_over
 from warp_lcp.material.narrow_band import without_band
@@ -19,6 +20,9 @@ from warp_lcp.material.particle_state import check_state, other_spacing, signatu
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Outlets, Sources
 from warp_lcp.material.spray import Spray
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
 
 
 class ParticleCheckpoints(ParticleFrames):
@@ -123,7 +127,11 @@ class ParticleCheckpoints(ParticleFrames):
             name: np.array(count) for name, count in counts.items() if count
         }
         particles |= self.particles.exchange.state()
-        clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
+        clock = {
+            "time": np.array(self.time),
+            "step_count": np.array(self.step_count),
+            "last_dt": np.array(self.last_dt),
+        }
         bodies = self.bodies.state() if self.bodies is not None else {}
         known = {"signature": signature(self.scene, self.grid)}
         return clock | known | particles | part.kept(self._fields()) | bodies | part.where()
@@ -177,12 +185,12 @@ class ParticleCheckpoints(ParticleFrames):
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
                 ranks.
         """
-        part: Any = self.grid.part  # `Subdomain` where there are several ranks
-        if not part.shared:
+        if not self.grid.part.shared:
             if self.grid.whole is not None and self._coverage is not None:
                 self.regrid(self._coverage.domain)
             self.restore(state_of(pieces, self.state()))
             return
+        part = subdomain_of(self.grid)
         expected, found = self._everyone(), part.of_pieces(pieces)
         if found is not None and found is not part:
             self._work_on(found)
@@ -191,9 +199,9 @@ class ParticleCheckpoints(ParticleFrames):
             self.particles.totals()
             self.rebalance()
 
-    def repartition(self, part: Any) -> None:
+    def repartition(self, part: Subdomain) -> None:
         """Continue in other boxes of the same ranks; collective."""
-        before, piece, expected = self.grid.part, self.state(), self._everyone()
+        before, piece, expected = subdomain_of(self.grid), self.state(), self._everyone()
         self._work_on(part)
         self._take_pieces([part.migrate(piece, list(self.particles.arrays()), before)], expected)
 
@@ -203,7 +211,7 @@ class ParticleCheckpoints(ParticleFrames):
             self.band.held if self.band is not None else 0
         )
 
-    def _work_on(self, part: Any) -> None:
+    def _work_on(self, part: Subdomain) -> None:
         """Allocate the arrays of another part of the grid.
 
         Its particles and fields have no values yet.
@@ -218,7 +226,7 @@ class ParticleCheckpoints(ParticleFrames):
             pieces: pieces of all ranks, or that of this box.
             expected: number of particles of all pieces if none enter or leave.
         """
-        part: Any = self.grid.part
+        part = subdomain_of(self.grid)
         names, bodies = (
             list(self.particles.arrays()),
             self.bodies.state() if self.bodies is not None else {},

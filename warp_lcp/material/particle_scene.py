@@ -280,7 +280,7 @@ class ParticleScene(Scene):
         at_start = sum(
             int(self._sites(shape.bounds(self.dimension)).prod()) for shape in self.materials()[1]
         )
-        count = min(
+        count: int = min(
             at_start + let_in, math.prod(self.cell_counts) * self.particles.per_axis**self.dimension
         )
         if self.particles.narrow_band is not None:
@@ -309,8 +309,11 @@ class ParticleScene(Scene):
         low, high = np.clip(box[:, : self.dimension] / step, -1.0, count + 1.0)
         first, last = np.ceil(low - 0.5 - reach), np.floor(high - 0.5 + reach)
         most = count // self.particles.per_axis if whole_cells else count
-        found = (np.minimum(last, most - 1) - np.maximum(first, 0) + 1).clip(min=0).astype(int)
-        return found * self.particles.per_axis if whole_cells else found
+        found: np.ndarray = (
+            (np.minimum(last, most - 1) - np.maximum(first, 0) + 1).clip(min=0).astype(int)
+        )
+        sites: np.ndarray = found * self.particles.per_axis if whole_cells else found
+        return sites
 
     def _source_sites(self, source: Source, *, later: bool) -> int:
         """Return the most particles of a source, at its start and until the run ends."""
@@ -480,7 +483,8 @@ class ParticleScene(Scene):
             self.counted_cells * (GRID_BYTES + self.solve_bytes) // 2
             + self.particle_estimate() * SEEDING_BYTES
         )
-        return max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
+        estimate: int = max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
+        return estimate
 
     @property
     def covered_counts(self) -> tuple[int, int, int]:

@@ -6,13 +6,15 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TypedDict
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.grid.active_rows import ActiveRows
-from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
+from warp_lcp.grid.particle_loops import MARGIN
+from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.kernels.launch_graph import LaunchGraph, copy
@@ -38,6 +40,17 @@ from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopw
 # Largest relative residual of bodies' contacts. Above it gravity's velocity of a step is wrong by a
 # hundredth, and bodies creep.
 CONTACTS_MISSED = 1e-2
+
+
+class ParticleSimulationOptions(TypedDict, total=False):
+    """Optional arguments of `ParticleSimulation`, see there."""
+
+    make_parts: Callable[[StaggeredGrid], Parts] | None
+    outlets: Outlets | None
+    bodies: RigidBodies | None
+    coverage: DomainWindow | None
+    spray: Spray | None
+    notes: Sequence[str]
 
 
 class ParticleSimulation(ParticleCheckpoints):
@@ -272,6 +285,10 @@ class ParticleSimulation(ParticleCheckpoints):
             *(time for part in timed for time in (part.start, part.stop)),
         )
         return [time for time in times if self.time < time <= until]
+
+    @abstractmethod
+    def step(self, dt: float) -> Row:
+        """Advance by dt [s]; return the row of the log."""
 
     def rebalance(self) -> None:
         """Continue in better boxes of ranks, if there are any; collective.
@@ -771,4 +788,5 @@ class ParticleSimulation(ParticleCheckpoints):
         free = self.boundary.base.numpy()[k, j, i] != wl.SOLID
         if self.grid.barriers is not None:
             free |= self.grid.barriers.near.numpy()[k, j, i] > 0
-        return free & self.boundary.admits(points)
+        admitted: np.ndarray = free & self.boundary.admits(points)
+        return admitted

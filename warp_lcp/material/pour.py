@@ -9,8 +9,8 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.grid.particles import seed
 from warp_lcp.material.particle_assembly import region_of
-from warp_lcp.material.particle_scene import MaterialProperties
 from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.scene.shapes import MaterialProperties
 
 
 def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.spatial import cKDTree
 
-from warp_lcp.grid.particles import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
 # x^(d+1) = x + 1: the steps of a sequence that fills a cube evenly.

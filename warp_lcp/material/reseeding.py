@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import typing
 
 import numpy as np
 import warp as wp
@@ -95,7 +94,7 @@ class Reseeding:
             (d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d))
         )
 
-    def _settings(self) -> typing.Any:
+    def _settings(self) -> kernels.ReseedingSetting:
         """Return the settings that are the same for all cells and steps, for kernels."""
         grid, s = self.grid, kernels.ReseedingSetting()
         s.planes, s.dx, s.inverse_dx = grid.planes, grid.spacing, 1.0 / grid.spacing

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import launch_list, list_kernel
-from warp_lcp.grid.particle_loops import ListMemory, launch
-from warp_lcp.grid.particles import GROWTH, MARGIN, Particles
+from warp_lcp.grid.particle_loops import MARGIN, ListMemory, launch
+from warp_lcp.grid.particles import GROWTH, Particles
 from warp_lcp.grid.sides import mark_gone
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -183,7 +183,7 @@ class Spray:
             for array in (particles.position, particles.velocity)
         )
         room = CLEAR * dx + (np.linalg.norm(v, axis=1) + 10.0 * dx) * dt
-        near = ~np.isfinite(x + v).all(axis=1)
+        near: np.ndarray = ~np.isfinite(x + v).all(axis=1)
         for axis in range(self._dimension):
             for side, gap in enumerate((x[:, axis], self._extent[axis] - x[:, axis])):
                 if not self._open >> (2 * axis + side) & 1:
@@ -222,6 +222,5 @@ class Spray:
             return
         kept = None if source.kept is None else source.kept.numpy()[which, 0]
         target.append(source.position.numpy()[which], source.velocity.numpy()[which], kept)
-        marks: Any = source.marks
-        marks.assign(which.astype(np.int32))
-        source.remove(marks)
+        source.marks.assign(which.astype(np.int32))
+        source.remove(source.marks)

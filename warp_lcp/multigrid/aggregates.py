@@ -19,6 +19,7 @@ from pyamg.strength import classical_strength_of_connection, symmetric_strength_
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.operators.sparse import SparseOperator
 
@@ -143,9 +144,9 @@ class Aggregation:
         members: the unknowns, by aggregates, wp.int32.
     """
 
-    owner: wp.array[Any]
-    first: wp.array[Any]
-    members: wp.array[Any]
+    owner: DeviceArray
+    first: DeviceArray
+    members: DeviceArray
 
     @classmethod
     def of(cls, aggregates: scipy.sparse.csr_array, device: wp.Device) -> Aggregation:
@@ -180,11 +181,11 @@ class AggregateLevel:
     """
 
     A: SparseOperator
-    x: wp.array[Any]
-    b: wp.array[Any]
-    lower: wp.array[Any]
-    upper: wp.array[Any]
-    y: wp.array[Any]
+    x: DeviceArray
+    b: DeviceArray
+    lower: DeviceArray
+    upper: DeviceArray
+    y: DeviceArray
     aggregation: Aggregation | None
     visits: int = GAMMA
     _legs: dict[str, list[CycleStage]] = field(default_factory=dict, init=False, repr=False)
@@ -313,9 +314,7 @@ class MonotoneAggregation:
                 operator = SparseOperator(found.T @ host @ found, device=device, dtype=wp.float64)
         return len(self._levels) > 1
 
-    def cycle(
-        self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
-    ) -> None:
+    def cycle(self, x: DeviceArray, b: DeviceArray, lower: DeviceArray, upper: DeviceArray) -> None:
         """Apply one cycle to x (float64, within its bounds).
 
         The cycle is recorded, and recorded again when a field is replaced.

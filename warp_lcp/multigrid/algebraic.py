@@ -21,6 +21,7 @@ from pyamg.strength import symmetric_strength_of_connection
 from warp_lcp.kernels import BoundKernel, KernelFile, Rows
 from warp_lcp.kernels.fields import kept, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import (
     densify_kernel,
@@ -58,7 +59,7 @@ class DeviceMatrix:
             RowEntries(self.indptr, self.indices, self.values),
         )
 
-    def multiplying(self, x: wp.array[Any], y: wp.array[Any], *, add: bool = False) -> BoundKernel:
+    def multiplying(self, x: DeviceArray, y: DeviceArray, *, add: bool = False) -> BoundKernel:
         """Return the kernel y = A x, or y + A x."""
         return PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y)
 
@@ -141,7 +142,7 @@ class AlgebraicLevel:
         )
 
     def sweep(
-        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False
+        self, y: DeviceArray, x: DeviceArray, omega: float, *, from_zero: bool = False
     ) -> BoundKernel:
         """Return the sweep y = x + omega (b - A x), scaled by the rows' l1 norms.
 
@@ -241,7 +242,7 @@ class AlgebraicHierarchy:
         )
         self.r, self.z = self.levels[0].b, self.levels[0].x
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set the free set and the shift D >= 0, and coarsen.
 
         The set is a uint8 field, the shift a float64 field; None: 0.
@@ -262,7 +263,7 @@ class AlgebraicHierarchy:
         ).launch()
         self._coarsening.run()
 
-    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         """Compute q = M p on the finest level."""
         self.levels[0].A.multiplying(p, q).launch(launch)
 
@@ -345,7 +346,7 @@ class AlgebraicHierarchy:
     def _most(self) -> int:
         return self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
 
-    def _find_entries(self, host: Matrix, pattern: Matrix) -> wp.array[Any]:
+    def _find_entries(self, host: Matrix, pattern: Matrix) -> DeviceArray:
         """Return the index in A of each entry of the pattern, -1 if A lacks it.
 
         Empty if both patterns are equal.

@@ -23,6 +23,7 @@ import warp as wp
 from warp_lcp.kernels import BoundKernel, KernelFile, Rows
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, recorded
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.dense_inverse import DenseInverse
@@ -63,11 +64,11 @@ class LineFields:
         cells: of a row.
     """
 
-    x: wp.array[Any]
-    b: wp.array[Any]
-    t: wp.array[Any]
-    d: wp.array[Any]
-    weights: wp.array[Any]
+    x: DeviceArray
+    b: DeviceArray
+    t: DeviceArray
+    d: DeviceArray
+    weights: DeviceArray
     size: int
     cells: int
 
@@ -293,10 +294,7 @@ class BlackBoxMultigrid:
         return self.levels[0]
 
     def restrict(
-        self,
-        free: wp.array[Any],
-        shift: wp.array[Any] | None = None,
-        weight: wp.array[Any] | None = None,
+        self, free: DeviceArray, shift: DeviceArray | None = None, weight: DeviceArray | None = None
     ) -> None:
         """Set the free set and the shift, and coarsen.
 
@@ -306,14 +304,14 @@ class BlackBoxMultigrid:
         self._fill(free, shift, weight)
         self._building.run()
 
-    def take_all(self, free: wp.array[Any]) -> None:
+    def take_all(self, free: DeviceArray) -> None:
         """Set a free set for transfers between the two finest levels only."""
         self._fill(free, None, None)
         for made in self.finest.transferring():
             made.launch()
 
     def _fill(
-        self, free: wp.array[Any], shift: wp.array[Any] | None, weight: wp.array[Any] | None
+        self, free: DeviceArray, shift: DeviceArray | None, weight: DeviceArray | None
     ) -> None:
         finest = self.finest
         FILL.bind(

@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.layout import Pattern
+from warp_lcp.kernels.types import DeviceArray
 
 Counts = tuple[int, int, int]
 
@@ -39,7 +40,7 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
 
 def weights_block(
     pattern: Pattern, padding: Padding, real: Any, device: wp.Device
-) -> tuple[wp.array[Any], tuple[wp.array[Any], ...]]:
+) -> tuple[DeviceArray, tuple[DeviceArray, ...]]:
     """Return memory for a pattern's weights, and its field for each weight.
 
     The fields lie one after another.

@@ -13,11 +13,9 @@ excess, whose held neighbors are one cell and not one aggregate away, by `held`.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import warp as wp
 
 from warp_lcp.kernels import FusedKernel, KernelFile
+from warp_lcp.kernels.types import DeviceArray
 
 UNBOUNDED = 1e30  # represents an infinite bound of a correction; corrections are of order one
 
@@ -67,9 +65,9 @@ class Coarsening:
         held: factor of the excess of a diagonal over its weights.
     """
 
-    changed: wp.array[Any]
-    coarse_changed: wp.array[Any]
-    coarse_d: wp.array[Any]
+    changed: DeviceArray
+    coarse_changed: DeviceArray
+    coarse_d: DeviceArray
     cells: int
     periodic_x: bool
     periodic_y: bool

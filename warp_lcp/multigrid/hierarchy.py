@@ -17,6 +17,7 @@ from warp_lcp.kernels import BoundKernel, FusedKernel, Rows
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer, copy, recording
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import convert
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
@@ -223,7 +224,7 @@ class Hierarchy:
             self.finest.signing(self._signs).launch(program.launch)
         return program
 
-    def hold(self, d: wp.array[Any], free: wp.array[Any]) -> None:
+    def hold(self, d: DeviceArray, free: DeviceArray) -> None:
         """Set the finest diagonal for a free set: d where `free`, else 0.
 
         `free` is a stored uint8 field. Changed rows are marked.
@@ -434,7 +435,7 @@ def _whole_stencil(
     """Return an empty stencil of the whole grid, like that of a process."""
     padding = Padding(counts)
 
-    def like(field: wp.array[Any]) -> wp.array[Any]:
+    def like(field: DeviceArray) -> DeviceArray:
         return wp.zeros(padding.size, dtype=field.dtype, device=field.device)
 
     weights = None if part.weights is None else tuple(map(like, part.weights))

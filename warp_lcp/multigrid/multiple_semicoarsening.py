@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import Rows
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle import CycleStage
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
@@ -191,7 +192,7 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
 
 
-def _gathered(weights: wp.array[Any], order: wp.array[Any]) -> np.ndarray:
+def _gathered(weights: DeviceArray, order: DeviceArray) -> np.ndarray:
     taken = wp.empty(order.size, dtype=weights.dtype, device=order.device)
     GATHER.bind(
         Rows.flat(order.size, order.device), source=weights, order=order, taken=taken

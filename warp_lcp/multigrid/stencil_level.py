@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.kernels import BoundKernel, Rows, StencilKernel
 from warp_lcp.kernels.fields import nothing, zeros
 from warp_lcp.kernels.launch_graph import Task
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.compact_levels import mask
@@ -19,7 +20,7 @@ from warp_lcp.multigrid.cycle_passes import Coarsening
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
-Pair = tuple[wp.array[Any], wp.array[Any]]
+Pair = tuple[DeviceArray, DeviceArray]
 
 
 class StencilLevel:
@@ -53,7 +54,7 @@ class StencilLevel:
         bounds: Pair | None = None,
     ) -> None:
         self.stencil, self.real, self.settings = stencil, real, settings
-        field: Callable[[], wp.array[Any]] = lambda: stencil.padding.zeros(real, stencil.device)  # noqa: E731
+        field: Callable[[], DeviceArray] = lambda: stencil.padding.zeros(real, stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
         self.lower, self.upper = (
             (bounds or (field(), field() if upper else nothing(real, stencil.device)))
@@ -62,7 +63,7 @@ class StencilLevel:
         )
         self.form = stencil.weights is not None, stencil.d.dtype, real, stencil.pattern
         # Weights of a compact level, one field after another.
-        self.block: wp.array[Any] | None = None
+        self.block: DeviceArray | None = None
         self.factors = 1, 1, 1
         # Bound kernels by their keys: a W-cycle repeats few of them many times.
         self._bound: dict[Any, Any] = {}
@@ -103,7 +104,7 @@ class StencilLevel:
             changed=self.changed,
         )
 
-    def signing(self, signs: wp.array[Any]) -> BoundKernel:
+    def signing(self, signs: DeviceArray) -> BoundKernel:
         """Return the kernel that marks rows whose weights hash to other 64 bits."""
         s = self.stencil
         assert s.weights is not None
@@ -160,7 +161,7 @@ class StencilLevel:
         *,
         projected: bool,
         rows: Rows | None = None,
-        x: wp.array[Any] | None = None,
+        x: DeviceArray | None = None,
     ) -> BoundKernel:
         """Return the kernel that adds `scale` times the coarse correction.
 
@@ -186,7 +187,7 @@ class StencilLevel:
         return self._once(name, lambda: self.stencil.fillings(getattr(self, name)))
 
     @cached_property
-    def near(self) -> wp.array[Any]:
+    def near(self) -> DeviceArray:
         """Buffer of the ascending leg.
 
         It uses the cells beside other processes' first, then three planes.
@@ -224,7 +225,7 @@ class StencilLevel:
         *,
         projected: bool,
         from_zero: bool = False,
-        ring: wp.array[Any] | None = None,
+        ring: DeviceArray | None = None,
     ) -> tuple[BoundKernel, BoundKernel]:
         """Return the same for one fused kernel.
 
@@ -384,7 +385,7 @@ class StencilLevel:
             made = self._bound[key] = make()
         return made
 
-    def _sides(self, projected: bool) -> tuple[wp.array[Any] | None, wp.array[Any] | None]:
+    def _sides(self, projected: bool) -> tuple[DeviceArray | None, DeviceArray | None]:
         return (self.lower, self.upper) if projected else (None, None)
 
     def _coarser_rows(self, coarse: StencilLevel) -> Rows:
@@ -396,8 +397,8 @@ class StencilLevel:
 
     def sweeping(
         self,
-        y: wp.array[Any],
-        x: wp.array[Any],
+        y: DeviceArray,
+        x: DeviceArray,
         omega: float,
         *,
         projected: bool,

@@ -19,6 +19,7 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Launch, clear, together
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.protocol import FLUID
 
 options: dict[str, Any] = {"module": "warp_lcp.components"}
@@ -91,7 +92,7 @@ if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
 
 
-Scratch = tuple[wp.array[Any], wp.array[Any]]
+Scratch = tuple[DeviceArray, DeviceArray]
 ROUNDED = 1e-10  # relative to the terms of a sum whose weights were computed
 
 
@@ -108,9 +109,9 @@ class FaceCoefficients:
         nz: likewise along z.
     """
 
-    fx: wp.array[Any] | None
-    fy: wp.array[Any] | None
-    fz: wp.array[Any] | None
+    fx: DeviceArray | None
+    fy: DeviceArray | None
+    fz: DeviceArray | None
     nx: float
     ny: float
     nz: float
@@ -194,7 +195,7 @@ class FloatingComponents:
             self.label, self.device, self._across, left=self.right, right=self.left
         )
 
-    def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
+    def unattainable(self, b: DeviceArray, lower: DeviceArray, upper: DeviceArray) -> float:
         """Return a lower bound of the natural residual's norm; 0 if b is compatible.
 
         Args:
@@ -224,7 +225,7 @@ class FloatingComponents:
         squares = self.sizes if self.left is None else np.bincount(label, w**2, self.count)
         return float(np.sqrt(np.sum(rest**2 / squares)))
 
-    def project(self, r: wp.array[Any], free: wp.array[Any]) -> None:
+    def project(self, r: DeviceArray, free: DeviceArray) -> None:
         """Subtract the mean of r from every component whose unknowns are all free.
 
         The result is a right-hand side that a singular block can meet.
@@ -251,7 +252,7 @@ class FloatingComponents:
             device=self.device,
         )
 
-    def _project_weighted(self, w: np.ndarray, r: wp.array[Any], free: wp.array[Any]) -> None:
+    def _project_weighted(self, w: np.ndarray, r: DeviceArray, free: DeviceArray) -> None:
         """Subtract w (w'r)/(w'w) from r on components whose unknowns are all free."""
         inside = self.label >= 0
         label, weights, host = self.label[inside], w[inside], r.numpy()
@@ -265,7 +266,7 @@ class FloatingComponents:
         r.assign(changed)
 
     def _settle_weighted(
-        self, v: np.ndarray, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]
+        self, v: np.ndarray, x: DeviceArray, lower: DeviceArray, upper: DeviceArray
     ) -> None:
         """Choose multiples of v instead of constants, otherwise like `settle`."""
         inside, moved = self.label >= 0, x.numpy().copy()
@@ -292,7 +293,7 @@ class FloatingComponents:
         found: np.ndarray = np.where(up, above, np.where(np.isfinite(below), -below, -mean))
         return found
 
-    def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
+    def settle(self, x: DeviceArray, lower: DeviceArray, upper: DeviceArray) -> None:
         """Choose the constants that the last `project` left open.
 
         The mean is 0 without bounds; otherwise x touches the bound toward which the sum of b pushes
@@ -414,7 +415,7 @@ class ComponentFinder:
         """
         return self._count.array
 
-    def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
+    def _grow(self, scratch: Scratch | None, joined: DeviceArray) -> Scratch:
         """Search now; return the result of `_search`."""
         clear(self._count.array)
         with together(self._A.device) as launch:
@@ -422,7 +423,7 @@ class ComponentFinder:
         self._count.changed()
         return found
 
-    def _search(self, scratch: Scratch | None, joined: wp.array[Any], launch: Launch) -> Scratch:
+    def _search(self, scratch: Scratch | None, joined: DeviceArray, launch: Launch) -> Scratch:
         """Return the component trees: each cell's parent, and the grounded roots.
 
         The number of cells without a grounded root is in `_count`.

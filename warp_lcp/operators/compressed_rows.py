@@ -11,6 +11,7 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.kernels.layout import make_struct
+from warp_lcp.kernels.types import DeviceArray
 
 
 @functools.cache
@@ -34,9 +35,9 @@ class RowEntries:
         a: values of the entries, float32 or float64.
     """
 
-    ptr: wp.array[Any]
-    col: wp.array[Any]
-    a: wp.array[Any]
+    ptr: DeviceArray
+    col: DeviceArray
+    a: DeviceArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +50,9 @@ class CompressedRows:
         values: entries, wp.float32 or wp.float64.
     """
 
-    indptr: wp.array[Any]
-    indices: wp.array[Any]
-    values: wp.array[Any]
+    indptr: DeviceArray
+    indices: DeviceArray
+    values: DeviceArray
 
     @property
     def operand(self) -> Any:

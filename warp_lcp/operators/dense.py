@@ -18,6 +18,7 @@ from warp_lcp.kernels.fields import (
     real_array,
     relative_rounding,
 )
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
@@ -101,15 +102,15 @@ class DenseOperator(Pickled):
         """Return the largest relative rounding of an entry."""
         return self._rounding
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""
         return self._product(x, out, transposed=False)
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A' x, x as for `apply`."""
         return self._product(x, out, transposed=True)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A, shape (n,)."""
         return wp.array(self.host_diagonal().copy(), dtype=self.dtype, device=self.device)
 
@@ -130,7 +131,7 @@ class DenseOperator(Pickled):
         """Return the natural residual's d, shape (n,), for the current entries."""
         return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
-    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
         """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
 
         Shape (n, n), float64.
@@ -161,9 +162,7 @@ class DenseOperator(Pickled):
             rows, a=matrix, b=b, lower=lower, upper=upper, x=x, omega=omega, forward=forward
         ).launch()
 
-    def _product(
-        self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
-    ) -> wp.array[Any]:
+    def _product(self, x: DeviceArray, out: DeviceArray | None, *, transposed: bool) -> DeviceArray:
         """Return A x or A' x, in `out` if given."""
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")

@@ -28,6 +28,7 @@ from warp_lcp.kernels.fields import (
 )
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.launch_graph import copy as copy_array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator
 from warp_lcp.operators.cell_lists import cells_of
 from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
@@ -119,7 +120,7 @@ class GridOperator(Pickled):
         self.version = 1
         self._refills: dict[int, LaunchGraph] = {}  # by the address of the cells
         self.stencil = self._empty_stencil()
-        self._mask: wp.array[Any] | None = None
+        self._mask: DeviceArray | None = None
         self._fill_stencil()
 
     @classmethod
@@ -148,7 +149,7 @@ class GridOperator(Pickled):
         """
         return cls(cells=cells_of(shape, fluid, solid), **options)
 
-    def update(self, cells: wp.array[Any]) -> None:
+    def update(self, cells: DeviceArray) -> None:
         """Set new cell types, in place and without allocation.
 
         Face coefficients and shift in padded arrays are read again.
@@ -176,7 +177,7 @@ class GridOperator(Pickled):
             )
         self._refill(cells)
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x.
 
         Args:
@@ -189,8 +190,8 @@ class GridOperator(Pickled):
     apply_transpose = apply  # A is symmetric
 
     def _applied(
-        self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool = False
-    ) -> wp.array[Any]:
+        self, x: DeviceArray, out: DeviceArray | None, *, transposed: bool = False
+    ) -> DeviceArray:
         """Return A x or A' x for a stored field, or for one of the operator's shape."""
         if x.size == self.layout.size:
             if out is None:
@@ -210,11 +211,11 @@ class GridOperator(Pickled):
         wp.copy(out, product)
         return out
 
-    def _product(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+    def _product(self, x: DeviceArray, out: DeviceArray, *, transposed: bool) -> None:
         """Compute out = A x, or A' x; flat stored fields."""
         self.stencil.product(x, out)
 
-    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+    def apply_plus(self, x: DeviceArray, b: DeviceArray, out: DeviceArray) -> None:
         """Compute out = A x + b in one pass; stored fields of one type."""
         self.stencil.product(x, out, plus=b)
 
@@ -227,7 +228,7 @@ class GridOperator(Pickled):
         """
         self.stencil.relax(x, b, lower, upper, omega, forward=forward)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A, a field of the operator's shape and type.
 
         0 off the FLUID cells.
@@ -339,7 +340,7 @@ class GridOperator(Pickled):
         """Compute diagonal and weights on the current and former rows in use."""
         raise NotImplementedError
 
-    def _refill(self, cells: wp.array[Any]) -> None:
+    def _refill(self, cells: DeviceArray) -> None:
         """Set padded cell types and compute diagonal and weights."""
         self.version += 1
         if not self.records:
@@ -349,7 +350,7 @@ class GridOperator(Pickled):
             self._refills[cells.ptr] = LaunchGraph(self.device, partial(self._take_cells, cells))
         self._refills[cells.ptr].run()
 
-    def _take_cells(self, cells: wp.array[Any]) -> None:
+    def _take_cells(self, cells: DeviceArray) -> None:
         """Set padded cell types, and update rows in use, diagonal and weights."""
         if cells is not self.cells:
             COPY_CELLS.bind(
@@ -375,7 +376,7 @@ class GridOperator(Pickled):
         check_coefficients(field.numpy(), self.dtype, name)
         return True
 
-    def _stored_shift(self, shift: Any) -> wp.array[Any]:
+    def _stored_shift(self, shift: Any) -> DeviceArray:
         """Return the shift as a padded array; empty if there is none."""
         if shift is None:
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)

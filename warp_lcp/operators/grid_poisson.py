@@ -9,13 +9,14 @@ import copy
 from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows
-from warp_lcp.kernels.fields import overwrite, real_array
+from warp_lcp.kernels.fields import Array, overwrite, real_array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import (
     ComponentFinder,
@@ -38,6 +39,17 @@ FACE_GRADIENT = KERNELS["grid_poisson.face_gradient"]
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
 Face = Any  # a number or an array
+
+
+class PoissonArguments(TypedDict, total=False):
+    """Coefficients of `GridPoisson`, see there."""
+
+    face_x: Face
+    face_y: Face
+    face_z: Face
+    shift: Array | float | None
+
+
 AXES = "xyz"
 
 
@@ -131,7 +143,7 @@ class GridPoisson(GridOperator):
         self.shift = self._stored_shift(shift)
         self._check_sums()
 
-    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
         """Return the derivatives of mu'A x by face coefficients and shift.
 
         (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
@@ -189,8 +201,8 @@ class GridPoisson(GridOperator):
         }
 
     def _coefficient_field(
-        self, name: str, stored: wp.array[Any], shape: tuple[int, ...]
-    ) -> wp.array[Any]:
+        self, name: str, stored: DeviceArray, shape: tuple[int, ...]
+    ) -> DeviceArray:
         """Return a stored field of coefficients in the shape that was given.
 
         The field has those of lower faces.
@@ -249,7 +261,7 @@ class GridPoisson(GridOperator):
         sizes = tuple(field.size for field in (*self.faces, self.shift, *(s.weights or ())))
         return self.shape, self.periodic, self.dtype, s.d.dtype, sizes, *numbers
 
-    def _held(self) -> list[wp.array[Any]]:
+    def _held(self) -> list[DeviceArray]:
         """Return all arrays that a solve reads of the operator."""
         s = self.stencil
         return [
@@ -302,7 +314,7 @@ class GridPoisson(GridOperator):
         }
         return faces | {"shift": self.shift if self.shift.size else None}
 
-    def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
+    def _stored_face(self, face: Face, axis: int) -> DeviceArray:
         """Return the coefficients of lower faces as a padded array.
 
         Empty for a number.
@@ -382,7 +394,7 @@ class GridPoisson(GridOperator):
             self._ghosts,
         )
 
-    def _mean_coefficient(self, face: wp.array[Any], uniform: float) -> float:
+    def _mean_coefficient(self, face: DeviceArray, uniform: float) -> float:
         """Return the mean of the coefficients that are not 0."""
         if face.size == 0:
             return uniform

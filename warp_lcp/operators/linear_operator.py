@@ -14,6 +14,7 @@ import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real_array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import Operator
@@ -100,11 +101,11 @@ class LinearOperator(Pickled, Operator):
         """Pickle the constructor's arguments."""
         return made_again(_made, *self._given, device=self.device)
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x, x of `shape` and type wp.float32 or wp.float64."""
         return self._applied(self._product, x, out)
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A' x, x as for `apply`.
 
         Raises:
@@ -119,7 +120,7 @@ class LinearOperator(Pickled, Operator):
             self._product if self.symmetric or self._transpose is None else self._transpose, x, out
         )
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A or its estimate, of `shape`."""
         d = self.scale() if self._diagonal is None else self._diagonal
         return wp.array(d.reshape(self.shape), dtype=wp.float64, device=self.device)
@@ -143,9 +144,7 @@ class LinearOperator(Pickled, Operator):
         check_storable(host, wp.float64, "diagonal")
         return np.broadcast_to(host, self.shape).ravel().copy()
 
-    def _applied(
-        self, product: Product, x: wp.array[Any], out: wp.array[Any] | None
-    ) -> wp.array[Any]:
+    def _applied(self, product: Product, x: DeviceArray, out: DeviceArray | None) -> DeviceArray:
         if x.size != self.layout.size:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         image = self._image(np.array(x.numpy(), dtype=np.float64).reshape(self.shape), product)

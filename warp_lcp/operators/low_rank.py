@@ -18,6 +18,7 @@ from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, Reduction, add_across
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.pickling import Pickled, made_again
@@ -50,10 +51,10 @@ class ColumnEntries:
         width: columns of a block.
     """
 
-    entry_rows: wp.array[Any]
-    blocks: wp.array[Any]
-    values: wp.array[Any]
-    count: wp.array[Any]
+    entry_rows: DeviceArray
+    blocks: DeviceArray
+    values: DeviceArray
+    count: DeviceArray
     width: int
 
 
@@ -126,7 +127,7 @@ class BlockColumns:
         """The entries, distributed over threads in turn, for sums on a GPU."""
         return self._all
 
-    def reduction(self, found: wp.array[Any], columns: int) -> Reduction:
+    def reduction(self, found: DeviceArray, columns: int) -> Reduction:
         """Return the reduction that adds columns of sums over `turns` to `found`."""
         return Reduction(self.size, self.device, found, columns=columns, threads=self._all.places)
 
@@ -184,12 +185,12 @@ class BlockColumns:
 
     def gather(
         self,
-        x: wp.array[Any],
+        x: DeviceArray,
         *,
-        mask: wp.array[Any] | None = None,
+        mask: DeviceArray | None = None,
         fused: bool = True,
         launch: Launch = launch_now,
-    ) -> wp.array[Any]:
+    ) -> DeviceArray:
         """Write U'x to `sums`, and return that.
 
         x is a flat stored field; it counts as 0 where `mask` is 0. `fused` as of `scatter`.
@@ -206,11 +207,11 @@ class BlockColumns:
 
     def scatter(
         self,
-        factors: wp.array[Any],
-        base: wp.array[Any],
-        out: wp.array[Any],
+        factors: DeviceArray,
+        base: DeviceArray,
+        out: DeviceArray,
         *,
-        mask: wp.array[Any] | None = None,
+        mask: DeviceArray | None = None,
         sign: float = 1.0,
         fused: bool = True,
         launch: Launch = launch_now,
@@ -231,7 +232,7 @@ class BlockColumns:
             FUSED=fused,
         ).launch(launch)
 
-    def add_diagonal(self, weights: wp.array[Any], out: wp.array[Any]) -> None:
+    def add_diagonal(self, weights: DeviceArray, out: DeviceArray) -> None:
         """Add the diagonal of U W U' to `out`, W of shape (rank * rank,)."""
         DIAGONAL.bind(
             self._each, self.entry_fields, rank=self.rank, weights=weights, result=out
@@ -367,21 +368,21 @@ class LowRankOperator(Pickled):
         moved.assign(place[rows], blocks, values)
         return LowRankOperator.of_blocks(A, moved, self.weights.numpy())
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return U W U' x, x of the operator's shape or stored."""
         return self._product(x, out, self.weights)
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return U W' U' x."""
         return self._product(x, out, self._transposed)
 
     def add(
         self,
-        x: wp.array[Any],
-        base: wp.array[Any],
-        out: wp.array[Any],
+        x: DeviceArray,
+        base: DeviceArray,
+        out: DeviceArray,
         *,
-        mask: wp.array[Any] | None = None,
+        mask: DeviceArray | None = None,
         transposed: bool = False,
         launch: Launch = launch_now,
     ) -> None:
@@ -398,11 +399,11 @@ class LowRankOperator(Pickled):
         )
         self.columns.scatter(self.weighed, base, out, mask=mask, launch=launch)
 
-    def stored_diagonal(self, out: wp.array[Any]) -> None:
+    def stored_diagonal(self, out: DeviceArray) -> None:
         """Add the diagonal to a flat stored field of type wp.float64."""
         self.columns.add_diagonal(self.weights.flatten(), out)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal, a field of the operator's shape."""
         stored = self.layout.zeros(wp.float64)
         self.stored_diagonal(stored)
@@ -467,7 +468,7 @@ class LowRankOperator(Pickled):
             raise ValueError("weights holds a value that is not finite")
         return W
 
-    def products_at(self, x: wp.array[Any]) -> np.ndarray | None:
+    def products_at(self, x: DeviceArray) -> np.ndarray | None:
         """Return U'x of the last solve's solution; waits for the device.
 
         It must not be written to. None if no solve has stored it.
@@ -478,9 +479,7 @@ class LowRankOperator(Pickled):
             else None
         )
 
-    def _product(
-        self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]
-    ) -> wp.array[Any]:
+    def _product(self, x: DeviceArray, out: DeviceArray | None, W: DeviceArray) -> DeviceArray:
         """Return U W U' x for a stored field, or for one of the operator's shape."""
         if x.size != self.layout.size:
             if tuple(x.shape) != self.shape:

@@ -16,6 +16,7 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.layout import Pattern
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.sparse import SparseOperator
@@ -109,7 +110,7 @@ def _as_stencil(
         wp.array(middle, device=device),
     )
 
-    def recognize(block: wp.array[Any] | None) -> np.ndarray:
+    def recognize(block: DeviceArray | None) -> np.ndarray:
         """Compare all rows with the middle one, and copy entries to `block` if given."""
         return sums.of(
             RECOGNIZE,

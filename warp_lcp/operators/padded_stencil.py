@@ -27,6 +27,7 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import Padding
 from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
 from warp_lcp.kernels.layout import Pattern, check_memory, put, stencil_struct
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
@@ -93,10 +94,10 @@ class Ghosts(Protocol):
     @property
     def gathering(self) -> Any: ...  # noqa: D102
 
-    def fill(self, field: wp.array[Any]) -> None:
+    def fill(self, field: DeviceArray) -> None:
         """Fill the ghost cells of a stored field."""
 
-    def filling(self, field: wp.array[Any]) -> Task:
+    def filling(self, field: DeviceArray) -> Task:
         """Return the task that fills ghost cells, now or in a program."""
 
     def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
@@ -170,12 +171,12 @@ class PaddedStencil:
     """
 
     padding: Padding
-    d: wp.array[Any]
-    weights: tuple[wp.array[Any], ...] | None
+    d: DeviceArray
+    weights: tuple[DeviceArray, ...] | None
     coefficients: tuple[float, ...]
     unit: float = 1.0
     periodic: tuple[bool, bool, bool] = (False, False, False)
-    spans: wp.array[Any] | None = None
+    spans: DeviceArray | None = None
     strength: tuple[float, float, float] | None = None
     ghosts: Ghosts | None = None
     pattern: Pattern | None = None
@@ -230,7 +231,7 @@ class PaddedStencil:
         faces = [max(int(np.count_nonzero(w.numpy())), 1) for w in self.weights]
         return [s / n for s, n in zip(sums, faces, strict=True)]
 
-    def with_diagonal(self, d: wp.array[Any]) -> PaddedStencil:
+    def with_diagonal(self, d: DeviceArray) -> PaddedStencil:
         """Return the stencil with another diagonal and the same weights.
 
         A mask makes the diagonal 0.
@@ -238,12 +239,12 @@ class PaddedStencil:
         unit = self.unit if d.dtype is self.d.dtype else 1.0
         return replace(self, d=d, unit=unit)
 
-    def wrap(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def wrap(self, x: DeviceArray, *, launch: Launch = launch_now) -> None:
         """Fill x's ghost cells along periodic axes, and those of other ranks."""
         for filling in self.fillings(x):
             filling.launch(launch)
 
-    def fillings(self, x: wp.array[Any]) -> list[BoundKernel | Task]:
+    def fillings(self, x: DeviceArray) -> list[BoundKernel | Task]:
         """Return the launches of `wrap`."""
         strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
         axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
@@ -259,9 +260,9 @@ class PaddedStencil:
 
     def product(
         self,
-        x: wp.array[Any],
-        out: wp.array[Any],
-        plus: wp.array[Any] | None = None,
+        x: DeviceArray,
+        out: DeviceArray,
+        plus: DeviceArray | None = None,
         *,
         launch: Launch = launch_now,
     ) -> None:
@@ -274,10 +275,10 @@ class PaddedStencil:
 
     def relax(
         self,
-        x: wp.array[Any],
-        b: wp.array[Any],
-        lower: wp.array[Any],
-        upper: wp.array[Any],
+        x: DeviceArray,
+        b: DeviceArray,
+        lower: DeviceArray,
+        upper: DeviceArray,
         omega: float,
         *,
         forward: bool = True,

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
 from warp_lcp.kernels.fields import Array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.sparse import SparseOperator
@@ -63,7 +63,7 @@ class RestatedProblem:
         host = self.given.layout.load(x0, wp.float64, "x0").numpy()
         return host.reshape(self.grid) if self.order is None else host[self.order]
 
-    def field(self, x: wp.array[Any]) -> wp.array[Any]:
+    def field(self, x: DeviceArray) -> DeviceArray:
         """Convert a field of the problem in this form to the original problem's form."""
         if self.place is not None:
             return wp.array(x.numpy()[self.place], dtype=x.dtype, device=self.given.device)

@@ -25,6 +25,7 @@ from warp_lcp.kernels.fields import (
     zeros_like,
 )
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.dense import is_rounding
@@ -81,10 +82,10 @@ class MatrixSweep:
         forward: whether rows are taken in ascending order.
     """
 
-    ptr: wp.array[Any]
-    col: wp.array[Any]
-    a: wp.array[Any]
-    d: wp.array[Any]
+    ptr: DeviceArray
+    col: DeviceArray
+    a: DeviceArray
+    d: DeviceArray
     b: Any
     lower: Any
     upper: Any
@@ -156,7 +157,7 @@ class SparseOperator(Pickled):
         )
         self._indptr, self._indices = host.indptr, host.indices
         self._diagonal = zeros(self.unknowns, dtype, self.device)
-        self._transpose_values: wp.array[Any] | None = None
+        self._transpose_values: DeviceArray | None = None
         self.version = 0
         self._scale: np.ndarray | None = None
         self._turned: SparseOperator | None = None
@@ -223,13 +224,13 @@ class SparseOperator(Pickled):
         self.values.assign(host.data.astype(wp.dtype_to_numpy(self.dtype)))
         self._take(host)
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""
         out = self._result(x, out)
         self.product(x, out)
         return out
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A' x.
 
         The first call stores the transpose, unless A is symmetric.
@@ -252,15 +253,15 @@ class SparseOperator(Pickled):
         ).launch()
         return out
 
-    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+    def apply_plus(self, x: DeviceArray, b: DeviceArray, out: DeviceArray) -> None:
         """Evaluate out = A x + b in one pass; fields of one type."""
         self.product(x, out, plus=b)
 
     def product(
         self,
-        x: wp.array[Any],
-        out: wp.array[Any],
-        plus: wp.array[Any] | None = None,
+        x: DeviceArray,
+        out: DeviceArray,
+        plus: DeviceArray | None = None,
         *,
         launch: Launch = launch_now,
     ) -> None:
@@ -269,7 +270,7 @@ class SparseOperator(Pickled):
             launch
         )
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A, shape (n,).
 
         It is the operator's own memory, which `update` keeps current.
@@ -329,7 +330,7 @@ class SparseOperator(Pickled):
             1,
         )
 
-    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
         """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
 
         In the order of `indices`.
@@ -405,7 +406,7 @@ class SparseOperator(Pickled):
             RELAX.bind(here, sweep, list=rows, first=starts[c]).launch(launch)
 
     @cached_property
-    def colors(self) -> tuple[wp.array[Any], list[int]]:
+    def colors(self) -> tuple[DeviceArray, list[int]]:
         """Rows grouped by color, and the start of each color (and the end).
 
         On the device. No row has an entry in another row of its color. The coloring is greedy in
@@ -434,7 +435,7 @@ class SparseOperator(Pickled):
         self._scale, self._rounding = None, relative_rounding(host.data, self.dtype)
         self.version += 1
 
-    def _gather(self, order: wp.array[Any]) -> None:
+    def _gather(self, order: DeviceArray) -> None:
         GATHER.bind(
             Rows.flat(order.size, self.device),
             source=self.values,
@@ -443,7 +444,7 @@ class SparseOperator(Pickled):
         ).launch()
 
     @cached_property
-    def _transpose(self) -> tuple[wp.array[Any], wp.array[Any], wp.array[Any]]:
+    def _transpose(self) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
         """Rows and columns of A', and the index in A of each of its entries."""
         numbered = scipy.sparse.csr_array(
             (np.arange(self.nnz), self._indices, self._indptr), shape=self.shape * 2
@@ -463,7 +464,7 @@ class SparseOperator(Pickled):
             (values.astype(np.float64), self._indices, self._indptr), shape=self.shape * 2
         )
 
-    def _result(self, x: wp.array[Any], out: wp.array[Any] | None) -> wp.array[Any]:
+    def _result(self, x: DeviceArray, out: DeviceArray | None) -> DeviceArray:
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         return wp.zeros_like(x) if out is None else out

@@ -19,6 +19,7 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import check_kept, check_storable, real_array
 from warp_lcp.kernels.layout import Pattern
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components
 from warp_lcp.operators.grid_matrix import grid_matrix
@@ -208,7 +209,7 @@ class Stencil(GridOperator):
             "outside": self.outside,
         }
 
-    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
         """Return the derivatives by each offset's coefficients and by the shift.
 
         mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; for
@@ -350,13 +351,13 @@ class Stencil(GridOperator):
         """Return the values of one of the pattern's functions as a stored field."""
         return np.pad(self._evaluated(function), 1).ravel()
 
-    def _stored(self, values: np.ndarray) -> wp.array[Any]:
+    def _stored(self, values: np.ndarray) -> DeviceArray:
         """Return coefficients of all cells as a stored field."""
         return wp.array(np.pad(values, 1).ravel(), dtype=self.dtype, device=self.device)
 
     def _stored_weight(
         self, full: dict[Offset, np.ndarray], offset: Offset, halves: bool
-    ) -> wp.array[Any]:
+    ) -> DeviceArray:
         """Return an offset's weights as a stored field.
 
         Ghost cells of periodic axes have those of the cells that they represent. A weight that
@@ -419,18 +420,18 @@ class Stencil(GridOperator):
                 "closed sides: must be > 0"
             )
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A' x, as `apply` does A x."""
         return self._applied(x, out, transposed=not self.symmetric)
 
-    def _product(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+    def _product(self, x: DeviceArray, out: DeviceArray, *, transposed: bool) -> None:
         if not transposed:
             super()._product(x, out, transposed=False)
             return
         self.stencil.wrap(x)
         TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
 
-    def boundary_term(self, values: Any) -> wp.array[Any]:
+    def boundary_term(self, values: Any) -> DeviceArray:
         """Return the contribution to b of given values in AIR cells, instead of 0.
 
         The sums of a_o(i) value_(i + o), float64, shape of `cells`.
@@ -577,7 +578,7 @@ class StoredStencil(GridOperator):
     def __init__(
         self,
         cells: np.ndarray,
-        d: wp.array[Any],
+        d: DeviceArray,
         weights: tuple[Any, ...],
         pattern: Pattern | None,
         *,
@@ -590,7 +591,7 @@ class StoredStencil(GridOperator):
         self._made, self._unit = (d, weights, pattern, strength), unit
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
-    def take(self, cells: np.ndarray, d: np.ndarray, weights: wp.array[Any]) -> None:
+    def take(self, cells: np.ndarray, d: np.ndarray, weights: DeviceArray) -> None:
         """Set other cells of the same shape, another diagonal, and weights, in place.
 
         `weights` has one field after another.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import as_operator
@@ -70,7 +71,7 @@ class SumOperator(Pickled):
         self.second: Operator = second
         self.shape, self.device = tuple(first.shape), first.device
         self.dtype = wp.float64 if wp.float64 in (first.dtype, second.dtype) else wp.float32
-        self._scratch: dict[Any, wp.array[Any]] = {}
+        self._scratch: dict[Any, DeviceArray] = {}
         terms: tuple[Operator, Operator] = (
             (second, first) if isinstance(first, LowRankOperator) else (first, second)
         )
@@ -95,15 +96,15 @@ class SumOperator(Pickled):
         """Number of changes of all terms."""
         return sum(version_of(A) or 0 for A in (self.first, self.second))
 
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x + B x."""
         return self._add(x, out, transposed=False)
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A' x + B' x."""
         return self._add(x, out, transposed=True)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the sum of the diagonals."""
         d = self.first.diagonal().numpy().astype(np.float64) + self.second.diagonal().numpy()
         return wp.array(d, dtype=self.dtype, device=self.device)
@@ -119,7 +120,7 @@ class SumOperator(Pickled):
             else self.layout.load(self.diagonal(), self.dtype).numpy()
         )
 
-    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+    def apply_plus(self, x: DeviceArray, b: DeviceArray, out: DeviceArray) -> None:
         """Evaluate out = A x + B x + b; flat stored fields of one type."""
         plain, low = self._plain, self._low
         if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
@@ -173,9 +174,7 @@ class SumOperator(Pickled):
             return SumOperator(self.first.masked(free), second.masked(free, shift))
         return SumOperator(first.masked(free, shift), second.masked(free))
 
-    def _add(
-        self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool
-    ) -> wp.array[Any]:
+    def _add(self, x: DeviceArray, out: DeviceArray | None, *, transposed: bool) -> DeviceArray:
         """Return (A + B) x or its transpose, stored or of the operator's shape."""
         if x.size not in (self.layout.size, int(np.prod(self.shape))):
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
@@ -186,7 +185,7 @@ class SumOperator(Pickled):
             self._add_fields(x, out, transposed=transposed)
         return out
 
-    def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+    def _add_fields(self, x: DeviceArray, out: DeviceArray, *, transposed: bool) -> None:
         """Compute (A + B) x or its transpose on fields of one form."""
         plain, low = self._plain, self._low
         (plain.apply_transpose if transposed else plain.apply)(x, out)

@@ -14,6 +14,7 @@ import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import Layout, real_array
+from warp_lcp.kernels.types import DeviceArray
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
@@ -194,7 +195,7 @@ class AffineFields:
         self.values = [wp.clone(c) for c in self.constant]
         self._check()
 
-    def evaluate(self, x: wp.array[Any]) -> None:
+    def evaluate(self, x: DeviceArray) -> None:
         """Compute the bounds at x (stored, float64)."""
         for operands, values in zip(self.operands, self.values, strict=True):
             wp.launch(evaluate_kernel, x.size, [operands, x, values], device=x.device)
@@ -236,7 +237,7 @@ class AffineFields:
             )
 
 
-def affine_side(constant: wp.array[Any], index: Any = None, coefficient: Any = None) -> AffineSide:
+def affine_side(constant: DeviceArray, index: Any = None, coefficient: Any = None) -> AffineSide:
     """Return bounds as a kernel argument; constant ones without index."""
     side = AffineSide()
     side.constant = constant

@@ -17,6 +17,7 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import LARGE, Array, Layout, nothing, overwrite, real_array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
@@ -65,7 +66,7 @@ class Bounds:
             list(INFINITE),
             self._no_code,
         )
-        self._memory: wp.array[Any] | None = None
+        self._memory: DeviceArray | None = None
         self.affine = affine_fields(layout, lower, upper)
         if self.affine is not None:
             self.fields, self.values, self.varying, self.in_place = (
@@ -142,7 +143,7 @@ class Bounds:
             return [self._none, numbers[0], self._none, numbers[1], self.code]
         return [self.fields[0], numbers[0], self.fields[1], numbers[1], self.code]
 
-    def follow(self, x: wp.array[Any]) -> None:
+    def follow(self, x: DeviceArray) -> None:
         """Evaluate bounds that depend on x at x (stored, float64)."""
         if self.affine is not None:
             self.affine.evaluate(x)
@@ -224,7 +225,7 @@ class Bounds:
         found, across = float(self._others.reading.numpy()[0]), self.layout.across
         return found if across is None else float(across.sum(found))
 
-    def as_field(self, side: int) -> wp.array[Any]:
+    def as_field(self, side: int) -> DeviceArray:
         """Return a stored float64 field of the lower (0) or the upper bound (1)."""
         if self.fields[side].size:
             return self.fields[side]

@@ -18,6 +18,7 @@ from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import LARGE, Array, Layout, overwrite, real_array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, Sums, rows_of
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.pickling import OnHost, Pickled
@@ -157,12 +158,12 @@ class LCP(Pickled):
         return any(self.bounds.may_bind)
 
     @cached_property
-    def lower(self) -> wp.array[Any]:
+    def lower(self) -> DeviceArray:
         """l as a stored field, float64."""
         return self.bounds.as_field(0)
 
     @cached_property
-    def upper(self) -> wp.array[Any]:
+    def upper(self) -> DeviceArray:
         """u as a stored field, float64."""
         return self.bounds.as_field(1)
 
@@ -202,7 +203,7 @@ class LCP(Pickled):
         for cached in ("lower", "upper"):
             self.__dict__.pop(cached, None)
 
-    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+    def apply_plus(self, x: DeviceArray, b: DeviceArray, out: DeviceArray) -> None:
         """Evaluate out = A x + b on flat stored fields of one type.
 
         One kernel does it where the operator has a fused product.
@@ -213,11 +214,11 @@ class LCP(Pickled):
         self.A.apply(x.reshape(self.layout.stored_shape), out.reshape(self.layout.stored_shape))
         ADD.bind(rows_of(x), z=b, x=out).launch()
 
-    def not_finite(self, field: wp.array[Any]) -> int:
+    def not_finite(self, field: DeviceArray) -> int:
         """Return the number of unknowns of a stored field that are not finite."""
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
-    def look_at(self, field: wp.array[Any], launch: Launch = launch_now) -> DeviceScalar:
+    def look_at(self, field: DeviceArray, launch: Launch = launch_now) -> DeviceScalar:
         """Launch the check of `not_finite`; return the reading of its result.
 
         Its first number counts the values that are not finite. For a problem in one process.
@@ -231,7 +232,7 @@ class LCP(Pickled):
         )
         return self._counts.reading
 
-    def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
+    def _faults(self, field: DeviceArray, bounds: Bounds) -> list[int]:
         """Count the faults of b and of the bounds.
 
         Values of b that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf.
@@ -288,7 +289,7 @@ def _count(unknown: np.ndarray) -> int:
     )
 
 
-def _unknown(A: Operator, layout: Layout) -> wp.array[Any]:
+def _unknown(A: Operator, layout: Layout) -> DeviceArray:
     """Return a stored int8 field that is 1 on unknowns.
 
     A grid's cell types are used without a copy.

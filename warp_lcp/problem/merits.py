@@ -6,11 +6,10 @@ For plots and comparisons of convergence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 
 
@@ -34,7 +33,7 @@ class Merits:
     absolute: float
 
 
-def merits_at(problem: LCP, x: wp.array[Any], y: wp.array[Any]) -> Merits:
+def merits_at(problem: LCP, x: DeviceArray, y: DeviceArray) -> Merits:
     """Return the merit functions at x, a stored field, by one product.
 
     Args:

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
+
 
 class OnHost:
     """Wrapper of a device array in the arguments of `__reduce__`.
@@ -19,7 +21,7 @@ class OnHost:
     It is restored as a wp.array.
     """
 
-    def __init__(self, array: wp.array[Any]) -> None:
+    def __init__(self, array: DeviceArray) -> None:
         self._array = array
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -83,7 +85,7 @@ def _made(
     return make(*arguments, device=_present(device), **options)
 
 
-def _on_device(host: np.ndarray, dtype: str, device: str) -> wp.array[Any]:
+def _on_device(host: np.ndarray, dtype: str, device: str) -> DeviceArray:
     return wp.array(host, dtype=getattr(wp, dtype), device=_present(device))
 
 

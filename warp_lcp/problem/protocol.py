@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import Layout
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
 
 if TYPE_CHECKING:
@@ -49,10 +50,10 @@ class Operator(Protocol):
     symmetric: bool = False
 
     @abstractmethod
-    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x, in `out` if given."""
 
-    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+    def apply_transpose(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A' x, in `out` if given; by default A x of a symmetric A.
 
         Raises:
@@ -65,7 +66,7 @@ class Operator(Protocol):
             )
         return self.apply(x, out)
 
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """Return the diagonal of A as a field of type `dtype`.
 
         By default row and column norms, estimated from 16 products at each call, are used instead:
@@ -92,7 +93,7 @@ class HasRows(Operator, Protocol):
             empty. The unknown of an empty row goes to the bound that b's sign selects.
     """
 
-    row_sizes: wp.array[Any] | None
+    row_sizes: DeviceArray | None
 
     def rows(self) -> CompressedRows:
         """Return the rows of A for flat stored fields, in the operator's own memory."""
@@ -143,7 +144,7 @@ class HasCells(Operator, Protocol):
             others stay 0.
     """
 
-    cells: wp.array[Any]
+    cells: DeviceArray
 
 
 class HasStencil(HasCells, HasLayout, Versioned, Protocol):
@@ -188,7 +189,7 @@ class HasColumns(Operator, Protocol):
 class AppliesPlus(Operator, Protocol):
     """Fused A x + b, which saves one pass over memory per residual."""
 
-    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+    def apply_plus(self, x: DeviceArray, b: DeviceArray, out: DeviceArray) -> None:
         """Evaluate out = A x + b; flat stored fields of one type."""
 
 
@@ -238,7 +239,7 @@ class StoresRounded(Operator, Protocol):
 class HasCoefficients(Operator, Protocol):
     """Derivatives of a scalar by the data of A, for `wl.vjp`."""
 
-    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
         """Return the derivatives of mu'A x by the constructor's arguments, by name.
 
         Each has the shape that was given, as a wp.float64 array on A's device, or is a number where

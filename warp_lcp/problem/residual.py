@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -19,6 +18,7 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, PrecomputedProduct, Rows
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
@@ -62,7 +62,7 @@ class NaturalResidual:
             self.rescale()
 
     @cached_property
-    def y(self) -> wp.array[Any]:
+    def y(self) -> DeviceArray:
         """Field y, allocated at first access."""
         return self.problem.layout.zeros(wp.float64)
 
@@ -71,7 +71,7 @@ class NaturalResidual:
         """Kernel argument with the precomputed y, in place of a stencil."""
         return PrecomputedProduct(self.diagonal, self.unit, self.y)
 
-    def evaluate(self, x: wp.array[Any]) -> float:
+    def evaluate(self, x: DeviceArray) -> float:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""
         p = self.problem
         p.bounds.follow(x)
@@ -88,11 +88,11 @@ class NaturalResidual:
         self.norm, self.current = float(np.sqrt(square)), True
         return self.norm
 
-    def affine(self, x: wp.array[Any]) -> None:
+    def affine(self, x: DeviceArray) -> None:
         """Compute y = A x + b."""
         self.problem.apply_plus(x, self.problem.b, self.y)
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+    def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Project x onto the bounds, or set it to clip(0, l, u).
 
         It is 0 where there is no unknown.
@@ -104,7 +104,7 @@ class NaturalResidual:
             self.rescale()
         self.project(x, keep=keep)
 
-    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
+    def project(self, x: DeviceArray, *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x onto the bounds, or of 0, as `start` does."""
         p = self.problem
         # Bounds that depend on x are evaluated at the given x, then at x within its bounds.
@@ -134,11 +134,11 @@ class NaturalResidual:
         )
 
     @property
-    def row_sizes(self) -> wp.array[Any] | None:
+    def row_sizes(self) -> DeviceArray | None:
         """Largest magnitude of each row of a matrix with empty rows, else None."""
         return self.problem.A.row_sizes if has(self.problem.A, HasRows) else None
 
-    def settle_isolated(self, x: wp.array[Any]) -> None:
+    def settle_isolated(self, x: DeviceArray) -> None:
         """Set x at empty rows of A to the bound that the sign of b selects.
 
         There y = b. Methods move coupled unknowns only.
@@ -183,7 +183,7 @@ class NaturalResidual:
             UNKNOWN_SQUARE, launch=launch, b=self.problem.b, unknown=self.problem.unknown
         )
 
-    def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
+    def rounding_floor(self, x: DeviceArray, epsilon: float) -> float:
         """Estimate the residual that rounding x to `epsilon` leaves, in units of y.
 
         r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has an error e_i. Where r_i is y_i, or
@@ -197,7 +197,7 @@ class NaturalResidual:
         errors = np.where(np.abs(y - r) <= error, error, own)
         return math.sqrt(self._total(float(errors @ errors)))
 
-    def is_rounding(self, x: wp.array[Any]) -> bool:
+    def is_rounding(self, x: DeviceArray) -> bool:
         """Return whether the residual of every row is rounding error.
 
         |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|): x then solves the problem as well as float64 can
@@ -210,7 +210,7 @@ class NaturalResidual:
         beyond = float(np.count_nonzero(~(np.abs(r) <= 4 * EPS * (np.abs(b) + sizes))))
         return self._total(beyond) == 0
 
-    def _rows_at(self, x: wp.array[Any]) -> tuple[np.ndarray, ...]:
+    def _rows_at(self, x: DeviceArray) -> tuple[np.ndarray, ...]:
         """Return y, r, d, b and x of the unknowns at x, on the host."""
         p, field = self.problem, self.problem.layout.zeros(wp.float64)
         p.bounds.follow(x)

@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.pickling import FieldsOnHost
 
 if TYPE_CHECKING:
-    import warp as wp
-
     from warp_lcp.problem.merits import Merits
 
 
@@ -118,7 +117,7 @@ class SolveResult(FieldsOnHost):
         version: of the problem's operator then, None where it has none.
     """
 
-    x: wp.array[Any]
+    x: DeviceArray
     status: SolveStatus
     iterations: int
     linear_iterations: int

@@ -21,6 +21,7 @@ import warp as wp
 from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.kernels.fields import Array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import convert
 from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
@@ -125,10 +126,10 @@ class Residual(Protocol):
     norm: float
     current: bool
 
-    def evaluate(self, x: wp.array[Any]) -> float:
+    def evaluate(self, x: DeviceArray) -> float:
         """Return the norm at x, recomputed in float64."""
 
-    def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
+    def rounding_floor(self, x: DeviceArray, epsilon: float) -> float:
         """Estimate the norm that rounding x to `epsilon` leaves; 0 if there is none."""
 
 
@@ -139,7 +140,7 @@ class Workspace(Protocol):
     """
 
     problem: Any
-    x: wp.array[Any]
+    x: DeviceArray
     residual: Any  # a NaturalResidual of an LCP, else a Residual
     precision: Precision
 
@@ -169,7 +170,7 @@ class BeginsOnDevice(Protocol):
     """A workspace whose device can begin a solve without the host."""
 
     def begin_ahead(
-        self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+        self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve on the device, and take steps.
 
@@ -196,15 +197,15 @@ class WorkspaceBase:
     """
 
     floating: Any = None
-    _best: wp.array[Any] | None = None
-    _solution: wp.array[Any] | None = None
+    _best: DeviceArray | None = None
+    _solution: DeviceArray | None = None
 
     def __init__(
         self,
         problem: LCP,
         precision: str = Precision.DOUBLE,
         *,
-        x: wp.array[Any] | None = None,
+        x: DeviceArray | None = None,
         residual: NaturalResidual | None = None,
     ) -> None:
         self.problem, self.precision = problem, Precision(precision)
@@ -229,7 +230,7 @@ class WorkspaceBase:
         """Round x to its precision."""
         self._round(self.x, launch=launch)
 
-    def solution(self) -> wp.array[Any]:
+    def solution(self) -> DeviceArray:
         """Return x in its precision and stored shape: the same array after each solve."""
         single = self._rounded is not None
         if self._solution is None:
@@ -241,13 +242,13 @@ class WorkspaceBase:
             np.copyto(self._solution.numpy().reshape(-1), self.x.numpy(), casting="same_kind")
         return self._solution
 
-    def _finish_move(self, x: wp.array[Any]) -> None:
+    def _finish_move(self, x: DeviceArray) -> None:
         """Choose the constants of floating components after a move of x, and round."""
         if self.floating is not None:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
 
-    def _round(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def _round(self, x: DeviceArray, *, launch: Launch = launch_now) -> None:
         if self._rounded is not None:
             convert(x, self._rounded, launch=launch)
             convert(self._rounded, x, launch=launch)
@@ -264,7 +265,7 @@ class Solver(Protocol):
             ValueError: the method's assumptions on A do not hold.
         """
 
-    def step(self, problem: Any, work: Any, x: wp.array[Any]) -> Step:
+    def step(self, problem: Any, work: Any, x: DeviceArray) -> Step:
         """Move x once.
 
         `work.residual` is current at x; leave `work.residual.current` False unless it is at the new
@@ -671,7 +672,7 @@ class _Loop:
             version=version,
         )
 
-    def _found(self) -> wp.array[Any]:
+    def _found(self) -> DeviceArray:
         """Return the x of the result: the iterate in place."""
         return self.work.x
 
@@ -680,7 +681,7 @@ class _LoopInBox(_Loop):
     """State of a solve of an LCP."""
 
     problem: LCP
-    _y: wp.array[Any] | None = None  # A x + b for merit functions
+    _y: DeviceArray | None = None  # A x + b for merit functions
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), and go on from x0.
@@ -787,7 +788,7 @@ class _LoopInBox(_Loop):
                     "scale b and the bounds by one factor"
                 )
 
-    def _guess(self, x0: Array) -> wp.array[Any]:
+    def _guess(self, x0: Array) -> DeviceArray:
         """Return a guess as a stored field that is not the iterate itself."""
         stored = self.problem.layout.load(x0, wp.float64, "x0")
         if self.problem.not_finite(stored):
@@ -796,14 +797,14 @@ class _LoopInBox(_Loop):
             )
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
-    def _take(self, guess: wp.array[Any]) -> None:
+    def _take(self, guess: DeviceArray) -> None:
         self.problem.layout.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
         self.work.round_iterate()
         if not math.isfinite(self.residual.evaluate(self.work.x)):
             raise ValueError("x0 gives a residual that is not finite")
 
-    def _found(self) -> wp.array[Any]:
+    def _found(self) -> DeviceArray:
         """Return x in the problem's original layout, rounded to its precision."""
         layout, x = self.problem.layout, self.work.x
         if self.problem.in_place and hasattr(self.work, "solution"):

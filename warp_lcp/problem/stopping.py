@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Annotated, Any
+from typing import Annotated
 
-import warp as wp
 from annotated_types import Gt
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.settings import Count, CountOrZero, NonNegative, OrInfinite, Settings, ShareOrZero
 
@@ -106,7 +106,7 @@ class MeanCriteria:
     atol: float
     max_iterations: int
     count: Callable[[], float]
-    counted: wp.array[Any] | None = None
+    counted: DeviceArray | None = None
 
     def known(self) -> StoppingCriteria:
         """Return the criteria for the counted unknowns, computed once."""

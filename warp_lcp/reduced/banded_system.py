@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of
 from warp_lcp.operators.sparse import SparseOperator
 
@@ -33,7 +32,7 @@ class BandedSystem:
                 BandedMatrix(bands_of(self._A, self._A.bandwidth)),
             )
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set another free set and shift."""
         self._free = free.numpy() != 0
         self._shift = 0.0 if shift is None else np.where(self._free, shift.numpy(), 0.0)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import AROUND, StoredStencil
@@ -81,7 +82,7 @@ class FullApproximationCorrection:
             ).numpy()
         )
 
-    def _solved(self, *fields: np.ndarray) -> wp.array[Any]:
+    def _solved(self, *fields: np.ndarray) -> DeviceArray:
         """Return a rough solution of the coarse problem for this b, lower and upper."""
         work = self._work
         for field, values in zip(

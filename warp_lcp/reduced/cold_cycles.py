@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import warp as wp
-
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.multigrid.aggregates import MonotoneAggregation
 from warp_lcp.operators.sparse import SparseOperator
@@ -48,7 +47,7 @@ class GridCycles:
         return self._count
 
     def run(
-        self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool
+        self, x: DeviceArray, residual: NaturalResidual, free: DeviceArray, *, restrict: bool
     ) -> float:
         """Move x by a cycle on all unknowns; return the largest acceptable residual.
 
@@ -93,7 +92,7 @@ class AggregateColdStart:
         return (2 if self._problem.A.shape[0] < HUGE else 6) * self._count
 
     def run(
-        self, x: wp.array[Any], residual: NaturalResidual, free: wp.array[Any], *, restrict: bool
+        self, x: DeviceArray, residual: NaturalResidual, free: DeviceArray, *, restrict: bool
     ) -> float:
         """Move x by a cycle on all unknowns; return the largest acceptable residual."""
         p = self._problem

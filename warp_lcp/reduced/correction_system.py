@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.deadline import check_time
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
@@ -269,7 +270,7 @@ class CorrectionSystem:
         return Step(name, iterations, self.active, failure, interim=self._shrinks)
 
     def _set(
-        self, base: wp.array[Any], e: wp.array[Any], scale: float, kept: wp.array[Any] | None = None
+        self, base: DeviceArray, e: DeviceArray, scale: float, kept: DeviceArray | None = None
     ) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0.
 

@@ -6,13 +6,13 @@ Levenberg-Marquardt steps replace Newton's where these fail.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 import warp as wp
 
 from warp_lcp.deadline import check_time
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
@@ -40,7 +40,7 @@ class DenseSystem:
         """Copy the matrix to the host."""
         self._matrix = self._A.matrix.numpy().astype(np.float64)
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Store the free set and the shift."""
         self._free = np.flatnonzero(free.numpy())
         self._shift = None if shift is None else shift.numpy()[self._free].astype(np.float64)
@@ -125,7 +125,7 @@ class DampedSteps:
         self._least, self._waited = min(norm, self._least), 0 if falls else self._waited + 1
         return False
 
-    def take(self, x: wp.array[Any], residual: NaturalResidual) -> bool:
+    def take(self, x: DeviceArray, residual: NaturalResidual) -> bool:
         """Take the shortest of some steps that reduces the residual's norm.
 
         With r = d (x - clip(x - y / d, l, u)) and its Jacobian J, d on held rows and A elsewhere,

@@ -27,6 +27,7 @@ from warp_lcp.kernels.launch_graph import (
 )
 from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import CONVERT, add_across
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
@@ -320,7 +321,7 @@ class DeviceIteration:
         return True
 
     @property
-    def _calm(self) -> wp.array[Any] | None:
+    def _calm(self) -> DeviceArray | None:
         """On a GPU, whether bodies need no correction of the cycle.
 
         None if there are no bodies.
@@ -334,7 +335,7 @@ class DeviceIteration:
         return self._rebuilds or (correction is not None and correction.is_calm)
 
     def begin(
-        self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int
+        self, guess: DeviceArray, criteria: StoppingCriteria | MeanCriteria, left: int
     ) -> float | None:
         """Begin a solve from a guess, and take steps.
 
@@ -400,7 +401,7 @@ class DeviceIteration:
         self._beginning = None
         self.rows.clear()
 
-    def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
+    def _judge_first(self, counted: DeviceArray | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
         *arguments, noise = self._numbers
         memory = [
@@ -490,10 +491,10 @@ class Beginning:
     def __init__(
         self,
         work: MultigridWorkspace,
-        guess: wp.array[Any],
-        counted: wp.array[Any] | None,
+        guess: DeviceArray,
+        counted: DeviceArray | None,
         found: DeviceScalar,
-        judge: Callable[[wp.array[Any] | None, Launch], None],
+        judge: Callable[[DeviceArray | None, Launch], None],
     ) -> None:
         self._work, self._guess, self._counted, self._found, device = (
             work,
@@ -515,7 +516,7 @@ class Beginning:
             self._record(self._program.launch, Conditional(self._searches, search))
             judge(counted, self._program.launch)
 
-    def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
+    def fits(self, guess: DeviceArray, counted: DeviceArray | None) -> bool:
         """Return whether the launches are for this guess, count and bounds."""
         return (
             self._guess.ptr == guess.ptr
@@ -529,7 +530,7 @@ class Beginning:
         self._searches.numpy()[0] = self._finder.wanted()
         self._program.run()
 
-    def run_with(self, loop: CommandBuffer | None, going: wp.array[Any], *, renewed: bool) -> None:
+    def run_with(self, loop: CommandBuffer | None, going: DeviceArray, *, renewed: bool) -> None:
         """Launch everything on CUDA, and the steps that follow: one graph.
 
         Args:
@@ -543,7 +544,7 @@ class Beginning:
             changed.changed()
 
     def _launch(
-        self, loop: CommandBuffer | None, going: wp.array[Any], renewed: bool, searches: bool
+        self, loop: CommandBuffer | None, going: DeviceArray, renewed: bool, searches: bool
     ) -> None:
         """Launch or record everything, with the arguments of `run_with`.
 

@@ -5,12 +5,11 @@ A Krylov method with the operator's diagonal, or the problem's preconditioner.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
@@ -36,7 +35,7 @@ class DiagonalSystem(KrylovSystem):
             self._layout.zeros(wp.float64),
         )
         weight = self._inverse if shifted else None
-        self._shift: wp.array[Any] | None = None
+        self._shift: DeviceArray | None = None
         method = ConjugateGradient if self._A.symmetric and self._definite else GMRES
         self._iterate_by(method(self._product, self, weight=weight), weight)
         self.refresh()
@@ -45,7 +44,7 @@ class DiagonalSystem(KrylovSystem):
         """Read the diagonal of A again; entries may have changed."""
         self._own = self._layout.load(self._A.diagonal().numpy(), wp.float64)
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Store the free set and the shift, and shift the diagonal."""
         self._free, self._shift = free, shift
         rows, weight = rows_of(self.r), self._inverse
@@ -63,7 +62,7 @@ class DiagonalSystem(KrylovSystem):
         """Apply the preconditioner: z = r / d."""
         DIVIDE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def _product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
         MASK.bind(rows_of(q), free=self._free, shift=self._shift, direction=p, q=q).launch()

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP, as_operator
@@ -110,7 +111,7 @@ class EquilibratedWorkspace(WorkspaceBase):
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
         self._tried = False
 
-    def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
+    def step(self, advance: Callable[[LCP, Any, DeviceArray], Step]) -> Step:
         """Take a step of the method on the scaled problem.
 
         x = C x' is evaluated in the problem's own units. Where the residual does not fall for some
@@ -187,5 +188,5 @@ class EquilibratedWorkspace(WorkspaceBase):
         self._units.assign(C)
         return scaled(matrix, R, C)
 
-    def _multiply(self, field: wp.array[Any], out: wp.array[Any], *, inverse: bool = False) -> None:
+    def _multiply(self, field: DeviceArray, out: DeviceArray, *, inverse: bool = False) -> None:
         UNITS.bind(rows_of(field), x=field, units=self._units, inverse=inverse, scaled=out).launch()

@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.deadline import time_is_up
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
@@ -34,7 +35,7 @@ class MinimumMapResidual(ResidualAndActiveSet):
         away: whether held unknowns are not at their bounds yet.
     """
 
-    _away: wp.array[Any]
+    _away: DeviceArray
     _minimum_map = True
 
     def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
@@ -49,7 +50,7 @@ class MinimumMapResidual(ResidualAndActiveSet):
         found, across = bool(self._away.numpy().any()), self.problem.layout.across
         return found if across is None else across.any(found)
 
-    def hold(self, x: wp.array[Any]) -> None:
+    def hold(self, x: DeviceArray) -> None:
         """Move held unknowns onto their bounds, and update the right-hand side.
 
         Only in flagged rows and those beside them: g = -(A x + b) / size on the free set.

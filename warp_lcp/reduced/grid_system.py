@@ -8,11 +8,10 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import warp as wp
-
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
@@ -70,7 +69,7 @@ class GridSystem(GuardedSystem):
             if isinstance(self._krylov, FusedConjugateGradient):
                 self._krylov.clear()
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Mask and shift the finest diagonal and coarsen.
 
         Raises:
@@ -113,10 +112,10 @@ class GridSystem(GuardedSystem):
 def projected_cycle(
     problem: LCP,
     system: GridSystem,
-    x: wp.array[Any],
-    y: wp.array[Any],
+    x: DeviceArray,
+    y: DeviceArray,
     size: float,
-    free: wp.array[Any],
+    free: DeviceArray,
     sums: Reduction,
     *,
     restrict: bool = True,

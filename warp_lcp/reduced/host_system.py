@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.banded_matrix import NARROW, BandedMatrix, bands_of, bandwidth
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
@@ -130,15 +131,15 @@ class HostResidual(NaturalResidual):
         self.problem, self.matrix = problem, matrix
         self.norm, self.current, self.unit = 0.0, False, 1.0
         self._y = np.zeros(problem.layout.size)
-        self._field: wp.array[Any] | None = None
+        self._field: DeviceArray | None = None
 
     @cached_property
-    def diagonal(self) -> wp.array[Any]:
+    def diagonal(self) -> DeviceArray:
         """The scale as a device array, for kernels."""
         return wp.array(self.scale, dtype=self.problem.A.dtype, device=self.problem.device)
 
     @cached_property
-    def y(self) -> wp.array[Any]:
+    def y(self) -> DeviceArray:
         """The memory in which `evaluate` computes y, as a device array."""
         return wp.array(self._y, dtype=wp.float64, device=self.problem.device, copy=False)
 
@@ -151,14 +152,14 @@ class HostResidual(NaturalResidual):
         self.__dict__.pop("diagonal", None)
         self._taken = True
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+    def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u)."""
         self._take()
         values = self.values(x)
         np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
         self.current = False
 
-    def evaluate(self, x: wp.array[Any]) -> float:
+    def evaluate(self, x: DeviceArray) -> float:
         """Compute y and return the norm of the natural residual at x."""
         if not self._taken:  # a block among others is evaluated before it is solved
             self._take()
@@ -169,7 +170,7 @@ class HostResidual(NaturalResidual):
             self.norm, self.current = math.sqrt(r @ r), True
         return self.norm
 
-    def values(self, x: wp.array[Any]) -> np.ndarray:
+    def values(self, x: DeviceArray) -> np.ndarray:
         """Return x's memory; creating a view takes a tenth of a small solve."""
         if x is not self._field:
             self._field, self._values = x, x.numpy()

@@ -5,10 +5,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import warp as wp
-
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.multigrid.black_box_multigrid import BlackBoxMultigrid
@@ -49,7 +48,7 @@ class LineSystem(GuardedSystem):
         if self._version != self._A.version:
             self._version, self._substitute = self._A.version, None
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set another free set and shift, and coarsen."""
         self._note(free, shift)
         self.hierarchy.restrict(free, shift, self._weight)

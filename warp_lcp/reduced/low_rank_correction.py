@@ -18,6 +18,7 @@ from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
@@ -489,7 +490,7 @@ class WoodburyCorrection:
         self._hierarchy.cycle.run()
         copy(self._Z[slot * self._size : (slot + 1) * self._size], self._hierarchy.finest.x)
 
-    def _launch_products(self, products: wp.array[Any]) -> None:
+    def _launch_products(self, products: DeviceArray) -> None:
         """Launch U'Z, slot by slot; `force` is cleared."""
         clear(self._force)
         d, rank, n = self._hierarchy.finest.stencil.d, self._low.rank, self._size

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.system import KrylovSystem
@@ -47,7 +48,7 @@ class CoupledGridSystem(KrylovSystem):
         self.r, self.z = self._grid.r, self._grid.z
         self._correction, self._begins = WoodburyCorrection(low, self._grid.hierarchy), True
         self._extra = zeros_like(self.r)
-        self._free: wp.array[Any] | None = None
+        self._free: DeviceArray | None = None
         self._weight = zeros_like(self.r) if shifted else None
         across = A.layout.across
         # Without ghost cells, which other ranks sum.
@@ -66,7 +67,7 @@ class CoupledGridSystem(KrylovSystem):
         self._take_diagonal()
         self._begins = True
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set another free set and shift."""
         self._free = free
         self._grid.restrict(free, shift)
@@ -92,7 +93,7 @@ class CoupledGridSystem(KrylovSystem):
         self._grid.apply()
         self._correction.end()
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def _product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         self._grid.hierarchy.finest.stencil.product(p, q)
         self._low.add(p, q, q, mask=self._free)
 

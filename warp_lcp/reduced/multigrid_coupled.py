@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, LaunchGraph, launch_now
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import CONVERT, rows_of
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
@@ -57,7 +58,7 @@ class CoupledResidual(ResidualAndActiveSet):
         if self._low_version != self._low.version:
             self._low_version, self.free_set = self._low.version, self.free_set + 1
 
-    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
+    def project(self, x: DeviceArray, *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x, or of 0, onto the bounds; copy b.
 
         The copy is exact off U's rows.
@@ -65,7 +66,7 @@ class CoupledResidual(ResidualAndActiveSet):
         CONVERT.bind(rows_of(self._b), a=self.problem.b, b=self._b).launch(launch)
         super().project(x, keep=keep, launch=launch)
 
-    def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
+    def assess(self, x: DeviceArray, *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the evaluation with b + U W U' x, and correct the energy for it."""
         low = self._low
         low.add(x, self.problem.b, self._b, launch=launch)
@@ -79,12 +80,7 @@ class CoupledResidual(ResidualAndActiveSet):
         return super().read(classified=classified)
 
     def advance(
-        self,
-        x: wp.array[Any],
-        direction: wp.array[Any],
-        *,
-        classify: bool,
-        launch: Launch = launch_now,
+        self, x: DeviceArray, direction: DeviceArray, *, classify: bool, launch: Launch = launch_now
     ) -> None:
         """Launch the step and the evaluation at its end; U'x is needed between them."""
         self.update(x, direction, launch=launch)
@@ -129,7 +125,7 @@ class CoupledWorkspace(MultigridWorkspace):
         self._fresh = True
 
     def begin_ahead(
-        self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+        self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
         if guess is not None:
@@ -184,7 +180,7 @@ class CoupledWorkspace(MultigridWorkspace):
             if self.floating is not None:
                 self._project()
 
-    def _launch_evaluation(self, x: wp.array[Any], classify: bool) -> None:
+    def _launch_evaluation(self, x: DeviceArray, classify: bool) -> None:
         self.residual.assess(x, classify=classify, launch=launch_recorded)
 
     def _cycle(self) -> None:

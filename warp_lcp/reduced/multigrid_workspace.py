@@ -17,6 +17,7 @@ from warp_lcp.kernels.fields import nothing
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, as_one_table, launch_now
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.halo_levels import beside_cuts
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
@@ -103,7 +104,7 @@ class MultigridWorkspace(WorkspaceBase):
         )
         self.flat = Rows.of_fields(problem.layout)
         self._programs: dict[tuple[Any, ...], CommandBuffer] = {}  # truncated cycles
-        self._mask: wp.array[Any] | None = None
+        self._mask: DeviceArray | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
         # Steps since the best iterate; whether it has memory of its own.
         self._past, self._stored = 0, False
@@ -135,7 +136,7 @@ class MultigridWorkspace(WorkspaceBase):
             self._ahead.forget_guess()
 
     def begin_ahead(
-        self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+        self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve, and take steps, without the host.
 
@@ -167,7 +168,7 @@ class MultigridWorkspace(WorkspaceBase):
         """
         return self.floating is None and self._rounded is None
 
-    def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
+    def _scratch(self) -> tuple[DeviceArray, DeviceArray]:
         """Return memory that is free between cycles, with four bytes and one byte a cell."""
         x, t = self.hierarchy.finest.x, self.hierarchy.finest.t
         return t, wp.array(ptr=x.ptr, dtype=wp.uint8, shape=x.shape, device=x.device)
@@ -213,13 +214,13 @@ class MultigridWorkspace(WorkspaceBase):
             self.problem.layout.copy(self.best(), self.x)
         self._stored = True
 
-    def best(self) -> wp.array[Any]:
+    def best(self) -> DeviceArray:
         """Return the memory of the best iterate, allocated at the first call."""
         if self._best is None:
             self._best = self.problem.layout.zeros(wp.float64)
         return self._best
 
-    def _undo(self, out: wp.array[Any]) -> None:
+    def _undo(self, out: DeviceArray) -> None:
         """Write the start of the last step."""
         p, scalars = self.problem, self.residual.scalars
         kernels.UNDO.bind(

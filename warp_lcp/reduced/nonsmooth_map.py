@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -23,6 +23,7 @@ from warp_lcp.kernels import FusedKernel, KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.fields import PaddedLayout
 from warp_lcp.kernels.host_kernel import HostKernel
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, convert, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
@@ -101,10 +102,10 @@ class MapFields:
         unit: of d.
     """
 
-    x: wp.array[Any]
-    y: wp.array[Any]
-    d: wp.array[Any]
-    unknown: wp.array[Any]
+    x: DeviceArray
+    y: DeviceArray
+    d: DeviceArray
+    unknown: DeviceArray
     unit: float
 
 
@@ -138,9 +139,9 @@ class MapSystem:
         drop: whether elements at kinks are 0.
     """
 
-    D: wp.array[Any]
-    r: wp.array[Any]
-    free: wp.array[Any] | None
+    D: DeviceArray
+    r: DeviceArray
+    free: DeviceArray | None
     scale: float
     least: float
     drop: bool
@@ -155,8 +156,8 @@ class MapWeights:
         by_y: derivative by y (written).
     """
 
-    by_x: wp.array[Any]
-    by_y: wp.array[Any]
+    by_x: DeviceArray
+    by_y: DeviceArray
 
 
 class NonsmoothMap:
@@ -210,7 +211,7 @@ class NonsmoothMap:
         # Created at the first use, as are the current and the last gradient, the product and the
         # weights.
         self._by_rows: Sums | None = None
-        self._gradients: list[wp.array[Any]] = []
+        self._gradients: list[DeviceArray] = []
         self._drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
         self.begin()
 
@@ -220,11 +221,11 @@ class NonsmoothMap:
         scale = self.residual.norm_of_b() / np.sqrt(count) or 1.0
         self._numbers = MapNumbers(self._share, float(1 / scale), float(KINK * scale), 0)
 
-    def merit(self, x: wp.array[Any]) -> float:
+    def merit(self, x: DeviceArray) -> float:
         """Return f.f / 2 at x, where the residual was evaluated."""
         return self._half_sum(MERIT, x)
 
-    def values(self, x: wp.array[Any], out: wp.array[Any]) -> None:
+    def values(self, x: DeviceArray, out: DeviceArray) -> None:
         """Write f to a stored field."""
         VALUES.bind(
             self._sums.rows,
@@ -240,10 +241,10 @@ class NonsmoothMap:
 
     def condense(
         self,
-        x: wp.array[Any],
-        shift: wp.array[Any],
-        r: wp.array[Any],
-        free: wp.array[Any],
+        x: DeviceArray,
+        shift: DeviceArray,
+        r: DeviceArray,
+        free: DeviceArray,
         scale: float,
         turn: int,
     ) -> float:
@@ -262,12 +263,7 @@ class NonsmoothMap:
         return self._half_sum(CONDENSE, x, self._system(shift, r, free, scale, turn))
 
     def _system(
-        self,
-        D: wp.array[Any],
-        r: wp.array[Any],
-        free: wp.array[Any] | None,
-        scale: float,
-        turn: int,
+        self, D: DeviceArray, r: DeviceArray, free: DeviceArray | None, scale: float, turn: int
     ) -> MapSystem:
         seed = turn * self.problem.layout.size  # other random elements than in the last step
         self._numbers = replace(self._numbers, seed=seed)
@@ -275,8 +271,8 @@ class NonsmoothMap:
 
     def step(
         self,
-        x: wp.array[Any],
-        e: wp.array[Any],
+        x: DeviceArray,
+        e: DeviceArray,
         length: float,
         finest: StencilLevel,
         scale: float,
@@ -327,7 +323,7 @@ class NonsmoothMap:
         )
         return 0.5 * float(merit) / scale**2
 
-    def descend(self, x: wp.array[Any]) -> tuple[float, float]:
+    def descend(self, x: DeviceArray) -> tuple[float, float]:
         """Write the gradient J'f, scaled by d^-2, to `direction`.
 
         Returns:
@@ -354,11 +350,11 @@ class NonsmoothMap:
         return float(square), float(inner)
 
     @property
-    def direction(self) -> wp.array[Any]:
+    def direction(self) -> DeviceArray:
         """The gradient that `descend` wrote last."""
         return self._gradients[0]
 
-    def slope(self, x: wp.array[Any], e: wp.array[Any]) -> float:
+    def slope(self, x: DeviceArray, e: DeviceArray) -> float:
         """Return the derivative of the merit at x along e.
 
         f'J e = (p d f)'e + (q f)'A e: one product with A, none with A'.
@@ -374,7 +370,7 @@ class NonsmoothMap:
             self._sums.dot(weights, moved, slot)
         return float(self._sums.scalars.numpy()[:2].sum())
 
-    def is_stationary(self, x: wp.array[Any], share: float) -> bool:
+    def is_stationary(self, x: DeviceArray, share: float) -> bool:
         """Return whether x is a stationary point of the merit within the bounds.
 
         The norm of the projected gradient d (x - clip(x - d^-2 J'f)) must be at most `share` ||f||.
@@ -393,13 +389,7 @@ class NonsmoothMap:
         return float(np.linalg.norm(projected)) <= share * math.sqrt(2 * merit)
 
     def advance(
-        self,
-        base: wp.array[Any],
-        e: wp.array[Any],
-        scale: float,
-        x: wp.array[Any],
-        *,
-        projected: bool,
+        self, base: DeviceArray, e: DeviceArray, scale: float, x: DeviceArray, *, projected: bool
     ) -> None:
         """Set x = base + scale e, projected onto the bounds or not.
 
@@ -419,7 +409,7 @@ class NonsmoothMap:
         ).launch()
 
     def _half_sum(
-        self, declared: StencilKernel, x: wp.array[Any], *more: MapSystem | MapWeights
+        self, declared: StencilKernel, x: DeviceArray, *more: MapSystem | MapWeights
     ) -> float:
         """Run a kernel of the map at x; return half of its first sum."""
         sums = self._sums.of(
@@ -435,7 +425,7 @@ class NonsmoothMap:
         )
         return 0.5 * float(sums[0])
 
-    def _fields(self, x: wp.array[Any]) -> MapFields:
+    def _fields(self, x: DeviceArray) -> MapFields:
         return MapFields(x, self.residual.y, self._d, self.problem.unknown, self._unit)
 
 
@@ -474,7 +464,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         d = self._residual.diagonal.numpy().astype(np.float64) * self._residual.unit
         self._diagonal = wp.array(d, dtype=wp.float64, device=self._problem.device)
 
-    def linearize(self, x: wp.array[Any], free: wp.array[Any], size: float) -> None:
+    def linearize(self, x: DeviceArray, free: DeviceArray, size: float) -> None:
         """Set the point x, where the residual was evaluated.
 
         The right-hand side becomes -f / size on the free unknowns.
@@ -489,7 +479,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         """Apply the preconditioner: z = r / |d|."""
         SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def _product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         """Compute q = J p by a difference of the map, on the free unknowns."""
         norm = self.norm(p)
         if norm == 0:

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-import warp as wp
-
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.black_box_multigrid import needs_lines
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
@@ -43,13 +42,13 @@ class PrincipalSystem(Protocol):
         e: stored field; the solution, zero off the free set.
     """
 
-    r: wp.array[Any]
-    e: wp.array[Any]
+    r: DeviceArray
+    e: DeviceArray
 
     def refresh(self) -> None:
         """Read A's entries after they changed in place; `restrict` must follow."""
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set another free set and shift.
 
         Args:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from contextlib import nullcontext
-from typing import Any
 
 import numpy as np
-import warp as wp
 
 from warp_lcp.kernels import BoundKernel, Rows
 from warp_lcp.kernels.launch_graph import Launch, as_one_table, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.problem.lcp import LCP
@@ -43,7 +42,7 @@ class ResidualAndActiveSet(NaturalResidual):
             A.version,
         )
         self._rounded, self._b = rounded, problem.b
-        self._away: wp.array[Any] | None = None
+        self._away: DeviceArray | None = None
         self._reading = DeviceScalar(A.device, kernels.SLOTS)
         self.scalars = self._reading.array
         places = A.stencil.rows.places
@@ -64,7 +63,7 @@ class ResidualAndActiveSet(NaturalResidual):
         )
         self.size = 1.0  # divisor of the right-hand side
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+    def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u).
 
         A guess is classified, a cold start is not.
@@ -110,7 +109,7 @@ class ResidualAndActiveSet(NaturalResidual):
         """Return ||b|| over the unknowns."""
         return self._norm_of_b
 
-    def evaluate(self, x: wp.array[Any], classify: bool | None = None) -> float:
+    def evaluate(self, x: DeviceArray, classify: bool | None = None) -> float:
         """Compute the norm of the natural residual, free set and right-hand side at x.
 
         Args:
@@ -126,25 +125,20 @@ class ResidualAndActiveSet(NaturalResidual):
             self.assess(x, classify=classify)
         return self.read(classified=classify)
 
-    def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
+    def assess(self, x: DeviceArray, *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the evaluation at x; `read` returns its results."""
         self._A.stencil.wrap(x, launch=launch)
         kernels.ADVANCE.launch(None, self._assessing(x, classify), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def update(
-        self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now
+        self, x: DeviceArray, direction: DeviceArray, *, launch: Launch = launch_now
     ) -> None:
         """Launch the step from x along the new conjugate direction."""
         self._updating(self._A.stencil.rows, x, direction).launch(launch)
 
     def advance(
-        self,
-        x: wp.array[Any],
-        direction: wp.array[Any],
-        *,
-        classify: bool,
-        launch: Launch = launch_now,
+        self, x: DeviceArray, direction: DeviceArray, *, classify: bool, launch: Launch = launch_now
     ) -> None:
         """Launch the step and the evaluation at its end.
 
@@ -164,13 +158,13 @@ class ResidualAndActiveSet(NaturalResidual):
         )
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
-    def _updating(self, rows: Rows, x: wp.array[Any], direction: wp.array[Any]) -> BoundKernel:
+    def _updating(self, rows: Rows, x: DeviceArray, direction: DeviceArray) -> BoundKernel:
         bounds = self.problem.bounds.operands
         return kernels.UPDATE.bind(
             rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars
         )
 
-    def _assessing(self, x: wp.array[Any], classify: bool) -> BoundKernel:
+    def _assessing(self, x: DeviceArray, classify: bool) -> BoundKernel:
         """Return the kernel that evaluates the residual at x, with its arguments."""
         p, finest = self.problem, self._finest
         return kernels.ASSESS.bind(

@@ -17,6 +17,7 @@ import warp as wp
 
 from warp_lcp.kernels.fields import zeros, zeros_like
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, KrylovPreconditioner
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
@@ -48,11 +49,11 @@ ENOUGH = 60  # iterations within which it should reach that
 class Substitute(Protocol):
     """A system that takes over: the same matrix, with its own fields."""
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None) -> None:
         """Set another free set and shift."""
 
     def solve_for(
-        self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
+        self, r: DeviceArray, e: DeviceArray, tolerance: float, max_iterations: int
     ) -> tuple[int, float]:
         """Solve for e; return iterations and the norm reached."""
 
@@ -67,13 +68,13 @@ class GuardedSystem(KrylovSystem):
     _substitute: Substitute | None = None
     _make_substitute: Callable[[], Substitute] | None = None  # none: no substitute
     # The current free set and shift.
-    _restriction: tuple[wp.array[Any], wp.array[Any] | None] | None = None
+    _restriction: tuple[DeviceArray, DeviceArray | None] | None = None
 
     def _guard(self, substitute: Callable[[], Substitute]) -> None:
         """Set the function that creates the substitute when it is needed."""
         self._saved, self._make_substitute = zeros_like(self.r), substitute
 
-    def _note(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
+    def _note(self, free: DeviceArray, shift: DeviceArray | None) -> None:
         """Store the free set and the shift."""
         self._restriction = free, shift
         if self._substitute is not None:
@@ -102,12 +103,12 @@ class GuardedSystem(KrylovSystem):
 class SparsePreconditioner(KrylovPreconditioner, Protocol):
     """An approximate inverse of M = P A P + P D P, and M itself."""
 
-    weight: wp.array[Any]
+    weight: DeviceArray
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set a free set and a shift."""
 
-    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         """Compute q = M p on the device."""
 
 
@@ -179,7 +180,7 @@ class SparseSystem(GuardedSystem):
                     "A was updated from a symmetric to an unsymmetric matrix: make a new workspace"
                 )
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Set another free set and shift, and recompute the preconditioner."""
         if self._substitute is None:
             self.preconditioner.restrict(free, shift)
@@ -202,7 +203,7 @@ class IncompleteFactors:
         self._solve: Any = None
         self._free = np.zeros(0, dtype=np.intp)
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
         """Factor the free block, its diagonal nudged where a factor might be singular."""
         self._free = np.flatnonzero(free.numpy())
         matrix = self._A.matrix()
@@ -220,7 +221,7 @@ class IncompleteFactors:
             self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
         )
 
-    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         """Compute q = M p on the host."""
         q.assign(self._M @ p.numpy())
 
@@ -310,12 +311,12 @@ class FactoredSystem(KrylovSystem):
         kind = CompleteFactors if A.unknowns <= complete else IncompleteFactors
         return FactoredSystem(kind(A, wp.float64), weighted=weighted)
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None) -> None:
         """Set another free set and shift, and factor."""
         self._factors.restrict(free, shift)
 
     def solve_for(
-        self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
+        self, r: DeviceArray, e: DeviceArray, tolerance: float, max_iterations: int
     ) -> tuple[int, float]:
         """Solve for e, a field like r of any precision."""
         self.r.assign(r.numpy().astype(np.float64))
@@ -343,7 +344,7 @@ class MatrixSystem:
             self._operator, wp.float64, shifted=shifted, substitute=factored
         )
 
-    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
+    def restrict(self, free: DeviceArray, shift: DeviceArray | None) -> None:
         """Set another free set and shift, stored fields of the grid."""
         device = self._operator.device
         of_rows = (
@@ -356,7 +357,7 @@ class MatrixSystem:
         )
 
     def solve_for(
-        self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int
+        self, r: DeviceArray, e: DeviceArray, tolerance: float, max_iterations: int
     ) -> tuple[int, float]:
         """Solve for e; r and e are fields of the grid."""
         self._system.r.assign(r.numpy()[self._rows].astype(np.float64))

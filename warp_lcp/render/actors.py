@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -16,6 +16,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from warp_lcp.render.sunlight import LIGHT
 from warp_lcp.scene.camera import THREE_QUARTERS
 from warp_lcp.simulation import Surface
+
+if TYPE_CHECKING:
+    import pyvista
+    from matplotlib.colors import LinearSegmentedColormap
 
 BODY_COLORS = [
     "#e07a3f",
@@ -31,7 +35,7 @@ BODY_EDGE = "#4a3b33"
 LIGHTER = 0.5  # fraction of the way to white, for every other octant of a ball
 BOX_POINTS = 8
 ROUND = 1e-3  # largest relative difference of the distances from the center of a round body
-SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
+SURFACES: dict[str, MeshStyle] = {  # in 3-D, by `Scene.palette`
     "water": {
         "color": "#4aa9ee",
         "opacity": 0.5,
@@ -58,17 +62,41 @@ SHADING_CELLS = 4e6  # cells of the density that shades a liquid, to limit its m
 # Distance from a side of the domain up to which a point is on it, relative to the longest side.
 FLUSH = 1e-5
 
-Drawn = tuple[Any, dict[str, Any]]  # a pyvista mesh, and the options of its plotter
+Drawn: TypeAlias = "tuple[pyvista.DataSet, MeshStyle]"  # a mesh, and how it is drawn
+
+
+class MeshStyle(TypedDict, total=False):
+    """Arguments of pyvista's `Plotter.add_mesh` that the images use."""
+
+    color: str
+    scalars: str | np.ndarray
+    rgb: bool
+    cmap: LinearSegmentedColormap | list[str]
+    n_colors: int
+    clim: Sequence[float] | np.ndarray
+    opacity: float
+    lighting: bool
+    ambient: float
+    diffuse: float
+    specular: float
+    specular_power: float
+    smooth_shading: bool
+    split_sharp_edges: bool
+    culling: str
+    style: str
+    emissive: bool
+    render_points_as_spheres: bool
+    line_width: float
 
 
 class Actors:
     """Actors of a plotter, in groups that are replaced as a whole."""
 
-    def __init__(self, plotter: Any) -> None:
+    def __init__(self, plotter: pyvista.Plotter) -> None:
         self.plotter = plotter
         self._counts: dict[str, int] = defaultdict(int)
 
-    def exchange(self, group: str, meshes: Sequence[Drawn]) -> list[Any]:
+    def exchange(self, group: str, meshes: Sequence[Drawn]) -> list[pyvista.Actor]:
         """Replace the meshes of a group; return the actors of those with points."""
         for number in range(self._counts[group]):
             self.plotter.remove_actor(f"{group} {number}", render=False)
@@ -120,13 +148,13 @@ def surface_meshes(
     outline = mesh.clean()
     inside = outline.triangulate_contours()
     colors = LinearSegmentedColormap.from_list(palette, FILLS[palette])
-    depth = {
+    depth: MeshStyle = {
         "scalars": inside.points[:, 1],
         "cmap": colors,
         "clim": [0.0, size[1]],
         "lighting": False,
     }
-    line = {"color": OUTLINES[palette], "line_width": line_width, "lighting": False}
+    line: MeshStyle = {"color": OUTLINES[palette], "line_width": line_width, "lighting": False}
     return [
         (inside.translate((0.0, 0.0, behind)), depth),
         (outline.translate((0.0, 0.0, 0.95 * behind)), line),
@@ -164,7 +192,7 @@ def _solid_body(
     from matplotlib.colors import to_hex, to_rgb
 
     mesh = poly_data(points, corners)
-    looks: dict[str, Any] = {
+    looks: MeshStyle = {
         "smooth_shading": True,
         "ambient": 0.45,
         "specular": 0.25,
@@ -198,14 +226,14 @@ def _flat_body(
                 np.array([[0, 1]]),
             )
         )
-    line = {"color": BODY_EDGE, "line_width": line_width, "lighting": False}
+    line: MeshStyle = {"color": BODY_EDGE, "line_width": line_width, "lighting": False}
     return [
         (inside, {"color": color, "lighting": False}),
         (outline.translate((0.0, 0.0, 1.2 * front)), line),
     ]
 
 
-def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:
+def poly_data(points: np.ndarray, corners: np.ndarray) -> pyvista.PolyData:
     """Return triangles or segments as PolyData, with only the points in use."""
     import pyvista
 

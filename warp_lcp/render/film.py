@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -23,7 +23,7 @@ GIF_FASTEST = 50.0  # frames per second: viewers slow down faster animations
 QUALITY = "18"  # of x264, from 0 (lossless) to 51: flat colors and thin lines stay clean
 # A palette for each image of a GIF.
 OWN_COLORS = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"
-ENCODERS: dict[str, dict[str, Any]] = {  # H.264 in MP4; a GIF repeats forever
+ENCODERS: dict[str, dict[str, str | int | list[str]]] = {  # H.264 in MP4; a GIF repeats forever
     ".mp4": {
         "codec": "libx264",
         "pix_fmt_out": "yuv420p",
@@ -108,7 +108,7 @@ class Film:
         except OSError as failure:
             raise self._failure(failure) from failure
 
-    def _encoder(self, temporary: Path) -> Generator[None, Any, None]:
+    def _encoder(self, temporary: Path) -> Generator[None, np.ndarray | None, None]:
         """Return the encoder, which receives the images."""
         try:
             import imageio_ffmpeg

@@ -7,12 +7,20 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.render.actors import SHADES, Actors, Drawn, body_meshes, shaded, surface_meshes
+from warp_lcp.render.actors import (
+    SHADES,
+    Actors,
+    Drawn,
+    MeshStyle,
+    body_meshes,
+    shaded,
+    surface_meshes,
+)
 from warp_lcp.render.grains import grains
 from warp_lcp.render.recording import (
     WITH_PARTICLES,
@@ -22,9 +30,18 @@ from warp_lcp.render.recording import (
     Recording,
     Show,
 )
-from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescribed_solids
+from warp_lcp.render.solid_meshes import (
+    FlatSolids,
+    RoomSolids,
+    SolidDrawer,
+    apart,
+    prescribed_solids,
+)
 from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
 from warp_lcp.scene.camera import Viewpoint, viewpoint
+
+if TYPE_CHECKING:
+    import pyvista
 
 # Samples per pixel and direction: images are drawn larger and averaged down, since splats have no
 # other antialiasing.
@@ -65,7 +82,9 @@ class Picture:
         plotter: a pyvista plotter to draw into; it is shown on a screen, at its own size.
     """
 
-    def __init__(self, recording: Recording, size: tuple[int, int], plotter: Any = None) -> None:
+    def __init__(
+        self, recording: Recording, size: tuple[int, int], plotter: pyvista.Plotter | None = None
+    ) -> None:
         import pyvista
 
         scene = self.scene = recording.scene
@@ -199,7 +218,8 @@ class Picture:
         """Draw the domain and the solids at rest, and prepare the moving ones."""
         solids = prescribed_solids(self.scene)
         sides, width = self.scene.domain.size, 2 * self.samples
-        drawer: Any = (
+        # A drawer gets back what it has prepared.
+        drawer: SolidDrawer[Any] = (
             FlatSolids(sides, width, self.front) if self.flat else RoomSolids(sides, width)
         )
         self._solids = drawer
@@ -257,7 +277,7 @@ class Picture:
                 )
         if self.grainy:
             points, colors, radius = grains(points, colors, self.spacing, self.scene.domain.size)
-        looks = {
+        looks: MeshStyle = {
             "style": "points_gaussian",
             "emissive": False,
             "render_points_as_spheres": True,

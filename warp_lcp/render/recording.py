@@ -7,16 +7,20 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
 from warp_lcp.frames.frames import FRAME_FILE
 from warp_lcp.frames.meshio_format import WRITTEN_ONLY
 from warp_lcp.frames.read_frame import READABLE, read_part
+from warp_lcp.frames.vtu import Mesh
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.simulation import Cells, InputError, Points, Surface
+
+if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
 
 SCALE_FRAMES = 16  # evenly spaced frames that define the color scale of a run
 SCALE_VALUES = 50_000  # approximate number of values of each
@@ -83,6 +87,9 @@ class RecordedFrame:
     cells: Cells | None = None
 
 
+ContentT = TypeVar("ContentT", Mesh, Cells)
+
+
 @dataclass(frozen=True)
 class ColorScale:
     """Color scale from `low` to `high`, the same in every image of a run.
@@ -102,7 +109,7 @@ class ColorScale:
     palette: tuple[str, ...] = ()
 
     @cached_property
-    def mappable(self) -> Any:
+    def mappable(self) -> ScalarMappable:
         """The scale as a Matplotlib mappable."""
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import LinearSegmentedColormap, Normalize
@@ -116,7 +123,7 @@ class ColorScale:
 
     def colors(self, values: np.ndarray) -> np.ndarray:
         """Return a color for each value, 0 to 255, shape (n, 3)."""
-        return cast(np.ndarray, self.mappable.to_rgba(values, bytes=True)[:, :3])
+        return self.mappable.to_rgba(values, bytes=True)[:, :3]
 
 
 class Recording:
@@ -244,7 +251,7 @@ class Recording:
         Raises:
             RenderError: the file cannot be read.
         """
-        mesh = _read(self._file("particles", number))
+        mesh = _read(self._file("particles", number), Mesh)
         finite = np.isfinite(mesh.points).all(axis=1)
         return Points(
             "particles",
@@ -377,7 +384,7 @@ class Recording:
     def _surface(self, name: str, number: int) -> Surface:
         """Return the triangles or segments of a surface with finite points."""
         file = self._file(name, number)
-        mesh = _read(file)
+        mesh = _read(file, Mesh)
         corners = (
             mesh.corners
             if len(mesh.corners)
@@ -400,8 +407,8 @@ class Recording:
         """Return the cells of a frame with their fields."""
         file = self._file("grid", number)
         if file.suffix in (".vti", ".pvti"):
-            cells = _read(file)
-        elif not len((mesh := _read(file)).corners):
+            cells = _read(file, Cells)
+        elif not len((mesh := _read(file, Mesh)).corners):
             return None
         else:
             low = np.nan_to_num(
@@ -435,7 +442,7 @@ class Recording:
         files = [path.with_suffix(f".{suffix}") for suffix in self._readable]
         return next((file for file in files if file.is_file()), path.with_suffix(".vtu"))
 
-    def _field(self, fields: dict[str, Any], name: str, components: int = 1) -> np.ndarray:
+    def _field(self, fields: dict[str, np.ndarray], name: str, components: int = 1) -> np.ndarray:
         if name not in fields or fields[name].shape[1:] != (components,)[: components - 1]:
             raise RenderError(
                 f"{self.folder}: the frames have no {name}, which --color {self.color} needs; "
@@ -465,14 +472,21 @@ def spread(numbers: Sequence[int], count: int) -> list[int]:
     return [numbers[round(place)] for place in places]
 
 
-def _read(file: Path) -> Any:
-    """Return the Mesh or the Cells of a frame's file, or of the parts in its list.
+def _read(file: Path, kind: type[ContentT]) -> ContentT:
+    """Return the content of a frame's file, or of the parts in its list.
+
+    Args:
+        file: the file.
+        kind: Mesh or Cells.
 
     Raises:
-        RenderError: a file cannot be read.
+        RenderError: a file cannot be read, or has another kind of content.
     """
     try:
-        return read_part(file)
+        found = read_part(file)
+        if not isinstance(found, kind):
+            raise ValueError(f"it holds a {type(found).__name__}, expected {kind.__name__}")
+        return found
     except OSError as error:
         raise RenderError(f"{error.filename or file}: cannot be read: {error.strerror}") from error
     except ValueError as error:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -17,6 +17,9 @@ from warp_lcp.render.actors import BODY_COLORS, BODY_EDGE
 from warp_lcp.render.recording import Color, RecordedFrame, Recording, RenderError
 from warp_lcp.render.solid_meshes import EDGE, nearest_distance, prescribed_solids
 from warp_lcp.simulation import Surface
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 DOTS_AN_INCH = 100
 OUTLINE_POINTS = 400  # sample points of solids along the longest side
@@ -91,7 +94,7 @@ class Section:
     def close(self) -> None:
         """Do nothing: pictures do not share a figure."""
 
-    def _draw_cells(self, axes: Any, frame: RecordedFrame) -> None:
+    def _draw_cells(self, axes: Axes, frame: RecordedFrame) -> None:
         """Fill the cut cells, with the colors of their pressure if requested."""
         from matplotlib.colors import ListedColormap
 
@@ -123,7 +126,7 @@ class Section:
             **looks,
         )
 
-    def _draw_solids(self, axes: Any, time: float) -> None:
+    def _draw_solids(self, axes: Axes, time: float) -> None:
         """Fill the region of negative distance to the nearest solid."""
         if not self._solids:
             return
@@ -148,7 +151,7 @@ class Section:
         elif nearest.max() <= 0.0:
             axes.set_facecolor(SOLID)
 
-    def _draw_lines(self, axes: Any, surface: Surface, color: str) -> None:
+    def _draw_lines(self, axes: Axes, surface: Surface, color: str) -> None:
         """Draw the outline of a surface in the plane."""
         from matplotlib.collections import LineCollection
 
@@ -156,7 +159,7 @@ class Section:
             LineCollection(list(self._segments(surface)), colors=color, linewidths=1.5, zorder=4)
         )
 
-    def _fill_bodies(self, axes: Any, bodies: Surface) -> None:
+    def _fill_bodies(self, axes: Axes, bodies: Surface) -> None:
         """Fill the outlines of the bodies in the plane.
 
         Triangles from the origin to each segment wind around points inside.
@@ -178,7 +181,7 @@ class Section:
         ends = surface.points[surface.corners]
         return ends[..., :2] if self.at is None else cut(ends, self.at)
 
-    def _draw_particles(self, axes: Any, frame: RecordedFrame) -> None:
+    def _draw_particles(self, axes: Axes, frame: RecordedFrame) -> None:
         """Draw the particles within half a cell of the plane.
 
         In their color, or as dots over the cells' pressure.

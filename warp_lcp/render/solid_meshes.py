@@ -9,23 +9,49 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Geometry
-from warp_lcp.render.actors import Drawn
+from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.render.actors import Drawn, MeshStyle
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import BoxTable, CapsuleTable, MeshTable, PlaneTable, Shape, SphereTable
+from warp_lcp.scene.shapes import (
+    BoxTable,
+    CapsuleTable,
+    MeshTable,
+    PlaneTable,
+    Shape,
+    Solid,
+    SphereTable,
+)
 from warp_lcp.simulation import Surface
+
+if TYPE_CHECKING:
+    import pyvista
+
+PreparedT = TypeVar("PreparedT")
 
 OUTLINE_POINTS = 1500  # sample points of 2-D solids along the longest side: about a pixel
 TOUCHING = 0.75
 # Extent of the white frame, relative to the longest side; position of lines, relative to `front`.
 AROUND, LINE_FRONT = 20.0, 1.2
 FLAT_SOLID, SOLID, EDGE = "#bfc3c8", "#cdd1d5", "#6b7075"
+
+
+class SolidDrawer(Protocol[PreparedT]):
+    """Draws the domain, and solids that it has prepared."""
+
+    def domain(self) -> list[Drawn]:
+        """Return the domain."""
+
+    def prepared(self, solid: Shape) -> PreparedT:
+        """Return the form of a solid that `meshes` draws."""
+
+    def meshes(self, solids: Sequence[tuple[PreparedT, Pose]]) -> list[Drawn]:
+        """Return solids with their poses."""
 
 
 class FlatSolids:
@@ -91,7 +117,7 @@ class FlatSolids:
         line = self._plane.contour([0.0], scalars="distance").translate(
             (0.0, 0.0, LINE_FRONT * self.front)
         )
-        edge = {"color": EDGE, "line_width": 0.75 * self.line_width, "lighting": False}
+        edge: MeshStyle = {"color": EDGE, "line_width": 0.75 * self.line_width, "lighting": False}
         return [(inside, {"color": FLAT_SOLID, "lighting": False}), (line, edge)]
 
 
@@ -114,7 +140,7 @@ class RoomSolids:
 
         x, y, z = self.size
         edges = pyvista.Box((0.0, x, 0.0, y, 0.0, z)).extract_all_edges()
-        line = {"color": EDGE, "line_width": 0.6 * self.line_width, "lighting": False}
+        line: MeshStyle = {"color": EDGE, "line_width": 0.6 * self.line_width, "lighting": False}
         return [(edges, line)]
 
     def prepared(self, solid: Shape) -> Outline:
@@ -126,11 +152,15 @@ class RoomSolids:
         meshes: list[Drawn] = []
         for outline, pose in solids:
             mesh = outline.inside(self.size, pose)
-            looks = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}
+            looks: MeshStyle = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}
             if outline.shape.invert and not isinstance(outline.shape, PlaneTable):
                 # Containers end at the walls of the domain.
                 mesh = _clipped(mesh, self.size, closed=False)
-                line = {"color": EDGE, "line_width": 0.5 * self.line_width, "lighting": False}
+                line: MeshStyle = {
+                    "color": EDGE,
+                    "line_width": 0.5 * self.line_width,
+                    "lighting": False,
+                }
                 meshes += [
                     (mesh, {"ambient": 0.3, "opacity": 0.3, "culling": "front", **looks}),
                     (mesh.extract_feature_edges(30.0), line),
@@ -176,13 +206,13 @@ class Outline:
                     resolution=64,
                 )
             case MeshTable():
-                solid = cast(Any, shape.to_geometry(Path(), 3)).surface
+                solid = cast(TriangleMesh, shape.to_geometry(Path(), 3)).surface
                 mesh = pyvista.PolyData.from_regular_faces(solid.vertices, solid.triangles)
             case _:
                 raise TypeError(f"a {type(shape).__name__} cannot be drawn")
         self.mesh = mesh.triangulate().clean() if mesh.n_points else mesh
 
-    def inside(self, size: np.ndarray, pose: Pose) -> Any:
+    def inside(self, size: np.ndarray, pose: Pose) -> pyvista.DataSet:
         """Return the placed surface, cut at the domain's walls unless inverted.
 
         Args:
@@ -207,7 +237,7 @@ class Outline:
         return mesh if self.shape.invert else _clipped(mesh, size)
 
 
-def prescribed_solids(scene: Scene) -> list[Any]:
+def prescribed_solids(scene: Scene) -> list[Solid]:
     """Return the solids with prescribed motion, without rigid bodies.
 
     Positions of rigid bodies are only in frames.
@@ -252,7 +282,7 @@ def apart(surface: Surface, solids: Sequence[tuple[Geometry, Pose]], spacing: fl
     return replace(surface, corners=surface.corners[~touches])
 
 
-def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
+def _clipped(mesh: pyvista.PolyData, size: np.ndarray, *, closed: bool = True) -> pyvista.PolyData:
     """Cut a surface at the domain's walls; a closed one is closed again there."""
     for axis in range(3):
         for end, sign in ((0.0, 1.0), (size[axis], -1.0)):

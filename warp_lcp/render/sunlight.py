@@ -7,10 +7,15 @@ instead of pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
+
+if TYPE_CHECKING:
+    import pyvista
+
+    from warp_lcp.render.actors import Drawn
 
 # Direction from the domain to the lamp.
 LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])
@@ -56,7 +61,7 @@ class Sunlight:
             )
         return cast(np.ndarray, free / 9.0)
 
-    def floor(self, size: Sequence[float]) -> tuple[Any, dict[str, Any]]:
+    def floor(self, size: Sequence[float]) -> Drawn:
         """Return the floor of a domain [m] with the shadows on it, and its options."""
         import pyvista
 
@@ -74,7 +79,7 @@ class Sunlight:
         return np.floor((points @ ACROSS.T - self._low) / self._width).astype(int)
 
 
-def scattered(mesh: Any, width: float) -> np.ndarray:
+def scattered(mesh: pyvista.PolyData, width: float) -> np.ndarray:
     """Return points [m] scattered on the triangles of a pyvista mesh, shape (n, 3).
 
     One point per square of a given width [m].

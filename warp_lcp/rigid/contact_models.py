@@ -205,6 +205,7 @@ class FrozenBoxModel(BoxedModel):
         p = BoxedModel().problem(system)
         at = np.zeros(len(p.b))
         at[system.normals] = np.maximum(self.normal, 0.0)
+        assert isinstance(p.lower, AffineBounds) and isinstance(p.upper, AffineBounds)
         facts = p.facts - {"affine"} | {"solvable"}
         return Problem(
             f"{system.name}: frozen boxes", p.A, p.b, p.lower.at(at), p.upper.at(at), None, facts

@@ -10,11 +10,12 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.files.tables import TableView
 from warp_lcp.frames.meshio_format import to_meshio
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.particle_simulation import ParticleSimulation
@@ -31,6 +32,9 @@ from warp_lcp.scene.scene_file import SceneSource, load_scene, single_tables
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed
+
+if TYPE_CHECKING:
+    import meshio
 
 
 class RunError(InputError):
@@ -85,7 +89,7 @@ class Frame:
         faces = _of_particles(self.simulation).velocity
         return {f"velocity_{axis}": field for axis, field in zip("xyz", faces, strict=False)}
 
-    def to_meshio(self) -> dict[str, Any]:
+    def to_meshio(self) -> dict[str, meshio.Mesh]:
         """Return a `meshio.Mesh` for each part of the frame, by name.
 
         Points [m], cells, and the fields as point data or cell data. The parts are `particles`,
@@ -143,8 +147,8 @@ class Run:
         frames: int | None = None,
         force: bool = False,
         on_step: Callable[[Run], object] | None = None,
-        overrides: Mapping[str, Any] | None = None,
-        **keys: Any,
+        overrides: TableView | None = None,
+        **keys: object,
     ) -> None:
         """Load the scene; build and write nothing before the first frame."""
         given = resolve_scene(scene, _overrides(scene, overrides, keys))
@@ -164,8 +168,8 @@ class Run:
         device: str | None = None,
         frames: int | None = None,
         on_step: Callable[[Run], object] | None = None,
-        overrides: Mapping[str, Any] | None = None,
-        **keys: Any,
+        overrides: TableView | None = None,
+        **keys: object,
     ) -> Self:
         """Return the run of a folder, continued from its newest checkpoint.
 
@@ -344,7 +348,7 @@ class Run:
         arm = np.zeros(3) if at is None else self._vector("at", at) - pushed.position
         pushed.push(np.concatenate([given, np.cross(arm, given)]))
 
-    def add(self, **shape: Any) -> int:
+    def add(self, **shape: object) -> int:
         """Add material, at rest or with a `velocity`, outside material and solids.
 
         Returns the number of new particles.
@@ -427,9 +431,7 @@ def _folder(folder: str | PathLike[str] | None) -> Path | None:
         raise RunError(f"folder = {folder!r}: must be a path, or None for none") from error
 
 
-def _overrides(
-    scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Mapping[str, Any]
-) -> list[str]:
+def _overrides(scene: SceneSource, overrides: TableView | None, keys: TableView) -> list[str]:
     """Return overrides in the format of `load_scene`.
 
     The tables of those in `keys` are looked up.
@@ -450,7 +452,7 @@ def _overrides(
     return [f"{key}={_written(key, value)}" for key, value in values.items()]
 
 
-def _written(key: str, value: Any) -> str:
+def _written(key: str, value: object) -> str:
     """Return a value as TOML."""
     plain = (
         value.tolist()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.size_limits import one_line
@@ -182,10 +181,9 @@ def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
     """
     simulator = simulators()[scene.scene.simulator]
     try:
-        shared: dict[str, Any] = (
-            {"ranks": ranks} if ranks is not None and runs_on_ranks(simulator) else {}
-        )
-        return simulator.create(scene, device=device, folder=Path.cwd(), **shared)
+        if ranks is not None and runs_on_ranks(simulator):
+            return simulator.create(scene, device=device, folder=Path.cwd(), ranks=ranks)
+        return simulator.create(scene, device=device, folder=Path.cwd())
     except ValueError as error:
         check_shapes(scene, scene.scene.name)  # its error names the shape
         raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error

@@ -17,13 +17,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.archive import Archive, ArchiveError
 from warp_lcp.files.atomic import make_folder, replacing
+from warp_lcp.files.tables import Tables, TableView
 from warp_lcp.frames.pieces import in_ranks, rank_folder
 
 FORMAT = 2
@@ -57,7 +57,7 @@ class Checkpoint:
     step: int
     time: float
     state: Mapping[str, np.ndarray]
-    keys: Mapping[str, Any] = field(default_factory=dict)
+    keys: TableView = field(default_factory=dict)
 
     @cached_property
     def checksum(self) -> str:
@@ -116,7 +116,7 @@ class CheckpointFolder:
         self,
         folder: Path,
         fingerprint: str,
-        keys: Mapping[str, Any] | None = None,
+        keys: TableView | None = None,
         collective: Collective | None = None,
     ) -> None:
         self.folder, self.collective, self._in_pieces = (
@@ -191,7 +191,7 @@ class CheckpointFolder:
             "keys": self.keys,
             "checksum": checkpoint.checksum,
         }
-        arrays: dict[str, Any] = {META: np.array(json.dumps(meta))}
+        arrays: Tables = {META: np.array(json.dumps(meta))}
         arrays |= {STATE + name: array for name, array in checkpoint.state.items()}
         with replacing(self.path(checkpoint.step)) as file:
             np.savez(file, **arrays)
@@ -347,14 +347,14 @@ class CheckpointFolder:
         return None, refused
 
 
-def _meta(archive: Archive) -> dict[str, Any]:
+def _meta(archive: Archive) -> Tables:
     """Return the metadata of a checkpoint: of format 2, with valid types.
 
     Raises:
         ArchiveError: the metadata is missing or invalid.
     """
     try:
-        meta: Any = json.loads(str(archive.read([META])[META]))
+        meta: Tables = json.loads(str(archive.read([META])[META]))
         if meta["format"] != FORMAT:
             return {"format": meta["format"]}
         meta = {"keys": {}, **meta}

@@ -8,8 +8,8 @@ import re
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
 
+from warp_lcp.files.tables import TableView
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.shapes import BUILTIN
@@ -88,7 +88,7 @@ def fingerprint(scene: Scene, digests: Mapping[str, str] | None = None) -> str:
     return hashlib.blake2b(json.dumps(fixed, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
-def differences(before: Mapping[str, Any], after: Mapping[str, Any], *changes: Change) -> list[str]:
+def differences(before: TableView, after: TableView, *changes: Change) -> list[str]:
     """Return a line per changed key, such as `time.cfl: 2.0 before, 4.0 now`.
 
     Only keys whose effect is one of `changes`.

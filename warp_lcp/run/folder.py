@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Literal, get_type_hints
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -29,6 +29,7 @@ from warp_lcp.files.atomic import (
     write_text,
 )
 from warp_lcp.files.size_limits import one_line
+from warp_lcp.files.tables import Tables
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import (
@@ -269,8 +270,8 @@ class RunFolder:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
         """
         while True:
-            continuation = self._continuation()
-            if not self._shared:
+            continuation: Continuation | None = self._continuation()
+            if continuation is not None and not self._shared:
                 return continuation
             whole: Mapping[str, np.ndarray] = {}
             # The states are too large for a message.
@@ -283,7 +284,8 @@ class RunFolder:
                     continuation.checkpoint.state,
                     replace(continuation, checkpoint=replace(continuation.checkpoint, state={})),
                 )
-            continued: Continuation = self.collective.share(continuation)
+            continued = self.collective.share(continuation)
+            assert continued is not None, "of the root rank"
             checkpoint = continued.checkpoint
             if checkpoint is None or (checkpoint.state and self.checkpoints.complete(checkpoint)):
                 return continued
@@ -594,7 +596,7 @@ def mark_ended(folder: Path, status: Status, reason: str) -> None:
             )
 
 
-def read_record(folder: Path) -> dict[str, Any]:
+def read_record(folder: Path) -> Tables:
     """Return the content of run.json; empty if it cannot be read or is invalid."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
@@ -607,12 +609,12 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 @cache
-def _record_types() -> dict[str, TypeAdapter[Any]]:
+def _record_types() -> dict[str, TypeAdapter[object]]:
     """Return the validators of the values of a record."""
     return {key: TypeAdapter(hint) for key, hint in get_type_hints(RunRecord).items()}
 
 
-def recorded_keys(path: Path) -> dict[str, Any] | None:
+def recorded_keys(path: Path) -> Tables | None:
     """Return the keys of the scene of a run; None without a valid file."""
     try:
         return keys(load_scene(path))

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from warp_lcp.files.atomic import open_in_place
 from warp_lcp.files.size_limits import one_line
+from warp_lcp.files.tables import Tables
 
 try:
     import fcntl
@@ -109,7 +109,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 def _describe(text: bytes) -> str:
     """Return the process that wrote a lock file, in words."""
     try:
-        holder: Any = json.loads(text)
+        holder: Tables = json.loads(text)
         return one_line(
             f"process {int(holder['pid'])} on {holder['host']}, since {holder['since']}"
         )

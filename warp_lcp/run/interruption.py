@@ -10,7 +10,9 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Self
+
+Handler = Callable[[int, FrameType | None], object] | int | None  # of `signal.signal`
 
 # Batch systems also send the user signals.
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU")
@@ -56,7 +58,7 @@ class Interruption:
         self._say, self._early, self._last, self._signals = say, at_once, last, signals
         self._taken = threading.Event()
         self.name = ""
-        self._previous: dict[signal.Signals, Any] = {}
+        self._previous: dict[signal.Signals, Handler] = {}
 
     def __call__(self) -> str:
         """Return the name of the first signal."""

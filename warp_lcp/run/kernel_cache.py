@@ -8,9 +8,12 @@ import shutil
 import struct
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import warp as wp
+
+if TYPE_CHECKING:
+    from warp._src.context import ModuleExec
 
 ELF = b"\x7fELF"
 BINARIES = (".o", ".cubin", ".ptx")
@@ -31,8 +34,12 @@ def watch_loads() -> None:
 
     @functools.wraps(load)
     def checked(
-        module: wp.Module, device: Any, block_dim: int | None = None, *more: Any, **options: Any
-    ) -> Any:
+        module: wp.Module,
+        device: wp.DeviceLike,
+        block_dim: int | None = None,
+        *more: object,
+        **options: object,
+    ) -> ModuleExec | None:
         if module.execs:  # as in all launches after the first
             return load(module, device, block_dim, *more, **options)
         try:

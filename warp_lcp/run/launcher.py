@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from warp_lcp.files.tables import TableView
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.loop import RunRequest, run_scene
@@ -46,7 +47,7 @@ class Launcher:
         return self.collective.ranks if self.collective else None
 
     def load(
-        self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
+        self, scene: str | None, overrides: Sequence[str], options: TableView
     ) -> ResolvedScene:
         """Return the scene of a new or resumed run.
 
@@ -73,7 +74,7 @@ class Launcher:
             out or default_folder(load_scene(scene or "", overrides)), scene, overrides
         )
 
-    def agree(self, given: Mapping[str, Any]) -> None:
+    def agree(self, given: TableView) -> None:
         """Check that all ranks have the same values, by name.
 
         Raises:

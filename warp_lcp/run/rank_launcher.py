@@ -7,10 +7,9 @@ import hashlib
 import os
 import pickle
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import typer
 import warp as wp
@@ -19,6 +18,7 @@ from warp_lcp.distributed import launch
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.distributed.watchdog import Watchdog
+from warp_lcp.files.tables import TableView
 from warp_lcp.run.continuation import mesh_digests
 from warp_lcp.run.devices import DeviceError, EngineError, devices
 from warp_lcp.run.folder import OutputError, RunRecord, mark_ended
@@ -60,7 +60,7 @@ class RankLauncher(Launcher):
         self._folder: Path | None = None
 
     def load(
-        self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]
+        self, scene: str | None, overrides: Sequence[str], options: TableView
     ) -> ResolvedScene:
         """Return a scene that is the same on all ranks.
 
@@ -113,7 +113,7 @@ class RankLauncher(Launcher):
         self._folder = request.out
         return super().run(request, observer=observer, stop=stop, profile=profile)
 
-    def agree(self, given: Mapping[str, Any]) -> None:
+    def agree(self, given: TableView) -> None:
         """Check that all ranks have the same values, by name.
 
         Raises:
@@ -206,5 +206,5 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
         raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return "nothing" if value is None else written(value)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import IO, TYPE_CHECKING, Literal
 
 import typer
 from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
@@ -17,16 +18,40 @@ from typer.core import TyperGroup
 from warp_lcp.files.size_limits import one_line, visible
 from warp_lcp.run.kernel_cache import KernelCacheError
 
+if TYPE_CHECKING:
+    from typer._click.core import Context
+    from typer._click.exceptions import ClickException
+
 FREE_TEXT = "--set"  # its values may be arrays of several lines
 # click's ClickException, which new versions of typer include.
-Refusal: Any = typer.BadParameter.__mro__[2]
+Refusal: type[ClickException] = typer.BadParameter.__mro__[2]
 
 
 class Terminal(Console):
     """Console that prints colors and bars but no control characters of its text."""
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self,
+        *,
+        stderr: bool = False,
+        quiet: bool = False,
+        file: IO[str] | None = None,
+        width: int | None = None,
+        soft_wrap: bool = False,
+        highlight: bool = True,
+        force_terminal: bool | None = None,
+        color_system: Literal["auto", "standard", "256", "truecolor"] | None = "auto",
+    ) -> None:
+        super().__init__(
+            stderr=stderr,
+            quiet=quiet,
+            file=file,
+            width=width,
+            soft_wrap=soft_wrap,
+            highlight=highlight,
+            force_terminal=force_terminal,
+            color_system=color_system,
+        )
         self.push_render_hook(_Harmless())
 
     def on_broken_pipe(self) -> None:
@@ -37,7 +62,7 @@ class Terminal(Console):
 class Commands(TyperGroup):
     """Command group with the same error messages for wrong usage."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
         """Raise an error for control characters in arguments."""
         for before, argument in zip(["", *args], args, strict=False):
             if (
@@ -50,22 +75,34 @@ class Commands(TyperGroup):
                 )
         return super().parse_args(ctx, args)
 
-    def main(self, *arguments: Any, **options: Any) -> Any:
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: object,
+    ) -> object:
         """Run a command; escape characters that the output's encoding lacks."""
         for stream in (sys.stdout, sys.stderr):
-            if hasattr(stream, "reconfigure"):
+            if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")
-        return super().main(*arguments, **options)
+        return super().main(
+            args, prog_name, complete_var, standalone_mode, windows_expand_args, **extra
+        )
 
-    def make_context(self, *arguments: Any, **options: Any) -> Any:
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: Context | None = None, **extra: object
+    ) -> Context:
         """Create a command's context; escape arguments in its errors."""
         try:
-            return super().make_context(*arguments, **options)
+            return super().make_context(info_name, args, parent, **extra)
         except Refusal as error:
             error.message = visible(error.message)
             raise
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: Context) -> object:
         """Run a command; interruptions and cache errors end with exit code 1."""
         try:
             return super().invoke(ctx)

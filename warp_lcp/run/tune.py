@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from warp_lcp.files.atomic import write_text
 from warp_lcp.run.trial import Differences, Trial, spread_of, trial
-from warp_lcp.scene.presets import Preset, PresetName, PresetPrices, changed, price_table
+from warp_lcp.scene.presets import Preset, PresetName, PresetPrices, changed, price_table, table_of
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene
 from warp_lcp.scene.table import KeyFault, SceneError
@@ -43,7 +42,7 @@ class Candidate:
         seconds: the shortest of all timings.
     """
 
-    settings: dict[str, Any]
+    settings: dict[str, float]
     trial: Trial
     distance: float
     seconds: float
@@ -259,7 +258,7 @@ class _Search:
     say: Callable[[str], object]
     tried: list[Candidate] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    _known: dict[tuple[tuple[str, Any], ...], Candidate | None] = field(default_factory=dict)
+    _known: dict[tuple[tuple[str, float], ...], Candidate | None] = field(default_factory=dict)
 
     def run(self) -> Tuning:
         """Find the fastest settings within the bounds, or the fastest of the nearest."""
@@ -345,9 +344,9 @@ class _Search:
         return self.bounds.miss(candidate.trial, self.reference)
 
     def _has(self, key: str) -> bool:
-        return getattr(self.scene, key.partition(".")[0]) is not None
+        return table_of(self.scene, key) is not None
 
-    def _longest_step(self, settings: dict[str, Any]) -> int | None:
+    def _longest_step(self, settings: dict[str, float]) -> int | None:
         """Return the index of the longest step that meets the bounds, by bisection.
 
         None if none does. Steps shorter than one that meets the bounds meet them too.
@@ -363,8 +362,8 @@ class _Search:
         return low if low < len(steps) else None
 
     def _loosest(
-        self, settings: dict[str, Any], key: str, values: tuple[float, ...]
-    ) -> dict[str, Any]:
+        self, settings: dict[str, float], key: str, values: tuple[float, ...]
+    ) -> dict[str, float]:
         """Return the settings with the loosest value that meets the bounds.
 
         Values are tried from the loosest on; the settings are unchanged if none does.
@@ -376,14 +375,14 @@ class _Search:
                 return {**settings, key: value}
         return settings
 
-    def _meets(self, settings: dict[str, Any]) -> bool:
+    def _meets(self, settings: dict[str, float]) -> bool:
         key = tuple(sorted(settings.items()))
         if key not in self._known:
             self._known[key] = self._try(settings)
         found = self._known[key]
         return found is not None and self._miss(found) <= self.limit
 
-    def _try(self, settings: dict[str, Any]) -> Candidate | None:
+    def _try(self, settings: dict[str, float]) -> Candidate | None:
         """Run the first frames with some settings; return None if that fails."""
         words = " ".join(f"{key}={value:g}" for key, value in settings.items())
         try:

@@ -7,16 +7,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+from warp_lcp.files.tables import Tables, TableView
 
 if TYPE_CHECKING:
     from warp_lcp.scene.scene import Scene
+    from warp_lcp.scene.table import Table
 
 SceneT = TypeVar("SceneT", bound="Scene")
 PresetName = Literal["preview", "standard", "final"]
 PRESETS: tuple[PresetName, ...] = ("preview", "standard", "final")
 TABLE = "presets.toml"
-Settings = Mapping[str, Any]  # values by "section.key", such as time.cfl
+Settings = Mapping[str, float]  # values by "section.key", such as time.cfl
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ def price_table() -> Mapping[str, PresetPrices]:
     return entries
 
 
-def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
+def fill_in(model: type[Scene], data: TableView) -> TableView:
     """Return a scene's raw data with the defaults of its preset.
 
     Keys in the data are kept; invalid data are left to the validation.
@@ -91,7 +94,7 @@ def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
     return filled
 
 
-def preset_values(scene: Scene, table: str) -> dict[str, Any]:
+def preset_values(scene: Scene, table: str) -> Tables:
     """Return the values of a scene's preset for a table; empty without a preset."""
     prices, name = price_table().get(scene.scene.simulator), scene.solver.preset
     return (
@@ -127,14 +130,19 @@ def preset_line(scene: Scene) -> str | None:
     )
 
 
-def value_of(scene: Scene, key: str) -> Any:
+def table_of(scene: Scene, key: str) -> Table | None:
+    """Return the table of `section.key`; None if the section is off."""
+    table: Table | None = getattr(scene, key.partition(".")[0])
+    return table
+
+
+def value_of(scene: Scene, key: str) -> float | str | None:
     """Return the value at `section.key` of a scene; None if the section is off."""
-    table, _, name = key.partition(".")
-    found = getattr(scene, table)
-    return None if found is None else getattr(found, name)
+    value: float | str | None = getattr(table_of(scene, key), key.partition(".")[2], None)
+    return value
 
 
-def changed(scene: SceneT, settings: Settings) -> SceneT:
+def changed(scene: SceneT, settings: Mapping[str, float | str]) -> SceneT:
     """Return a scene with other values at `section.key`.
 
     Those of models that are off are omitted.
@@ -145,21 +153,21 @@ def changed(scene: SceneT, settings: Settings) -> SceneT:
     data = scene.model_dump(by_alias=True, exclude_none=True)
     for key, value in settings.items():
         table, _, name = key.partition(".")
-        if getattr(scene, table) is not None:
+        if table_of(scene, key) is not None:
             data[table][name] = value
     return type(scene).model_validate(data)
 
 
-def _nested(settings: Settings) -> dict[str, dict[str, Any]]:
+def _nested(settings: Settings) -> dict[str, Tables]:
     """Return settings as tables of a scene."""
-    tables: dict[str, dict[str, Any]] = {}
+    tables: dict[str, Tables] = {}
     for key, value in settings.items():
         table, _, name = key.partition(".")
         tables.setdefault(table, {})[name] = value
     return tables
 
 
-def _flat(part: Mapping[str, Any]) -> Settings:
+def _flat(part: TableView) -> Settings:
     """Return tables of a scene as settings."""
     return {
         f"{table}.{key}": value

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 import tomllib
 import warnings
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
+from warp_lcp.files.tables import Tables
 from warp_lcp.scene.table import KeyFault, SceneError, Table
 
 
@@ -16,7 +17,7 @@ class RenamedKeyWarning(FutureWarning):
     """A scene uses a key by its old name."""
 
 
-def rename_keys(tables: MutableMapping[str, Any], model: type[Table], source: str) -> None:
+def rename_keys(tables: Tables, model: type[Table], source: str) -> None:
     """Rename old keys in the tables of a scene, in place, and warn about each.
 
     Args:
@@ -68,7 +69,7 @@ def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]
 
 
 def _rename(
-    tables: Any, model: type[Table], source: str, place: str = ""
+    tables: Tables, model: type[Table], source: str, place: str = ""
 ) -> Iterator[tuple[str, str, str]]:
     """Rename keys of a table and the tables in it.
 
@@ -104,7 +105,7 @@ def _rename(
                     yield from _rename(row, inner, source, where)
 
 
-def _table_classes(annotation: Any) -> Iterator[type[Table]]:
+def _table_classes(annotation: object) -> Iterator[type[Table]]:
     """Yield the classes of tables in an annotation.
 
     Such as those of a list or a union.

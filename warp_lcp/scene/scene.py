@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from unicodedata import normalize
 
 import numpy as np
@@ -57,7 +57,7 @@ __all__ = [
 GridMethod = Literal[grid_methods()]
 
 
-def _tolerance(value: Any) -> Any:
+def _tolerance(value: object) -> object:
     """Return a number in (0, 1) or "auto", with an error as for any other number.
 
     The error does not mention the type of the alternative.
@@ -168,7 +168,7 @@ class Domain(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _without_ends(cls, data: Any) -> Any:
+    def _without_ends(cls, data: object) -> object:
         """Set the sides of a domain with `spacing` to an unreachable distance."""
         if (
             not isinstance(data, dict)
@@ -304,13 +304,11 @@ class Scene(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _gravity_is_down(cls, data: Any) -> Any:
+    def _gravity_is_down(cls, data: object) -> object:
         """Set gravity, whose default depends on the number of dimensions."""
-        domain, physics = (
-            (data.get("domain"), data.get("physics", {}))
-            if isinstance(data, dict)
-            else (None, None)
-        )
+        if not isinstance(data, dict):
+            return data
+        domain, physics = data.get("domain"), data.get("physics", {})
         size = domain.get("size") if isinstance(domain, dict) else None
         boundless = (
             isinstance(domain, dict)
@@ -329,7 +327,7 @@ class Scene(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _preset_fills_in(cls, data: Any) -> Any:
+    def _preset_fills_in(cls, data: object) -> object:
         """Apply the defaults of `solver.preset`."""
         return fill_in(cls, data) if isinstance(data, dict) else data
 

@@ -9,12 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import get_args, get_origin
 
 import numpy as np
 import tomli_w
 
 from warp_lcp.files.atomic import write_text
+from warp_lcp.files.tables import Tables, TableView
 from warp_lcp.scene.renamed_keys import fix_text, rename_keys
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN
@@ -29,7 +30,7 @@ GIVEN = "the scene given"  # name in messages for tables given in Python
 LARGEST = 1e18  # largest magnitude: its square fits into float32, sums of cubes into float64
 
 # A file, the name of a built-in scene, the tables of a file, or a scene.
-SceneSource = str | Path | Mapping[str, Any] | Scene
+SceneSource = str | Path | TableView | Scene
 
 HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
 
@@ -89,7 +90,7 @@ def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
     return scene
 
 
-def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
+def _raw(source: SceneSource) -> tuple[Tables, str, Path, str]:
     """Return a scene's tables, name in messages, folder and default name.
 
     Paths in the tables are relative to the folder.
@@ -97,7 +98,8 @@ def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
     if isinstance(source, Scene):
         source = source.model_dump(by_alias=True, exclude_none=True)
     if isinstance(source, Mapping):
-        return _plain(source), GIVEN, Path.cwd(), "scene"
+        tables = {str(key): _plain(entry) for key, entry in source.items()}
+        return tables, GIVEN, Path.cwd(), "scene"
     if not isinstance(source, (str, Path)):
         message = (
             "must be a scene file, the name of a built-in scene, a dict of its tables or a Scene"
@@ -109,8 +111,8 @@ def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
     return _parse(file, label), label, folder, file_name(file.name.removesuffix(".toml"))
 
 
-def _plain(value: Any) -> Any:
-    """Return a deep copy of tables and arrays, in the types of a TOML file."""
+def _plain(value: object) -> object:
+    """Return a deep copy of a value, tables or arrays, in the types of a TOML file."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -138,7 +140,7 @@ def scene_value(source: SceneSource, override: str) -> str:
     Raises:
         SceneError: the file cannot be read.
     """
-    value: Any = _raw(source)[0]
+    value: object = _raw(source)[0]
     for key in override_key(override).split("."):
         if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
             value = value[int(key)]
@@ -207,17 +209,17 @@ def dump_scene(scene: Scene) -> str:
     return HEADER + tomli_w.dumps(scene.model_dump(by_alias=True, exclude_none=True))
 
 
-def keys(scene: Scene) -> dict[str, Any]:
+def keys(scene: Scene) -> Tables:
     """Return all keys of a scene with values, such as `time.cfl` or `liquid[0].max`."""
     return table_keys(scene.model_dump(by_alias=True, exclude_none=True))
 
 
-def table_keys(table: Mapping[str, Any]) -> dict[str, Any]:
+def table_keys(table: TableView) -> Tables:
     """Return all keys of nested tables with values, as `keys` does."""
     return dict(_leaves(dict(table)))
 
 
-def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
     """Yield the values in tables and arrays of tables; lists of numbers are values."""
     if isinstance(value, dict):
         for key, entry in value.items():
@@ -277,7 +279,7 @@ def _near_file(path: Path, others: Iterable[str]) -> str:
     )
 
 
-def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
+def _parse(file: Path | Traversable, source: str) -> Tables:
     """Return the tables of a TOML file."""
     try:
         return tomllib.loads(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
@@ -297,13 +299,13 @@ def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
         ) from error
 
 
-def _refuse_extremes(data: dict[str, Any], source: str) -> None:
+def _refuse_extremes(data: Tables, source: str) -> None:
     """Raise an error for extreme numbers, lengths and nesting.
 
     nan and inf are left to the validation, which knows the keys.
     """
     problems = []
-    waiting: list[tuple[str, Any, int]] = [(key, value, 1) for key, value in data.items()]
+    waiting: list[tuple[str, object, int]] = [(key, value, 1) for key, value in data.items()]
     while waiting:  # not recursive: dotted keys nest without limit
         path, value, depth = waiting.pop()
         if depth > DEEPEST:
@@ -326,7 +328,7 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
         raise SceneError(source, problems)
 
 
-def _override(data: dict[str, Any], override: str, source: str) -> None:
+def _override(data: Tables, override: str, source: str) -> None:
     """Set one key of the raw data.
 
     The validation checks whether the key exists and the value is allowed.
@@ -343,22 +345,32 @@ def _override(data: dict[str, Any], override: str, source: str) -> None:
             ],
         )
     value = _value(text.strip())
-    table: Any = data
+    table: object = data
     for depth in range(len(keys) - 1):
-        place = _place(table, keys, depth, source)
-        table = table[place] if isinstance(place, int) else table.setdefault(place, {})
-    table[_place(table, keys, len(keys) - 1, source)] = value
+        if isinstance(table, list):
+            table = table[_index(table, keys, depth, source)]
+        else:
+            table = _table(table, keys, depth, source).setdefault(keys[depth], {})
+    last = len(keys) - 1
+    if isinstance(table, list):
+        table[_index(table, keys, last, source)] = value
+    else:
+        _table(table, keys, last, source)[keys[last]] = value
 
 
-def _place(table: object, keys: list[str], depth: int, source: str) -> str | int:
-    """Return keys[depth] as a key of `table`, or as an index into an array."""
-    key, parent, path = keys[depth], ".".join(keys[:depth]), ".".join(keys[: depth + 1])
-    if isinstance(table, dict):
-        return key
-    if not isinstance(table, list):
+def _table(value: object, keys: list[str], depth: int, source: str) -> Tables:
+    """Return the value before keys[depth] as a table, which has that key or gets it."""
+    if not isinstance(value, dict):
+        parent, path = ".".join(keys[:depth]), ".".join(keys[: depth + 1])
         raise SceneError(
-            source, [KeyFault(f"--set {path}", f"{parent} has no keys: it is {written(table)}")]
+            source, [KeyFault(f"--set {path}", f"{parent} has no keys: it is {written(value)}")]
         )
+    return value
+
+
+def _index(table: list[object], keys: list[str], depth: int, source: str) -> int:
+    """Return keys[depth] as an index into an array of tables."""
+    key, parent, path = keys[depth], ".".join(keys[:depth]), ".".join(keys[: depth + 1])
     if not key.isdecimal() or int(key) >= len(table):
         allowed = f"there are entries 0 to {len(table) - 1}" if table else "the array is empty"
         raise SceneError(
@@ -367,14 +379,14 @@ def _place(table: object, keys: list[str], depth: int, source: str) -> str | int
     return int(key)
 
 
-def _value(text: str) -> Any:
+def _value(text: str) -> object:
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):  # not TOML, too many digits, nested too deeply
         return text
 
 
-def _resolve_paths(data: dict[str, Any], folder: Path) -> None:
+def _resolve_paths(data: Tables, folder: Path) -> None:
     """Make the paths of files that shapes name absolute."""
     for entries in data.values():
         for entry in entries if isinstance(entries, list) else ():
@@ -383,7 +395,7 @@ def _resolve_paths(data: dict[str, Any], folder: Path) -> None:
                 entry["file"] = str(folder / file)
 
 
-def _scene_model(data: dict[str, Any], source: str) -> type[Scene]:
+def _scene_model(data: Tables, source: str) -> type[Scene]:
     """Return the scene class of the simulator that the scene names.
 
     Without a simulator, no other key can be validated.
@@ -419,7 +431,10 @@ def _find_meshes(scene: Scene, source: str) -> None:
     problems = [
         KeyFault(path, "there is no such file", written(file))
         for path, file in _leaves(scene.model_dump())
-        if path.endswith("].file") and not file.startswith(BUILTIN) and not os.path.isfile(file)
+        if path.endswith("].file")
+        and isinstance(file, str)
+        and not file.startswith(BUILTIN)
+        and not os.path.isfile(file)
     ]
     if problems:
         raise SceneError(source, problems)

@@ -31,7 +31,7 @@ BUILTIN = "builtin:"  # prefix of the names of meshes that the project generates
 Wall = Literal["separating", "free-slip", "sticky"]
 
 
-def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float | str:
+def _wall_friction(value: object, handler: ValidatorFunctionWrapHandler) -> float | str:
     """Return a number from 0 to 10 or "stick", with one error for both alternatives."""
     try:
         friction: float | str = handler(value)

@@ -6,12 +6,15 @@ import functools
 import inspect
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeGuard, TypeVar, runtime_checkable
 
-from warp_lcp.simulation import Simulation
+from warp_lcp.simulation import Joined, Simulation
 
 if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
     from warp_lcp.scene.scene import Scene
+
+PlugIn = TypeVar("PlugIn")
 
 
 @runtime_checkable
@@ -20,7 +23,10 @@ class Simulator(Protocol):
 
     name: str
     summary: str
-    scene_model: type[Any]  # a subclass of warp_lcp.scene.scene.Scene
+
+    @property
+    def scene_model(self) -> type[Scene]:
+        """The class of its scenes, a subclass of `Scene`."""
 
     def create(self, scene: Scene, *, device: str, folder: Path) -> Simulation:
         """Build the simulation of a scene.
@@ -33,7 +39,14 @@ class Simulator(Protocol):
         """
 
 
-def runs_on_ranks(simulator: Simulator) -> bool:
+class RankedSimulator(Protocol):
+    """Simulator plug-in whose simulations run on several MPI ranks."""
+
+    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks) -> Joined:
+        """Build this rank's part of the simulation of a scene; collective."""
+
+
+def runs_on_ranks(simulator: Simulator) -> TypeGuard[RankedSimulator]:
     """Return whether a plug-in's simulations run on several MPI ranks.
 
     Its `create` then has an argument `ranks`, is collective with the same scene on all ranks, and
@@ -53,13 +66,13 @@ def simulators() -> dict[str, Simulator]:
     return plug_ins("warp_lcp.simulators", Simulator, "a simulator")
 
 
-def plug_ins(group: str, kind: type[Any], what: str) -> dict[str, Any]:
+def plug_ins(group: str, kind: type[PlugIn], what: str) -> dict[str, PlugIn]:
     """Return the objects loaded by the entry points of a group, by name.
 
     Raises:
         TypeError: an object is not of this kind, which `what` names.
     """
-    loaded = {}
+    loaded: dict[str, PlugIn] = {}
     for entry in entry_points(group=group):
         loaded[entry.name] = entry.load()
         if not isinstance(loaded[entry.name], kind):

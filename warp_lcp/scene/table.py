@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, TypeVar, get_args
+from typing import Annotated, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from warp_lcp.files.size_limits import one_line
+from warp_lcp.files.tables import TableView
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError
 
@@ -136,7 +137,7 @@ def refuse(title: str, complaints: Iterable[Complaint]) -> None:
         raise ValidationError.from_exception_data(title, errors)
 
 
-def validate(model: type[ModelT], data: Mapping[str, Any], source: str) -> ModelT:
+def validate(model: type[ModelT], data: TableView, source: str) -> ModelT:
     """Return `data` as a `model`.
 
     Args:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
@@ -64,7 +65,7 @@ class AcceleratedProjectedGradient(Settings):
         positive_diagonal(problem)
         return AcceleratedWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: AcceleratedWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: AcceleratedWorkspace, x: DeviceArray) -> Step:
         """Take one step with momentum."""
         work.advance(x)
         return Step("gradient")
@@ -84,13 +85,13 @@ class MomentumFields:
         unknown: 1 where there is one.
     """
 
-    x: wp.array[Any]
-    x_old: wp.array[Any]
-    y: wp.array[Any]
-    z: wp.array[Any]
-    y_z: wp.array[Any]
-    d: wp.array[Any]
-    unknown: wp.array[Any]
+    x: DeviceArray
+    x_old: DeviceArray
+    y: DeviceArray
+    z: DeviceArray
+    y_z: DeviceArray
+    d: DeviceArray
+    unknown: DeviceArray
 
 
 class AcceleratedWorkspace(WorkspaceBase):
@@ -121,7 +122,7 @@ class AcceleratedWorkspace(WorkspaceBase):
                 self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0
             self._version = version  # last: the time limit may end the estimate before
 
-    def advance(self, x: wp.array[Any]) -> None:
+    def advance(self, x: DeviceArray) -> None:
         """Take one step; `residual.y` is A x + b at x.
 
         With beta of the last step: z = x + beta (x - x_old), y_z = y + beta (y - y_old), and then x
@@ -141,7 +142,7 @@ class AcceleratedWorkspace(WorkspaceBase):
         ).launch()
         self.round_iterate()
 
-    def _beta(self, x: wp.array[Any]) -> float:
+    def _beta(self, x: DeviceArray) -> float:
         """Return Nesterov's beta for the next step; correct L by the last one.
 
         With s = x - z of the last step, its curvature is s'A s = s'(y - y_z), to be compared with L
@@ -164,7 +165,7 @@ class AcceleratedWorkspace(WorkspaceBase):
         self._momentum = (1 + math.sqrt(1 + 4 * t * t)) / 2
         return (t - 1) / self._momentum
 
-    def _momenta(self, x: wp.array[Any]) -> MomentumFields:
+    def _momenta(self, x: DeviceArray) -> MomentumFields:
         """Return the fields that both kernels read."""
         return MomentumFields(
             x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown

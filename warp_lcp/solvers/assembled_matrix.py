@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -52,7 +53,7 @@ class AssembledMatrix(Settings):
         check_taken(self, problem.A)
         return AssembledWorkspace(problem, self.inner)
 
-    def step(self, problem: LCP, work: AssembledWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: AssembledWorkspace, x: DeviceArray) -> Step:
         """Take a step of the inner method."""
         return work.step(x)
 
@@ -82,7 +83,7 @@ class AssembledWorkspace(WorkspaceBase):
         work.keep()
         work.start(warm=False, tolerance=tolerance)
 
-    def step(self, x: wp.array[Any]) -> Step:
+    def step(self, x: DeviceArray) -> Step:
         """Take a step, and write the iterate to x."""
         work = self._work
         work.residual.current = False

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.layout import put
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -143,7 +144,7 @@ class BlockedGaussSeidel(Settings):
         self,
         problem: LCP,
         work: BlockWorkspace | LineWorkspace | StaggeringWorkspace,
-        x: wp.array[Any],
+        x: DeviceArray,
     ) -> Step:
         """Solve each block once, or forward and backward if symmetric."""
         linear = 0
@@ -210,7 +211,7 @@ class BlockWorkspace(SweepWorkspace):
         ]
         self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+    def run(self, x: DeviceArray, *, forward: bool) -> None:
         """Solve each block once: by one thread, or color by color in parallel."""
         colors = range(len(self._starts) - 1)
         for c in colors if forward else reversed(colors):
@@ -240,10 +241,10 @@ class LineMemory:
         omega: relaxation factor.
     """
 
-    c: wp.array[Any]
-    q: wp.array[Any]
-    z: wp.array[Any]
-    s: wp.array[Any]
+    c: DeviceArray
+    q: DeviceArray
+    z: DeviceArray
+    s: DeviceArray
     s1: int
     s2: int
     cells: int
@@ -299,7 +300,7 @@ class LineWorkspace(SweepWorkspace):
             settings.omega,
         )
 
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+    def run(self, x: DeviceArray, *, forward: bool) -> None:
         """Solve the lines of one color, then those of the other."""
         p = self.problem
         stencil = p.A.stencil  # type: ignore[attr-defined]

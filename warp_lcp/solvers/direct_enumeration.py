@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import Array, checked_device, real_array
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.pickling import FieldsOnHost
 from warp_lcp.problem.result import SolveStatus
@@ -52,7 +53,7 @@ class DirectEnumeration:
         check_size(problem, "DirectEnumeration", self.most_unknowns)
         return DenseWorkspace(problem)
 
-    def step(self, problem: LCP, work: DenseWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: DenseWorkspace, x: DeviceArray) -> Step:
         """Try all active sets and keep the best x."""
         candidates, measures = _candidates(work.data)
         best = int(measures.argmin())
@@ -111,8 +112,8 @@ class BatchResult(FieldsOnHost):
             problem has no solution.
     """
 
-    x: wp.array[Any]
-    sets: wp.array[Any]
+    x: DeviceArray
+    sets: DeviceArray
 
 
 def enumerate_batch(
@@ -233,7 +234,7 @@ def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
 
 def _on_device(
     field: Array, shape: tuple[int, ...], dtype: Any, device: wp.Device, name: str
-) -> wp.array[Any]:
+) -> DeviceArray:
     """Return a field as a device array; NaN and infinities in host arrays are refused."""
     if tuple(field.shape) != shape:
         raise ValueError(f"{name} has shape {tuple(field.shape)}: expected {shape}")
@@ -247,7 +248,7 @@ def _on_device(
     return wp.array(host, dtype=dtype, device=device)
 
 
-def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str) -> wp.array[Any]:
+def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str) -> DeviceArray:
     """Return a bound as an array with one row for all problems, or a row for each."""
     if isinstance(value, wp.array):
         if (

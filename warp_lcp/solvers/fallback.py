@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import takes
@@ -249,7 +250,7 @@ class Fallback:
             else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
         )
 
-    def step(self, problem: Any, work: FallbackWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: Any, work: FallbackWorkspace, x: DeviceArray) -> Step:
         """Take a step of the current method, after a hand-over if one is due."""
         return work.step()
 
@@ -304,10 +305,10 @@ class FallbackWorkspace:
         self._works: dict[int, Any] = {0: first}
         # By position: whether a method takes such a problem, before it has a workspace.
         self._suited: dict[int, bool] = {}
-        self._best: wp.array[Any] | None = None
+        self._best: DeviceArray | None = None
         self._place = 0
         # The iterate that the current method was given, if it is a restarted one.
-        self._begun: wp.array[Any] | None = None
+        self._begun: DeviceArray | None = None
         # Whether only the rounding floor prevents a hand-over.
         self._floored = False
         # Whether the best iterate is stored here and no longer by the first workspace.

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
@@ -156,7 +157,7 @@ class FischerNewton(NewtonSettings):
             return FischerDenseWorkspace(problem, self)
         return FischerWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: Any, x: DeviceArray) -> Step:
         """Take a monotone cycle, a gradient step or a Newton step.
 
         Cycles and gradient steps come first, after a cold start.
@@ -247,7 +248,7 @@ class FischerWorkspace(WorkspaceBase):
         """Whether a step is one pass over memory; the problem must allow it."""
         return self._fusable and self.floating is None
 
-    def newton_step(self, x: wp.array[Any]) -> Step:
+    def newton_step(self, x: DeviceArray) -> Step:
         """Solve for Newton's direction, and search along it.
 
         The system is (A + D) e = r with D = d p / q and r = -f / (q size), in units of the
@@ -288,14 +289,14 @@ class FischerWorkspace(WorkspaceBase):
         self._evaluate(x)
         return self._fall_back(x, iterations)
 
-    def _take_full_step(self, x: wp.array[Any], size: float, merit: float) -> bool:
+    def _take_full_step(self, x: DeviceArray, size: float, merit: float) -> bool:
         """Move by size e; return whether the merit falls as for an exact direction.
 
         The slope of an exact Newton direction is -f'f.
         """
         return self._trial(x, size) <= self._search.limit - 2 * DECREASE * merit
 
-    def _searched(self, x: wp.array[Any], size: float) -> bool:
+    def _searched(self, x: DeviceArray, size: float) -> bool:
         """Return to the start and search along e by the merit's own slope.
 
         That differs from -f'f where e is inexact. Returns whether the search succeeds.
@@ -305,7 +306,7 @@ class FischerWorkspace(WorkspaceBase):
         slope = size * self.map.slope(x, self.system.e)
         return slope < 0 and self._search.search(lambda t: self._trial(x, t * size), slope)[0] > 0.0
 
-    def _project(self, x: wp.array[Any]) -> None:
+    def _project(self, x: DeviceArray) -> None:
         """Move x onto its bounds, which it may violate by what the criteria allow.
 
         The solve goes on if the criteria are not met there.
@@ -315,14 +316,14 @@ class FischerWorkspace(WorkspaceBase):
         self._evaluate(x)
         self._scale = 0.0
 
-    def _evaluate(self, x: wp.array[Any]) -> float:
+    def _evaluate(self, x: DeviceArray) -> float:
         """Return the norm of the natural residual, and write y.
 
         The grid's own evaluation does not store y.
         """
         return NaturalResidual.evaluate(self.residual, x)
 
-    def _condense(self, x: wp.array[Any], move: float = 0.0) -> float:
+    def _condense(self, x: DeviceArray, move: float = 0.0) -> float:
         """Write the system of the next step; return the merit f'f / 2.
 
         If passes are fused, the same pass moves x by `move` e first.
@@ -339,7 +340,7 @@ class FischerWorkspace(WorkspaceBase):
         )
         return self._merit
 
-    def _fall_back(self, x: wp.array[Any], iterations: int) -> Step:
+    def _fall_back(self, x: DeviceArray, iterations: int) -> Step:
         """Take a gradient step where Newton's direction fails, or return the failure."""
         try:
             if not self.settings.safeguard:
@@ -355,7 +356,7 @@ class FischerWorkspace(WorkspaceBase):
             return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
         return Step("gradient", iterations + step.linear_iterations, None, step.failure)
 
-    def descend(self, x: wp.array[Any]) -> Step:
+    def descend(self, x: DeviceArray) -> Step:
         """Take one gradient step on the same map."""
         shared = self.cold_start is None  # a grid's own residual does not keep y
         if self._gradient is None:
@@ -372,7 +373,7 @@ class FischerWorkspace(WorkspaceBase):
         self.residual.norm, self.residual.current = self._gradient.residual.norm, True
         return step
 
-    def _trial(self, x: wp.array[Any], scale: float) -> float:
+    def _trial(self, x: DeviceArray, scale: float) -> float:
         """Move x, and return the merit.
 
         The system is then that of the next step, because a full step is nearly always taken.
@@ -384,7 +385,7 @@ class FischerWorkspace(WorkspaceBase):
         self._finish_move(x)
         return self._condense(x) if math.isfinite(self._evaluate(x)) else math.inf
 
-    def _go(self, x: wp.array[Any], scale: float) -> None:
+    def _go(self, x: DeviceArray, scale: float) -> None:
         """Move to x + scale e from the start of the step.
 
         Without bounds the last move is undone by a negative one, which saves a copy of x.

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
@@ -70,7 +71,7 @@ class GradientDescent(Settings):
         """Return a workspace, for any operator."""
         return DescentWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: DescentWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: DescentWorkspace, x: DeviceArray) -> Step:
         """Take one gradient step along the projected path."""
         return work.descend(x)
 
@@ -109,7 +110,7 @@ class DescentWorkspace(WorkspaceBase):
         self._search.forget()
         self._map.begin()
 
-    def descend(self, x: wp.array[Any]) -> Step:
+    def descend(self, x: DeviceArray) -> Step:
         """Take one step; `residual.y` is current at x before and after.
 
         The direction is d^-2 J'f. The first length is Barzilai and Borwein's: with the inner
@@ -138,14 +139,14 @@ class DescentWorkspace(WorkspaceBase):
         self.length = length
         return Step("gradient", 2, None, self._tested(x, merit, reached))
 
-    def _trial(self, x: wp.array[Any], length: float) -> float:
+    def _trial(self, x: DeviceArray, length: float) -> float:
         """Move along the projected path; return the merit."""
         self._map.advance(self._from, self._map.direction, -length, x, projected=True)
         self._round(x)
         self.residual.evaluate(x)
         return self._map.merit(x)
 
-    def _tested(self, x: wp.array[Any], before: float, after: float) -> SolveStatus | None:
+    def _tested(self, x: DeviceArray, before: float, after: float) -> SolveStatus | None:
         """Return STAGNATED if the relative or the stagnation test ends the solve.
 
         Returns None if neither does.

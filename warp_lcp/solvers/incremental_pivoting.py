@@ -6,13 +6,13 @@ The conditions of the rows are fulfilled one after the other, and are kept.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import warp as wp
 from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
@@ -87,7 +87,7 @@ class IncrementalPivoting(Settings):
             )
         return PivotingWorkspace(problem)
 
-    def step(self, problem: LCP, work: PivotingWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: PivotingWorkspace, x: DeviceArray) -> Step:
         """Take a block of pivots."""
         done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
         return work.result("pivots", done)

@@ -21,6 +21,7 @@ import warp as wp
 
 from warp_lcp.kernels import FusedKernel, KernelFile, PrecomputedProduct
 from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
@@ -116,7 +117,7 @@ class InteriorPoint(NewtonSettings):
             )
         return InteriorPointWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: Any, x: DeviceArray) -> Step:
         """Take a monotone cycle after a cold start, then path-following steps."""
         if isinstance(work, EquilibratedWorkspace):
             return work.step(self.step)
@@ -141,10 +142,10 @@ class ComplementaryPairs:
         t: multiplier of the upper bound.
     """
 
-    w: wp.array[Any]
-    v: wp.array[Any]
-    s: wp.array[Any]
-    t: wp.array[Any]
+    w: DeviceArray
+    v: DeviceArray
+    s: DeviceArray
+    t: DeviceArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +161,8 @@ class PathDirection:
         tau: target of the products w s and v t.
     """
 
-    a: wp.array[Any]
-    e: wp.array[Any]
+    a: DeviceArray
+    e: DeviceArray
     scale: float
     second: float
     joined: float
@@ -183,12 +184,12 @@ class PathSystem:
         tau: target of the products w s and v t.
     """
 
-    x: wp.array[Any]
-    b: wp.array[Any]
-    unknown: wp.array[Any]
-    free: wp.array[Any]
-    D: wp.array[Any]
-    r: wp.array[Any]
+    x: DeviceArray
+    b: DeviceArray
+    unknown: DeviceArray
+    free: DeviceArray
+    D: DeviceArray
+    r: DeviceArray
     scale: float
     tau: float
 
@@ -261,7 +262,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         if self.cold_start is not None:
             self.cold_start.start(warm=not cold_grid, tolerance=tolerance, floating=floating)
 
-    def monotone_step(self, x: wp.array[Any]) -> Step:
+    def monotone_step(self, x: DeviceArray) -> Step:
         """Take a projected multigrid cycle on all unknowns."""
         assert self.cold_start is not None
         return self.cold_start.monotone_step()
@@ -279,7 +280,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         """
         return self._fusable and self.floating is None and self.count > 0
 
-    def begin(self, x: wp.array[Any]) -> None:
+    def begin(self, x: DeviceArray) -> None:
         """Move x inside its bounds, and choose the multipliers.
 
         Far from the path their size follows from b and the residual, near it from the residual
@@ -314,7 +315,7 @@ class InteriorPointWorkspace(WorkspaceBase):
                 (free & np.isinf(w) & np.isinf(v)).astype(np.uint8), device=p.device
             )
 
-    def path_step(self, x: wp.array[Any]) -> Step:
+    def path_step(self, x: DeviceArray) -> Step:
         """Solve for the direction; move nearly as far as w, v, s and t stay positive.
 
         The predictor solves (A + D) dx = -(A x + b) with tau = 0, D = s / w + t / v. Mehrotra's
@@ -359,7 +360,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         name = "predictor-corrector" if s.mehrotra else "path"
         return Step(name, iterations, None, interim=not s.mehrotra and self.steps <= s.horizon)
 
-    def _fused_step(self, x: wp.array[Any]) -> Step:
+    def _fused_step(self, x: DeviceArray) -> Step:
         """Take Mehrotra's step of `path_step` in four passes over memory.
 
         The pass that moves x also condenses the system of the next step.
@@ -412,11 +413,11 @@ class InteriorPointWorkspace(WorkspaceBase):
             else PrecomputedProduct(r.diagonal, r.unit, r.y)
         )
 
-    def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> PathSystem:
+    def _condensing(self, x: DeviceArray, D: DeviceArray, tau: float) -> PathSystem:
         p = self.problem
         return PathSystem(x, p.b, p.unknown, self.free, D, self.system.r, 1 / self.size, tau)
 
-    def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
+    def _advance(self, x: DeviceArray, tau: float, length: float) -> None:
         """Move, unless the length is 0, and condense the next system there.
 
         The same pass sums the square of the residual's norm at the new x.
@@ -480,7 +481,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         products = float(sums[0])
         return float(self._longest.numpy()[0]), products
 
-    def _correct(self, tau: float, *, y: wp.array[Any] | None, D: wp.array[Any] | None) -> None:
+    def _correct(self, tau: float, *, y: DeviceArray | None, D: DeviceArray | None) -> None:
         """Write the corrector's right-hand side."""
         self._pass_sums.of(
             CENTER,
@@ -498,7 +499,7 @@ class InteriorPointWorkspace(WorkspaceBase):
             FUSED=self._fused,
         )
 
-    def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
+    def _move(self, x: DeviceArray, second: float, tau: float, length: float) -> None:
         """Take the step, and store mu."""
         sums = self._sums.of(
             MOVE,
@@ -513,7 +514,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         self.mu = float(sums[0]) / max(self.count, 1)
         self._finish_move(x)
 
-    def _inside(self, x: wp.array[Any], width: float) -> None:
+    def _inside(self, x: DeviceArray, width: float) -> None:
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
         INSIDE.bind(

@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-import warp as wp
 from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.banded_matrix import BandedFactors
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
@@ -230,7 +230,7 @@ class Lemke(Settings):
         check_size(problem, "Lemke", self.most_unknowns)
         return LemkeWorkspace(problem, self.covering_vectors)
 
-    def step(self, problem: LCP, work: LemkeWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: LemkeWorkspace, x: DeviceArray) -> Step:
         """Take a block of pivots."""
         done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
         return work.result("pivots", done)

@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import warp as wp
-
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.solve import Step
@@ -94,7 +93,7 @@ class MinimumMapNewton(NewtonSettings):
         """
         return NewtonWorkspace(problem, self, reduced_system(problem, self))
 
-    def step(self, problem: LCP, work: NewtonWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: NewtonWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle after a cold start, then Newton steps."""
         return work.step()
 

@@ -13,6 +13,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -118,7 +119,7 @@ class MPRGP(Settings):
             )
         return work
 
-    def step(self, problem: LCP, work: MPRGPWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: MPRGPWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle or a projected conjugate-gradient step.
 
         Cycles come first, after a cold start. A proportioning step precedes the gradient step where
@@ -164,7 +165,7 @@ class SplitResidual(NaturalResidual):
     """
 
     def __init__(
-        self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float
+        self, problem: LCP, r: DeviceArray, chopped_step: DeviceArray, *, slack: float
     ) -> None:
         super().__init__(problem)
         self.free, self._r, self._chopped_step, self._slack = (
@@ -188,7 +189,7 @@ class SplitResidual(NaturalResidual):
         self.sums = Sums(self.rows, 2, slots=engine.SLOTS)
         self._split = Sums(self._stencil.rows if self._stencil else self.rows, len(SPLIT.sums))
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+    def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
         super().start(x, keep=keep)
         if not keep:
@@ -199,7 +200,7 @@ class SplitResidual(NaturalResidual):
         """Return ||b|| over the unknowns, as it was at the start of the solve."""
         return self._norm_of_b
 
-    def evaluate(self, x: wp.array[Any]) -> float:
+    def evaluate(self, x: DeviceArray) -> float:
         """Compute the norm of the natural residual at x, and all attributes.
 
         One pass evaluates y = A x + b, the residual and its parts, the free set, g = -y / size on
@@ -239,7 +240,7 @@ class SplitResidual(NaturalResidual):
         )
         return self.norm
 
-    def measure(self, finest: StencilLevel, p: wp.array[Any]) -> list[float]:
+    def measure(self, finest: StencilLevel, p: DeviceArray) -> list[float]:
         """Return z'Az, z'Ap, r'z and r'p on a grid's finest level.
 
         The level's x is z, its b is r.
@@ -248,7 +249,7 @@ class SplitResidual(NaturalResidual):
         self._split.add_up(0, columns=4)
         return [float(v) for v in self._split.scalars.numpy()[:4]]
 
-    def dot(self, a: wp.array[Any], b: wp.array[Any]) -> float:
+    def dot(self, a: DeviceArray, b: DeviceArray) -> float:
         """Return a.b."""
         self.sums.dot(a, b, 0)
         return float(self.sums.scalars.numpy()[0])
@@ -273,7 +274,7 @@ class MPRGPWorkspace(WorkspaceBase):
         )
         z = self.preconditioner.z
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
-        self._best: wp.array[Any] = self._fields[0]
+        self._best: DeviceArray = self._fields[0]
         self._p, self._q = zeros_like(z), zeros_like(z)
         # A multigrid cycle overwrites z completely.
         self._chopped = z if self.is_grid else zeros_like(z)
@@ -333,7 +334,7 @@ class MPRGPWorkspace(WorkspaceBase):
         self._cycled, self._released = self._cycles_left > 0, False
         return self._cycled
 
-    def monotone_step(self, x: wp.array[Any]) -> Step:
+    def monotone_step(self, x: DeviceArray) -> Step:
         """Take a projected cycle on all unknowns."""
         residual = self.residual
         self._cycles_left -= 1
@@ -446,7 +447,7 @@ class MPRGPWorkspace(WorkspaceBase):
         self._settle(target)
         return True
 
-    def _projected_step(self, direction: wp.array[Any], gain: float, curvature: float) -> bool:
+    def _projected_step(self, direction: DeviceArray, gain: float, curvature: float) -> bool:
         """Move x to the energy's minimum along a direction, projected.
 
         The step is halved where the projection raises the energy.
@@ -469,13 +470,13 @@ class MPRGPWorkspace(WorkspaceBase):
             self._advance(origin, direction, length, self.x)
         return True
 
-    def _move(self, direction: wp.array[Any], length: float) -> wp.array[Any]:
+    def _move(self, direction: DeviceArray, length: float) -> DeviceArray:
         """Step along a direction; return the memory of the x before."""
         origin = self.x
         self._advance(origin, direction, length, self._target())
         return origin
 
-    def _target(self) -> wp.array[Any]:
+    def _target(self) -> DeviceArray:
         """Return memory for the next x, other than the best iterate's.
 
         It is not x's own either where a step may be repeated.
@@ -485,7 +486,7 @@ class MPRGPWorkspace(WorkspaceBase):
         return next(f for f in self._fields if f is not self._best and f is not self.x)
 
     def _advance(
-        self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]
+        self, origin: DeviceArray, direction: DeviceArray, length: float, target: DeviceArray
     ) -> None:
         """Compute x = clip(origin + length direction, l, u)."""
         projected_move(
@@ -493,7 +494,7 @@ class MPRGPWorkspace(WorkspaceBase):
         )
         self._settle(target)
 
-    def _settle(self, target: wp.array[Any]) -> None:
+    def _settle(self, target: DeviceArray) -> None:
         """Make the result of a step the current x."""
         self.x = target
         self._finish_move(self.x)
@@ -507,7 +508,7 @@ class MPRGPWorkspace(WorkspaceBase):
         """Set x to the best iterate."""
         self.x = self._best
 
-    def _first_bound(self, direction: wp.array[Any]) -> float:
+    def _first_bound(self, direction: DeviceArray) -> float:
         """Return the distance to the first bound along a direction; inf without one.
 
         Computed on the host. Semi-definite matrices need it occasionally.
@@ -518,7 +519,7 @@ class MPRGPWorkspace(WorkspaceBase):
             gaps = np.where(p > 0, (upper - at) / p, np.where(p < 0, (lower - at) / p, np.inf))
         return float(gaps.min())
 
-    def _product(self, direction: wp.array[Any]) -> None:
+    def _product(self, direction: DeviceArray) -> None:
         """Compute q = A times a direction."""
         A, shape = self.problem.A, self.problem.layout.stored_shape
         if self.is_grid:

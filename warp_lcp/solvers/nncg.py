@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
@@ -69,7 +70,7 @@ class NNCG(Settings):
         work.diagonal.check()
         return work
 
-    def step(self, problem: LCP, work: NNCGWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: NNCGWorkspace, x: DeviceArray) -> Step:
         """Sweep, then move along the last direction."""
         wp.copy(work.g, x)
         for forward in DIRECTIONS[self.direction]:
@@ -102,7 +103,7 @@ class NNCGWorkspace(SweepWorkspace):
         self._sums.scalars.zero_()
         self.p.zero_()
 
-    def advance(self, x: wp.array[Any]) -> None:
+    def advance(self, x: DeviceArray) -> None:
         """Move x after a sweep along p, and update p.
 
         g = x_before - x; beta = |g|^2 / |g_old|^2; x <- clip(x + beta p), p <- beta p - g, or both
@@ -129,7 +130,7 @@ class NNCGWorkspace(SweepWorkspace):
         self.round_iterate()
 
 
-def _where_constant(constant: wp.array[Any], index: wp.array[Any], none: float) -> wp.array[Any]:
+def _where_constant(constant: DeviceArray, index: DeviceArray, none: float) -> DeviceArray:
     """Return a bound as a field that is `none` where it depends on x."""
     return wp.array(
         np.where(index.numpy() < 0, constant.numpy(), none),

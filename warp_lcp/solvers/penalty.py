@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
@@ -90,7 +91,7 @@ class Penalty(NewtonSettings):
         """Return a workspace."""
         return PenaltyWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: PenaltyWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: PenaltyWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle (cold start), else a step of policy iteration."""
         if work.cycles_left > 0:
             work.cycles_left -= 1
@@ -155,7 +156,7 @@ class PenaltyWorkspace(WorkspaceBase):
         assert self.cold_start is not None
         return self.cold_start.monotone_step()
 
-    def policy_step(self, x: wp.array[Any]) -> Step:
+    def policy_step(self, x: DeviceArray) -> Step:
         """Solve with a penalty on the unknowns beyond their bounds; update that set.
 
         With V that set, (A + rho D_V) e = -(A x + b) / size from x = clip(z, l, u), and z = x +
@@ -206,7 +207,7 @@ class PenaltyWorkspace(WorkspaceBase):
         self.rho = min(LARGEST, self.rho * max(LEAST_RAISE, self._excess / allowed))
         return True
 
-    def _sort(self, x: wp.array[Any], *, first: bool = False, keep: bool = False) -> int:
+    def _sort(self, x: DeviceArray, *, first: bool = False, keep: bool = False) -> int:
         """Update the springs at z, project z onto the bounds; return their number.
 
         A spring stays if z is still beyond its bound. Its row of the step says z - g = -y / (rho

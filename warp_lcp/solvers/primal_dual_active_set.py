@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import time_is_up
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITE, Bounds
@@ -90,7 +91,7 @@ class PrimalDualActiveSet(NewtonSettings):
         """
         return ActiveSetWorkspace(problem, self.as_newton(), stop_if_singular=self.stop_if_singular)
 
-    def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: ActiveSetWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle after a cold start, then full steps.
 
         Least-index pivots follow a recurring set.
@@ -173,7 +174,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         # Whole steps may first raise the residual.
         return replace(step, interim=step.interim or (self._watched and self._moved))
 
-    def _cycles(self, x: wp.array[Any]) -> bool:
+    def _cycles(self, x: DeviceArray) -> bool:
         """Return whether the active set has recurred, now or before.
 
         A recurrence counts unless the residual has fallen by half since.
@@ -188,7 +189,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         self._seen[key] = norm
         return self.cycled
 
-    def _fingerprint(self, x: wp.array[Any]) -> bytes:
+    def _fingerprint(self, x: DeviceArray) -> bytes:
         """Return a hash that identifies an active set."""
         free = self.system.free.numpy() != 0
         at_upper = ~free & (x.numpy() == self.problem.upper.numpy())
@@ -196,7 +197,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
             np.packbits(free).tobytes() + np.packbits(at_upper).tobytes(), digest_size=16
         ).digest()
 
-    def least_index_step(self, x: wp.array[Any]) -> Step:
+    def least_index_step(self, x: DeviceArray) -> Step:
         """Take least-index pivots: the first violating unknown changes its place.
 
         The step is interim until no condition is violated.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.solve import PrecisionName, Step
@@ -60,7 +61,7 @@ class ProjectedJacobi(Settings):
         work.diagonal.check()
         return work
 
-    def step(self, problem: LCP, work: JacobiWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: JacobiWorkspace, x: DeviceArray) -> Step:
         """Update all unknowns once; y is that of the residual."""
         r = work.residual
         inputs = [work.d, r.unit, r.y, problem.lower, problem.upper, problem.unknown, work.omega, x]
@@ -77,7 +78,7 @@ class JacobiWorkspace(SweepWorkspace):
         d: A's diagonal / unit, stored field, as it was when the solve began.
     """
 
-    d: wp.array[Any]
+    d: DeviceArray
 
     def __init__(self, problem: LCP, settings: ProjectedJacobi) -> None:
         super().__init__(problem, settings.precision)

@@ -6,10 +6,9 @@ Monotone cycles, then truncated cycles with a carried conjugate-gradient directi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import warp as wp
-
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
@@ -93,7 +92,7 @@ class ProjectedMultigrid(Settings):
         """
         return lend(problem, self) if type(self) is ProjectedMultigrid else None
 
-    def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: MultigridWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle or a truncated one.
 
         Monotone cycles come after a cold start and where steps do not lower the energy; truncated

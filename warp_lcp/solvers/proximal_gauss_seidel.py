@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.solve import Precision, Step
@@ -98,7 +99,7 @@ class ProximalGaussSeidel(Settings):
         """Return a workspace: contacts by color, and recorded sweeps."""
         return ContactWorkspace(problem, self)
 
-    def step(self, problem: FrictionalContact, work: ContactWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: FrictionalContact, work: ContactWorkspace, x: DeviceArray) -> Step:
         """Sweep `check_every` times."""
         work.sweep()
         return Step("sweep", self.check_every, iterations=self.check_every)
@@ -120,15 +121,15 @@ class ContactFields:
         r: impulses as the problem numbers contacts, shape (k dim,).
     """
 
-    J: wp.array[Any]
-    b: wp.array[Any]
-    e: wp.array[Any]
-    laws: wp.array[Any]
-    contact: wp.array[Any]
-    one: wp.array[Any]
-    other: wp.array[Any]
-    w: wp.array[Any]
-    r: wp.array[Any]
+    J: DeviceArray
+    b: DeviceArray
+    e: DeviceArray
+    laws: DeviceArray
+    contact: DeviceArray
+    one: DeviceArray
+    other: DeviceArray
+    w: DeviceArray
+    r: DeviceArray
 
 
 class ContactWorkspace:
@@ -274,12 +275,12 @@ class ContactWorkspace:
         state = self._state.numpy().copy()
         self._state.assign(state[[1, 0, FACTOR, LEFT]])
 
-    def evaluate(self, x: wp.array[Any]) -> float:
+    def evaluate(self, x: DeviceArray) -> float:
         """Return the residual's norm at x, recomputed in float64 from x alone."""
         self._look()
         return self._read()
 
-    def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
+    def rounding_floor(self, x: DeviceArray, epsilon: float) -> float:
         """Return the rounding floor of the residual: epsilon (|J| |J|' |r| + |b|)."""
         J, r = abs(self.problem.jacobian), np.abs(x.numpy()).ravel()
         return float(epsilon * np.linalg.norm(J @ (J.T @ r) + np.abs(self.problem.b.ravel())))

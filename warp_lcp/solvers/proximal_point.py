@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
 from warp_lcp.problem.result import SolveStatus
@@ -83,7 +84,7 @@ class ProximalPoint(Settings):
         check_taken(self, problem.A)
         return ProximalWorkspace(problem, self.inner)
 
-    def step(self, problem: LCP, work: ProximalWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: ProximalWorkspace, x: DeviceArray) -> Step:
         """Take one step of the inner method, from a new center if one is due."""
         return work.step(x)
 
@@ -117,7 +118,7 @@ class ProximalWorkspace(WorkspaceBase):
             LEAST,
         )
 
-    def step(self, x: wp.array[Any]) -> Step:
+    def step(self, x: DeviceArray) -> Step:
         """Take one step for the regularized problem."""
         work, failure = self._work, None
         if self._steps == 0:
@@ -140,7 +141,7 @@ class ProximalWorkspace(WorkspaceBase):
             "proximal point", done.linear_iterations, done.active, failure, interim=failure is None
         )
 
-    def _take_center(self, x: wp.array[Any]) -> None:
+    def _take_center(self, x: DeviceArray) -> None:
         """Write the regularized problem around clip(x, l, u), and begin there."""
         inner, work = self._inner, self._work
         center = np.clip(x.numpy(), self._lower, self._upper)
@@ -154,7 +155,7 @@ class ProximalWorkspace(WorkspaceBase):
         work.keep()
         work.start(warm=True, tolerance=self._near)
 
-    def _assess(self, x: wp.array[Any], *, solved: bool) -> SolveStatus | None:
+    def _assess(self, x: DeviceArray, *, solved: bool) -> SolveStatus | None:
         """Prepare for the next center; return the status if the solve ends.
 
         It ends if IDLE centers have made no progress, or eps cannot be raised further.

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-import warp as wp
-
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, Relaxes, check_taken, has, version_of
@@ -96,7 +95,7 @@ class ProjectedSOR(Settings):
         work.diagonal.check()
         return work
 
-    def step(self, problem: LCP, work: SORWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: SORWorkspace, x: DeviceArray) -> Step:
         """Sweep once, or forward and backward if symmetric."""
         directions = DIRECTIONS[self.direction]
         for forward in directions:

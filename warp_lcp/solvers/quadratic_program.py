@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
@@ -76,7 +76,7 @@ class QuadraticProgram(Settings):
         work.check_definite()
         return work
 
-    def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: DeviceArray) -> Step:
         """Solve the whole quadratic program."""
         return work.result("quadratic program", work.minimize(self.tolerance, self.max_iterations))
 

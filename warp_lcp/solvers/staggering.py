@@ -17,6 +17,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.operators.grid_poisson import AIR, FLUID
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
@@ -87,7 +88,7 @@ class Staggering(Settings):
             problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations
         )
 
-    def step(self, problem: LCP, work: StaggeringWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: StaggeringWorkspace, x: DeviceArray) -> Step:
         """Solve each block once, with the others held fixed."""
         linear = work.rounds.run(work.target)
         return Step("round", linear, failure=work.contraction.test(x))
@@ -280,7 +281,7 @@ class MatrixBlock:
         problem: the block's own; `couple` writes b and bounds.
     """
 
-    def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
+    def __init__(self, whole: LCP, x: DeviceArray, rows: np.ndarray) -> None:
         self._whole, self._x, self._rows = whole, x, rows
         inner, self._outer = self._entries()
         device, size = whole.device, len(rows)
@@ -306,7 +307,7 @@ class MatrixBlock:
         for field, source in ((problem.lower, whole.lower), (problem.upper, whole.upper)):
             field.assign(source.numpy()[rows])
 
-    def guess(self) -> wp.array[Any]:
+    def guess(self) -> DeviceArray:
         """Return x_B, a copy on the device."""
         return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
 
@@ -340,7 +341,7 @@ class GridBlock:
         problem: the block's own, in the layout of the whole; bounds are shared with it.
     """
 
-    def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
+    def __init__(self, whole: LCP, x: DeviceArray, rows: np.ndarray) -> None:
         A = whole.A
         assert has(A, HasBlocks)
         layout = whole.layout
@@ -384,7 +385,7 @@ class GridBlock:
             rows_of(self._x), x=self._y, less=self._z, target=self._b, member=member, kept=False
         ).launch()
 
-    def guess(self) -> wp.array[Any]:
+    def guess(self) -> DeviceArray:
         """Return x_B as `couple` wrote it."""
         return self._guess
 
@@ -411,7 +412,7 @@ class GridBlock:
 Block = MatrixBlock | GridBlock
 
 
-def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
+def block_problem(whole: LCP, x: DeviceArray, rows: np.ndarray) -> Block:
     """Return a block of a problem as a problem of its own.
 
     Args:

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
@@ -94,7 +95,7 @@ class SubspaceMinimization(Settings):
         work.diagonal.check()
         return work
 
-    def step(self, problem: LCP, work: SubspaceWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: SubspaceWorkspace, x: DeviceArray) -> Step:
         """Sweep, then minimize on the free set until it stays."""
         for _ in range(self.sweeps):
             check_time()
@@ -134,7 +135,7 @@ class SubspaceWorkspace(SweepWorkspace):
         self._stale, self._target = True, tolerance
         self.system.refresh()
 
-    def classify(self, x: wp.array[Any]) -> tuple[int, int]:
+    def classify(self, x: DeviceArray) -> tuple[int, int]:
         """Find the free set; return how many unknowns changed sides and are held.
 
         An unknown is free where l < x < u ([Book] eq. 2.92).
@@ -150,7 +151,7 @@ class SubspaceWorkspace(SweepWorkspace):
             self._stale = False
         return moved, held
 
-    def minimize(self, x: wp.array[Any]) -> int:
+    def minimize(self, x: DeviceArray) -> int:
         """Solve on the free set and move x along the projected correction.
 
         It solves A_FF e_F = -y_F / size, then x <- clip(x + size e, l, u) with the correction
@@ -182,7 +183,7 @@ class SubspaceWorkspace(SweepWorkspace):
         residual.current = False
         return iterations
 
-    def _correct(self, x: wp.array[Any], scale: float) -> None:
+    def _correct(self, x: DeviceArray, scale: float) -> None:
         """Set x = clip(x0 + scale e, l, u) from the x0 before the correction.
 
         Held unknowns then follow bounds that are affine in x.
@@ -206,7 +207,7 @@ class SubspaceWorkspace(SweepWorkspace):
             ).launch()
         self._finish_move(x)
 
-    def _energy(self, x: wp.array[Any]) -> float:
+    def _energy(self, x: DeviceArray) -> float:
         """Return the energy x'A x / 2 + b'x = x'(y + b) / 2, y being that of x.
 
         Infinite where it does not exist: A is not symmetric, or bounds are affine.

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
@@ -40,7 +41,7 @@ class Sweep:
     def start(self) -> None:
         """Begin a solve: read again those data of A that are copies."""
 
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+    def run(self, x: DeviceArray, *, forward: bool) -> None:
         """Sweep x (stored, float64) once."""
 
 
@@ -57,7 +58,7 @@ class OperatorSweep(Sweep):
         self.problem, self._A, self.omega = problem, A, omega
         self._options: dict[str, bool] = {} if colored is None else {"colored": colored}
 
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+    def run(self, x: DeviceArray, *, forward: bool) -> None:
         """Sweep by the operator; bounds are those at x."""
         p = self.problem
         p.bounds.follow(x)
@@ -106,7 +107,7 @@ class RowSweep(Sweep):
         self._kernels = row_kernels(rows.values.dtype)
         self._y = problem.layout.zeros(wp.float64) if order is SweepOrder.GREEDY else None
 
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+    def run(self, x: DeviceArray, *, forward: bool) -> None:
         """Sweep by one thread; an order that depends on x is computed first."""
         p = self.problem
         if self._y is not None:
@@ -133,7 +134,7 @@ class DiagonalSweep(Sweep):
             self._own if self._by_rows is None or self._diagonal.positive() else self._by_rows
         )
 
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+    def run(self, x: DeviceArray, *, forward: bool) -> None:
         """Sweep by the chosen sweep."""
         self._current.run(x, forward=forward)
 
@@ -148,7 +149,7 @@ class Diagonal:
         """Return the diagonal, a stored field on the host, float64."""
         return self.field().numpy().astype(np.float64) * self._residual.unit
 
-    def field(self) -> wp.array[Any]:
+    def field(self) -> DeviceArray:
         """Return the diagonal / unit, a stored field.
 
         For grids and sparse matrices it is their own memory.
@@ -287,12 +288,12 @@ class Contraction:
         self._out = wp.zeros(1, dtype=wp.float64, device=problem.device)
         self.factor = np.nan
 
-    def start(self, x: wp.array[Any]) -> None:
+    def start(self, x: DeviceArray) -> None:
         """Store x as the iterate before the first sweep."""
         wp.copy(self._old, x)
         self._last, self._least, self._rises, self.factor = np.nan, np.inf, 0, np.nan
 
-    def test(self, x: wp.array[Any]) -> SolveStatus | None:
+    def test(self, x: DeviceArray) -> SolveStatus | None:
         """Compare x with the x of the last call.
 
         Returns DIVERGED, NON_DESCENT where nothing has changed, or None.

@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import scipy.ndimage
@@ -29,6 +29,9 @@ class Unseen:
     # Slightly changed problem, to be solved from the solution of `problem`; None if there is none.
     then: GridProblem | None = None
     allowance: float = 1.0  # factor of the allowed iterations
+
+
+ChoiceT = TypeVar("ChoiceT")
 
 
 class Draw:
@@ -61,7 +64,7 @@ class Draw:
         top = min(high, max(low, 15)) if self.small else high
         return min(top, int(self.decades(low, top + 1)))
 
-    def of(self, *choices: Any) -> Any:
+    def of(self, *choices: ChoiceT) -> ChoiceT:
         """Return one of the choices."""
         return choices[int(self.rng.integers(len(choices)))]
 

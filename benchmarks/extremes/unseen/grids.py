@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.ndimage
 
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of, with_solution
 from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw, framed
+from warp_lcp.files.tables import Tables, TableValue
 
 
-def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
+def some_bounds(draw: Draw, shape: tuple[int, ...]) -> Tables:
     """Return x >= 0 everywhere, on some cells, in one layer, or with an upper bound."""
     kind = draw.of("all", "all", "some", "layer", "box")
     if kind == "all":
@@ -26,7 +25,7 @@ def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     return {"upper": draw.decades(0.1, 100)}
 
 
-def loaded(draw: Draw, cells: np.ndarray, **more: Any) -> GridProblem:
+def loaded(draw: Draw, cells: np.ndarray, **more: TableValue) -> GridProblem:
     """Return a problem with a random right-hand side and bounds on these cells."""
     return GridProblem(
         cells=cells, b=draw.load(cells.shape), **more, **some_bounds(draw, cells.shape)
@@ -119,7 +118,8 @@ def periodic(draw: Draw) -> GridProblem:
 def handful(draw: Draw) -> GridProblem:
     """Return one to sixty cells of any type."""
     dimensions = draw.of(2, 3)
-    shape = tuple(int(n) for n in draw.rng.integers(1, 8 if dimensions == 2 else 5, dimensions))
+    most = 8 if dimensions == 2 else 5
+    shape = tuple(int(n) for n in draw.rng.integers(1, most, size=(dimensions,)))
     cells = draw.rng.choice([FLUID, AIR, SOLID], shape, p=[0.7, 0.2, 0.1])
     cells.flat[draw.rng.integers(cells.size)] = FLUID
     shift = draw.decades(1e-3, 1) if draw.chance(0.4) else None
@@ -320,7 +320,7 @@ def shifted(draw: Draw) -> GridProblem:
     shape = draw.shape(draw.of(2, 3))
     cells = np.full(shape, FLUID)
     cells[: draw.chance(0.3)] = AIR
-    shift: Any = draw.decades(1e-5, 100)
+    shift: float | np.ndarray = draw.decades(1e-5, 100)
     if draw.chance(0.5):
         shift = shift * (draw.rng.random(shape) < draw.between(0.01, 1))
         shift.flat[-1] = 1.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 import scipy.sparse
@@ -31,11 +31,13 @@ from warp_lcp.benchmarks.extremes.case import (
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, equality
 from warp_lcp.benchmarks.harness.record import RecordTable
+from warp_lcp.files.tables import Tables
+from warp_lcp.gradients.names import SolveOptions
 from warp_lcp.problem.protocol import families
 
 FAMILY, METHODS_FAMILY = FAMILIES = ("unseen", "unseen, every method")
 # More iterations than the default, so that the count is known.
-CRITERIA: dict[str, Any] = {"rtol": 1e-6, "max_iterations": 400}
+CRITERIA: Tables = {"rtol": 1e-6, "max_iterations": 400}
 OFTEN = (2.0, 6)  # at most 2 e + 6 iterations, where e is the count for the equations
 OFTEN_SHARE = 0.95  # share of the grids on which that must hold
 ALWAYS = (3.0, 6)  # at most 3 e + 6 iterations on all grids
@@ -53,7 +55,7 @@ Solve = Callable[..., wl.SolveResult]
 
 
 def solved(
-    problem: Problem, solve: Solve, device: str, **more: Any
+    problem: Problem, solve: Solve, device: str, **more: Unpack[SolveOptions]
 ) -> tuple[wl.SolveResult, ExtremeAttempt]:
     """Solve by the default method; return the result and its independent check."""
     begun = time.perf_counter()

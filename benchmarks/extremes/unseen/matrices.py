@@ -6,7 +6,6 @@ There are also skew matrices with small diagonals.
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -15,6 +14,7 @@ import scipy.spatial
 from warp_lcp.benchmarks.extremes.problem import MatrixProblem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids
 from warp_lcp.benchmarks.extremes.unseen.draw import Draw
+from warp_lcp.host_problem import Matrix
 
 GRIDS = (grids.torsion, grids.dam, grids.voxels, grids.shifted)
 SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # zero, and the range of tiny diagonals
@@ -143,7 +143,7 @@ def option(draw: Draw) -> MatrixProblem:
     return MatrixProblem(matrix=A.tocsr(), b=b, lower=payoff)
 
 
-def held(draw: Draw, matrix: Any) -> MatrixProblem:
+def held(draw: Draw, matrix: Matrix) -> MatrixProblem:
     """Return the problem of a matrix with a chosen solution.
 
     Entries have x > 0 and y = 0, or the other way round.
@@ -155,7 +155,7 @@ def held(draw: Draw, matrix: Any) -> MatrixProblem:
     return MatrixProblem(matrix=matrix, b=y - matrix @ x)
 
 
-def as_kind(draw: Draw, matrix: np.ndarray) -> Any:
+def as_kind(draw: Draw, matrix: np.ndarray) -> Matrix:
     """Return the matrix as dense or sparse."""
     return matrix if draw.chance(0.5) else scipy.sparse.csr_array(matrix)
 

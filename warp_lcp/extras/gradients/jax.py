@@ -5,30 +5,41 @@ The functions run on the host and can be traced.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve as solve_problem
-from warp_lcp.gradients.names import flat, nested
+from warp_lcp.gradients.names import (
+    Coefficients,
+    MakesOperator,
+    SolveOptions,
+    flat,
+    nested,
+    operator_of,
+)
 from warp_lcp.gradients.vjp import vjp
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
 
+if TYPE_CHECKING:
+    import jax
+
 
 def solve(
-    A: Any,
-    b: Any,
-    lower: Any = 0.0,
-    upper: Any = np.inf,
+    A: Operator | MakesOperator,
+    b: jax.Array | np.ndarray,
+    lower: jax.Array | np.ndarray | float = 0.0,
+    upper: jax.Array | np.ndarray | float = np.inf,
     *,
-    coefficients: Mapping[str, Any] | None = None,
+    coefficients: Coefficients | None = None,
     adjoint: StoppingCriteria | None = None,
-    **options: Any,
-) -> Any:
+    **options: Unpack[SolveOptions],
+) -> jax.Array:
     """Return the solution x as a JAX array with gradients to all arguments.
 
     x solves y = A x + b with bounds; it has the type of b.
@@ -55,21 +66,25 @@ def solve(
     given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
     names, values = tuple(given), tuple(map(jax.numpy.asarray, given.values()))
 
-    def solved(data: Sequence[Any], x0: Any = None) -> SolveResult:
+    Kept = tuple[Sequence[jax.Array], jax.Array]  # data and solution
+
+    def solved(data: Sequence[jax.Array], x0: jax.Array | None = None) -> SolveResult:
         """Solve the problem of host arrays."""
         host = [np.asarray(v) for v in data]
         parts = nested(names[3:], host[3:])
-        result = solve_problem(
-            LCP(A(**parts) if parts else A, *host[:3]),
-            **{**options, **({} if x0 is None else {"x0": np.asarray(x0)})},
-        )
+        own = options.copy()
+        if x0 is not None:
+            own["x0"] = np.asarray(x0)
+        result = solve_problem(LCP(operator_of(A, parts), *host[:3]), **own)
         if not result:
             raise ArithmeticError(
                 f"the solve ended with {result.status.name}: {result.status.value}"
             )
         return result
 
-    def derived(data: Sequence[Any], x: Any, cotangent: Any) -> tuple[Any, ...]:
+    def derived(
+        data: Sequence[jax.Array], x: jax.Array, cotangent: jax.Array
+    ) -> tuple[np.ndarray, ...]:
         found = vjp(solved(data, x), np.asarray(cotangent), stopping=adjoint).by_name
         parts = (found[name] for name in names)
         return tuple(
@@ -78,15 +93,15 @@ def solve(
         )
 
     @jax.custom_vjp
-    def solution(data: Sequence[Any]) -> Any:
+    def solution(data: Sequence[jax.Array]) -> jax.Array:
         like = jax.ShapeDtypeStruct(data[0].shape, data[0].dtype)
         return jax.pure_callback(lambda d: solved(d).x.numpy().astype(like.dtype), like, data)
 
-    def forward(data: Sequence[Any]) -> Any:
+    def forward(data: Sequence[jax.Array]) -> tuple[jax.Array, Kept]:
         x = solution(data)
         return x, (data, x)
 
-    def backward(kept: Any, cotangent: Any) -> Any:
+    def backward(kept: Kept, cotangent: jax.Array) -> tuple[Sequence[jax.Array]]:
         like = tuple(jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kept[0])
         return (jax.pure_callback(derived, like, *kept, cotangent),)
 

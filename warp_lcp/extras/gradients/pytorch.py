@@ -5,30 +5,43 @@ Tensors share memory with Warp arrays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve as solve_problem
-from warp_lcp.gradients.names import flat, nested
+from warp_lcp.gradients.names import (
+    Coefficients,
+    MakesOperator,
+    Name,
+    SolveOptions,
+    flat,
+    nested,
+    operator_of,
+)
 from warp_lcp.gradients.vjp import vjp
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.stopping import StoppingCriteria
+
+if TYPE_CHECKING:
+    import torch
+    from torch.autograd.function import FunctionCtx
 
 
 def solve(
-    A: Any,
-    b: Any,
-    lower: Any = 0.0,
-    upper: Any = np.inf,
+    A: Operator | MakesOperator,
+    b: torch.Tensor,
+    lower: torch.Tensor | float = 0.0,
+    upper: torch.Tensor | float = np.inf,
     *,
-    coefficients: Mapping[str, Any] | None = None,
+    coefficients: Coefficients | None = None,
     adjoint: StoppingCriteria | None = None,
-    **options: Any,
-) -> Any:
+    **options: Unpack[SolveOptions],
+) -> torch.Tensor:
     """Return the solution x as a PyTorch tensor with gradients to all given tensors.
 
     x solves y = A x + b with bounds; it has the type of b.
@@ -51,32 +64,40 @@ def solve(
     return _solution().apply((A, options, adjoint, tuple(given)), *given.values())
 
 
+# Operator, options of the solve, criteria of the gradients, names of the other arguments.
+How = tuple[Operator | MakesOperator, SolveOptions, StoppingCriteria | None, tuple[Name, ...]]
+
+
 @cache
-def _solution() -> Any:
+def _solution() -> type[torch.autograd.Function]:
     """Return the autograd function, created at the first call."""
     import torch
 
     class Solution(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, how: Any, *values: Any) -> Any:
+        def forward(
+            ctx: FunctionCtx, how: How, b: torch.Tensor, *others: torch.Tensor | float
+        ) -> torch.Tensor:
             """Solve, and keep the result for the backward pass."""
             A, options, ctx.adjoint, ctx.names = how
+            values = (b, *others)
             ctx.kinds = [
                 (v.dtype, v.device) if isinstance(v, torch.Tensor) else None for v in values
             ]
             shared = [_shared(v) if kind else v for v, kind in zip(values, ctx.kinds, strict=True)]
-            b, lower, upper = shared[:3]
+            right, lower, upper = shared[:3]
             parts = nested(ctx.names[3:], shared[3:])
-            ctx.result = solve_problem(LCP(A(**parts) if parts else A, b, lower, upper), **options)
+            problem = LCP(operator_of(A, parts), right, lower, upper)
+            ctx.result = solve_problem(problem, **options)
             if not ctx.result:
                 raise ArithmeticError(
                     f"the solve ended with {ctx.result.status.name}: {ctx.result.status.value}"
                 )
-            return wp.to_torch(ctx.result.x).to(values[0].dtype)
+            return wp.to_torch(ctx.result.x).to(b.dtype)
 
         @staticmethod
         @torch.autograd.function.once_differentiable
-        def backward(ctx: Any, cotangent: Any) -> Any:
+        def backward(ctx: FunctionCtx, cotangent: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
             """Return the gradients of all tensors by `wl.vjp`."""
             found = vjp(ctx.result, _shared(cotangent), stopping=ctx.adjoint).by_name
             values = [
@@ -99,6 +120,6 @@ def _solution() -> Any:
     return Solution
 
 
-def _shared(tensor: Any) -> Any:
+def _shared(tensor: torch.Tensor) -> DeviceArray | float:
     """Return a tensor's memory as a Warp array, a number if it has no axes."""
     return wp.from_torch(tensor.detach().contiguous()) if tensor.ndim else float(tensor)

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve as solve_problem
-from warp_lcp.gradients.names import flat
+from warp_lcp.gradients.names import Coefficients, MakesOperator, SolveOptions, flat, operator_of
 from warp_lcp.gradients.vjp import vjp
+from warp_lcp.kernels.fields import Array
 from warp_lcp.kernels.vectors import ADD, convert, rows_of
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
 
 
 def solve(
     tape: wp.Tape,
-    A: Any,
-    b: Any,
-    lower: Any = 0.0,
-    upper: Any = np.inf,
+    A: Operator | MakesOperator,
+    b: Array,
+    lower: Array | float = 0.0,
+    upper: Array | float = np.inf,
     *,
-    coefficients: Mapping[str, Any] | None = None,
+    coefficients: Coefficients | None = None,
     adjoint: StoppingCriteria | None = None,
-    **options: Any,
+    **options: Unpack[SolveOptions],
 ) -> SolveResult:
     """Solve y = A x + b with bounds and record the solve on a Warp tape.
 
@@ -54,9 +55,8 @@ def solve(
         ValueError: as of `wl.LCP` and `wl.solve`, and in the backward pass as of `wl.vjp`.
     """
     arguments = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
-    result = solve_problem(
-        LCP(A(**coefficients) if coefficients else A, b, lower, upper), **options
-    )
+    operator = operator_of(A, coefficients or {})
+    result = solve_problem(LCP(operator, b, lower, upper), **options)
     result.x.requires_grad = True
     differentiable = {
         name: v for name, v in arguments.items() if isinstance(v, wp.array) and v.requires_grad
@@ -66,7 +66,9 @@ def solve(
         found = vjp(result, result.x.grad, stopping=adjoint).by_name
         for name, array in differentiable.items():
             part = wp.empty_like(array.grad.flatten())
-            convert(found[name].flatten(), part)
+            gradient = found[name]
+            assert isinstance(gradient, wp.array)
+            convert(gradient.flatten(), part)
             ADD.bind(rows_of(part), z=part, x=array.grad.flatten()).launch()
 
     tape.record_func(backward, [result.x, *differentiable.values()])

@@ -13,13 +13,18 @@ import sys
 from dataclasses import dataclass, replace
 from functools import cache
 from glob import glob
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_lcp.files.tables import Tables
 from warp_lcp.render.photo.photo_scene import Finish, PhotoMesh, PhotoScene
 from warp_lcp.render.recording import RenderError
 from warp_lcp.scene.camera import Viewpoint
+
+if TYPE_CHECKING:
+    import mitsuba
 
 INSTALL = "pip install 'warp-lcp[photo]'"
 # The first is compiled ahead of time; the second is twice as fast, compiled at run time by LLVM.
@@ -68,7 +73,7 @@ class Quality:
     shutter: float = 0.0
 
 
-def load_renderer(variant: str = SCALAR) -> Any:
+def load_renderer(variant: str = SCALAR) -> ModuleType:
     """Return the module `mitsuba`, ready to render.
 
     Args:
@@ -203,7 +208,7 @@ def displaced(scene: PhotoScene, time: float) -> PhotoScene:
     return replace(scene, meshes=meshes)
 
 
-def scene_plugins(mitsuba: Any, scene: PhotoScene, size: tuple[int, int]) -> dict[str, Any]:
+def scene_plugins(mitsuba: ModuleType, scene: PhotoScene, size: tuple[int, int]) -> Tables:
     """Return a scene as a dict for `mitsuba.load_dict`.
 
     With integrator, sensor, sky, ground and meshes.
@@ -219,7 +224,7 @@ def scene_plugins(mitsuba: Any, scene: PhotoScene, size: tuple[int, int]) -> dic
         .rotate([1, 0, 0], -90)
         .scale(reach)
     )
-    plugins = {
+    plugins: Tables = {
         "type": "scene",
         "integrator": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "image": path},
         "sensor": sensor_plugin(transform, scene.view, size),
@@ -235,7 +240,9 @@ def scene_plugins(mitsuba: Any, scene: PhotoScene, size: tuple[int, int]) -> dic
     return plugins
 
 
-def sensor_plugin(transform: Any, view: Viewpoint, size: tuple[int, int]) -> dict[str, Any]:
+def sensor_plugin(
+    transform: type[mitsuba.ScalarTransform4f], view: Viewpoint, size: tuple[int, int]
+) -> Tables:
     """Return the plugin of the camera."""
     return {
         "type": "perspective",
@@ -257,7 +264,7 @@ def sensor_plugin(transform: Any, view: Viewpoint, size: tuple[int, int]) -> dic
     }
 
 
-def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
+def mesh_plugin(mitsuba: ModuleType, mesh: PhotoMesh) -> mitsuba.Mesh:
     """Return a mesh with its material; an absorbing one contains a medium."""
     properties = mitsuba.Properties()
     colored = mesh.color.ndim == 2
@@ -291,7 +298,7 @@ def mesh_plugin(mitsuba: Any, mesh: PhotoMesh) -> Any:
     return plugin
 
 
-def surface_plugin(mesh: PhotoMesh, colored: bool) -> dict[str, Any]:
+def surface_plugin(mesh: PhotoMesh, colored: bool) -> Tables:
     """Return the scattering model of a surface."""
     if mesh.finish is Finish.LIQUID:
         return {"type": "dielectric", "int_ior": WATER_INDEX, "ext_ior": 1.0}

@@ -9,15 +9,15 @@ import json
 import math
 import os
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from warp_lcp.files.atomic import make_folder, replacing
+from warp_lcp.files.tables import Tables
 from warp_lcp.render.film import Film, film_suffix
 from warp_lcp.render.photo.mitsuba_renderer import (
     VERSION,
@@ -134,7 +134,16 @@ def photograph_run(
 
 
 def photograph_film(
-    folder: Path, film: Path, *, rate: float | None = None, **given: Any
+    folder: Path,
+    film: Path,
+    *,
+    rate: float | None = None,
+    frames: Sequence[int] = (),
+    settings: PhotoSettings | None = None,
+    out: Path | None = None,
+    told: Callable[[int, int], None] = lambda done, of: None,
+    estimated: Callable[[float], None] = lambda seconds: None,
+    noted: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Path]:
     """Render frames as `photograph_run` does, then encode them into a film.
 
@@ -144,7 +153,12 @@ def photograph_film(
         folder: folder of the run.
         film: the file; `.mp4` or `.gif`.
         rate: frames per second of the film [1/s]. Default: that of the scene.
-        given: arguments of `photograph_run`.
+        frames: as of `photograph_run`.
+        settings: likewise.
+        out: likewise.
+        told: likewise.
+        estimated: likewise.
+        noted: likewise.
 
     Raises:
         RenderError: as in `photograph_run`, or the film cannot be written.
@@ -153,10 +167,18 @@ def photograph_film(
 
     film_suffix(film)
     files = []
-    for file in photograph_run(folder, **given):
+    for file in photograph_run(
+        folder,
+        frames=frames,
+        settings=settings,
+        out=out,
+        told=told,
+        estimated=estimated,
+        noted=noted,
+    ):
         files.append(file)
         yield file
-    settings = given.get("settings") or PhotoSettings()
+    settings = settings or PhotoSettings()
     with Film(film, settings.size, rate or Recording(folder).scene.time.frames_per_second) as reel:
         for file in files:
             reel.add(partial(lambda name: np.asarray(Image.open(name).convert("RGB")), file))
@@ -219,7 +241,7 @@ def developed(radiance: np.ndarray) -> np.ndarray:
     ).astype(np.uint8)
 
 
-def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) -> dict[str, Any]:
+def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) -> Tables:
     """Return everything that determines a picture.
 
     The renderer's version, settings, camera, and checksums of the frame's files.
@@ -240,7 +262,7 @@ def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) 
     }
 
 
-def read_settings(file: Path) -> dict[str, Any] | None:
+def read_settings(file: Path) -> Tables | None:
     """Return the settings stored in a picture.
 
     None if there is no complete picture, or it has no settings.
@@ -258,27 +280,27 @@ def read_settings(file: Path) -> dict[str, Any] | None:
 
 def _report(
     noted: Callable[[str], None],
-    held: dict[int, Any],
-    wanted: dict[int, Any],
+    held: Mapping[int, Tables | None],
+    wanted: Mapping[int, Tables],
     missing: Sequence[int],
 ) -> None:
     """Report which pictures are kept, and which are repeated and why."""
     if kept := len(wanted) - len(missing):
         noted(f"{kept} of {len(wanted)} pictures are there with these settings and are kept")
-    again = [number for number in missing if held[number] is not None]
+    again = {number: before for number in missing if (before := held[number]) is not None}
     if again:
         keys = sorted(
             {
                 key
-                for number in again
+                for number, before in again.items()
                 for key in wanted[number]
-                if held[number].get(key) != wanted[number][key]
+                if before.get(key) != wanted[number][key]
             }
         )
         noted(f"{len(again)} pictures have another {', '.join(keys)} and are rendered again")
 
 
-def _save(pixels: np.ndarray, settings: dict[str, Any], file: Path, folder: Path) -> None:
+def _save(pixels: np.ndarray, settings: Tables, file: Path, folder: Path) -> None:
     """Write a picture with its settings, in a run's folder never through a link."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import SurfaceMesh
+from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.render.actors import BODY_COLORS, is_round
 from warp_lcp.render.grains import placed_grains
 from warp_lcp.render.photo.meshes import (
@@ -32,7 +32,8 @@ from warp_lcp.render.recording import Recording, RenderError, Show, spread
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.camera import VIEW_ANGLE, Viewpoint, view_of_points, viewpoint
-from warp_lcp.scene.shapes import BoxTable, PlaneTable
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.shapes import BoxTable, PlaneTable, Solid
 from warp_lcp.simulation import Points, Surface
 
 FRAMING_FRAMES = 8  # evenly spaced frames that determine the view
@@ -118,19 +119,17 @@ class PhotoScenes:
     """
 
     def __init__(self, recording: Recording, aspect: float, *, beads: bool = False) -> None:
-        scene: Any = recording.scene
+        scene = recording.scene
         if scene.dimension != 3:
             raise RenderError(
                 "--look photo: draws 3-D runs; this one is 2-D, which --look quick draws"
             )
         self.recording, self._scene = recording, scene
-        particles = getattr(scene, "particles", None)  # settings of the material
+        # Settings of the material.
+        particles = scene.particles if isinstance(scene, ParticleScene) else None
         self._wrapped = scene.palette == "water" and particles is not None and not beads
-        if (
-            self._wrapped
-            and recording.show is Show.PARTICLES
-            and getattr(particles, "narrow_band", None) is not None
-        ):
+        banded = particles is not None and particles.narrow_band is not None
+        if self._wrapped and recording.show is Show.PARTICLES and banded:
             raise RenderError(
                 "--look photo: a run with a narrow band of particles needs output.surface = true; "
                 "--show particles draws beads"
@@ -162,7 +161,11 @@ class PhotoScenes:
             )
         if self.recording.show in (Show.SURFACE, Show.BOTH):
             meshes += self._material(self.recording.surface(number), self._distance(time, bodies))
-        elif self.recording.show is Show.PARTICLES and self._wrapped:
+        elif (
+            self.recording.show is Show.PARTICLES
+            and self._wrapped
+            and isinstance(self._scene, ParticleScene)
+        ):
             meshes += self._material(
                 particle_surface(self._scene, self.recording.particles(number)),
                 self._distance(time, bodies),
@@ -269,7 +272,7 @@ class PhotoScenes:
         )
 
 
-def particle_surface(scene: Any, particles: Points) -> Surface:
+def particle_surface(scene: ParticleScene, particles: Points) -> Surface:
     """Return the surface around a liquid's particles, as with `output.surface`.
 
     With the velocity of the nearest particle.
@@ -382,14 +385,14 @@ def grain_colors(seeds: np.ndarray) -> np.ndarray:
     return np.clip(SANDS[kind] * shade[:, None], 0.0, 0.9)
 
 
-def liquid_absorption(scene: Any) -> np.ndarray:
+def liquid_absorption(scene: Scene) -> np.ndarray:
     """Return a liquid's absorption [1/m]: that of water, or of syrup if viscous."""
     viscosity = getattr(scene, "viscosity", None)
     kind = "syrup" if viscosity is not None and viscosity.value >= SYRUP else "water"
     return ABSORPTION[kind] / max(scene.domain.size)
 
 
-def liquid_beads(scene: Any) -> np.ndarray:
+def liquid_beads(scene: Scene) -> np.ndarray:
     """Return the reflectance of a liquid's particles drawn as beads."""
     return np.exp(-liquid_absorption(scene) * max(scene.domain.size))
 
@@ -400,7 +403,7 @@ def linear_color(text: str) -> np.ndarray:
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
-def _halfspaces(solid: Any, pose: Pose) -> np.ndarray | None:
+def _halfspaces(solid: Solid, pose: Pose) -> np.ndarray | None:
     """Return a box or a half-space as rows (n, d) of n x + d <= 0.
 
     None for other shapes.
