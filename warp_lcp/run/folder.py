@@ -155,8 +155,6 @@ class RunFolder:
         SceneError: a mesh file of the scene cannot be read.
     """
 
-    keeps = True  # whether files are written
-
     def __init__(self, path: Path, scene: Scene, collective: Collective | None = None) -> None:
         """Inspect a folder, which need not exist; nothing is written yet."""
         self.path, self.scene, self.log = path, scene, path / "log.csv"

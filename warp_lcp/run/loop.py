@@ -21,7 +21,6 @@ from warp_lcp.run.devices import Engine
 from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.run.interruption import Interrupted
 from warp_lcp.run.log import Log, Value
-from warp_lcp.run.no_folder import NoFolder
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer, missed, residual_of
@@ -148,28 +147,17 @@ def running_scene(
         output_notes = check_output(scene) if request.out is not None else []
         if not request.force_memory:
             check_memory(scene, request.device, share=share)
-    folder: RunFolder = (
-        NoFolder(scene) if request.out is None else RunFolder(request.out, scene, collective)
-    )
+    folder = None if request.out is None else RunFolder(request.out, scene, collective)
+    if folder is None and request.resume:
+        raise OutputError("resume: a run without a folder has no checkpoints")
     record = RunRecord(
         scene.scene.name, scene.scene.simulator, request.device, overrides=list(request.overrides)
     )
     if collective is not None:
         record.engine, record.ranks = Engine.PETSC.value, collective.ranks.size
-    with folder.held(resume=request.resume) as remarks:
-        record.warnings, record.mesh_files = [*remarks, *output_notes], folder.mesh_files
-        continued: Continuation | None = None
-        if request.resume:
-            continued = folder.resume()
-            record.overrides = record.overrides or read_record(folder.path).get("overrides", [])
-            record.warnings += continued.remarks
-            record.changed, record.resampled_from_resolution = (
-                continued.changed,
-                continued.resampled_from,
-            )
-            record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
-        else:
-            folder.check_new(force=request.force)
+    with folder.held(resume=request.resume) if folder else nullcontext(list[str]()) as remarks:
+        record.warnings = [*remarks, *output_notes]
+        continued = _open(folder, request, record) if folder else None
         with everyone.together():
             simulation, notes = _simulation(request, folder, collective, continued)
         record.warnings += notes
@@ -178,7 +166,7 @@ def running_scene(
         for change in record.changed:
             observer.note(f"changed: {change}")
         checkpoint = continued.checkpoint if continued else None
-        run = RunLoop(simulation, folder, record, observer, profile)
+        run = RunLoop(simulation, scene, folder, record, observer, profile, everyone)
         with profile.kernels_apart() if profile else nullcontext():
             yield run
             return (
@@ -186,9 +174,23 @@ def running_scene(
             )
 
 
+def _open(folder: RunFolder, request: RunRequest, record: RunRecord) -> Continuation | None:
+    """Check that a run can use its folder; return what a resumed run continues from."""
+    record.mesh_files = folder.mesh_files
+    if not request.resume:
+        folder.check_new(force=request.force)
+        return None
+    continued = folder.resume()
+    record.overrides = record.overrides or read_record(folder.path).get("overrides", [])
+    record.warnings += continued.remarks
+    record.changed, record.resampled_from_resolution = continued.changed, continued.resampled_from
+    record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
+    return continued
+
+
 def _simulation(
     request: RunRequest,
-    folder: RunFolder,
+    folder: RunFolder | None,
     collective: Collective | None,
     continued: Continuation | None,
 ) -> tuple[Simulation, list[str]]:
@@ -199,7 +201,7 @@ def _simulation(
     scene, notes = request.scene, list[str]()
     simulation = start(scene, request.device, collective.ranks if collective else None)
     try:
-        if continued and continued.checkpoint:
+        if folder and continued and continued.checkpoint:
             notes = _go_on(simulation, folder, continued, on_ranks=collective is not None)
     except ValueError as error:
         raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error
@@ -266,22 +268,25 @@ class RunLoop:
 
     Args:
         simulation: the simulation at the start of the run.
-        folder: folder for the output, with the scene.
+        scene: the scene of the run.
+        folder: folder for the output; None: no files are written.
         record: record of the run.
         observer: observer of every step.
         profile: timer of the stages.
+        collective: collective operations of the ranks that share the run.
     """
 
     def __init__(
         self,
         simulation: Simulation,
-        folder: RunFolder,
+        scene: Scene,
+        folder: RunFolder | None,
         record: RunRecord,
         observer: Observer,
         profile: Profile | None,
+        collective: Collective,
     ) -> None:
         """Store the simulation and the settings; nothing is written yet."""
-        scene = folder.scene
         self.time = scene.time
         self.output = scene.output
         self.simulation = simulation
@@ -289,12 +294,13 @@ class RunLoop:
         self.record = record
         self.observer = observer
         self.profile = profile
+        self.collective = collective
         self.watch: Stopwatch = profile or NoStopwatch()
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
-        self.writer = folder.frame_writer(self.watch)
+        self.writer = folder.frame_writer(self.watch) if folder else None
         # Facts that one process knows hold for the run if they do on any rank.
-        self._somewhere = folder.collective.ranks.any
+        self._somewhere = collective.ranks.any
         # Surfaces of bodies are part of every frame.
         self._has_bodies = any(solid.is_body for solid in scene.solid)
         self._begun = clock.perf_counter()
@@ -305,7 +311,8 @@ class RunLoop:
         # Residuals of solves that missed their tolerance, and their steps.
         self._missed: list[tuple[float, int]] = []
         self._tolerance = scene.solver.tolerance
-        self._tables: dict[str, Log] = {}  # tables besides the log
+        # Open files with a row per step, by name: the log and other tables; none without a folder.
+        self._logs: dict[str, Log] = {}
         self._checkpointed: int | None = None  # step of the newest checkpoint
         self._checkpoint_time = clock.monotonic()
 
@@ -319,26 +326,31 @@ class RunLoop:
         self._check_space(last, start)
         try:
             # Errors caught here were raised on all ranks.
-            with self.folder.collective.together(), ExitStack() as stack:
-                stack.enter_context(self.writer)
-                log = stack.enter_context(
-                    closing(self._resume(last, start) if resumed else self._start(last, start))
-                )
-                self._open_tables(stack, self._first_step if resumed else None)
+            with self.collective.together(), ExitStack() as stack:
+                if self.writer:
+                    stack.enter_context(self.writer)
+                stack.callback(self._logs.clear)
+                if resumed:
+                    self._resume(stack, last, start)
+                else:
+                    self._start(stack, last, start)
+                for name, columns in self._table_columns().items():
+                    self._open_log(stack, name, columns, self._first_step if resumed else None)
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 try:
-                    stopped = yield from self._advance(log, last, stop, resumed=resumed)
+                    stopped = yield from self._advance(last, stop, resumed=resumed)
                 except GeneratorExit:
                     # No more frames are requested; the state is that of the last one.
                     stopped = f"stopped by the program after frame {self._frames_done()}"
-                self._write_checkpoint(log)
+                self._write_checkpoint()
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = stopped or f"frame {last} of {count} reached"
         except Interrupted as error:  # the checkpoint before the first step exists
             self.record.status, self.record.reason = "stopped", f"interrupted by {error} {BEFORE}"
         except (StepFailed, SimulationFailed) as error:
             self._fail(str(error))
-            self._try_to(self.writer.flush)
+            if self.writer:
+                self._try_to(self.writer.flush)
             if isinstance(error, StepFailed):  # the state is that before the step
                 self._try_to(self._write_checkpoint)
         except OSError as error:
@@ -354,13 +366,13 @@ class RunLoop:
                 self._fail("the program ended unexpectedly")
             self._tell_missed()
             self._try_to(self._write_record)
-            if self.profile:
-                self._try_to(self._write_profile)
+            if self.profile and self.folder:
+                self._try_to(partial(self._write_profile, self.profile, self.folder))
         return self.record
 
     def _check_space(self, last: int, frame: list[Part]) -> None:
         """Raise an error if the output of the remaining frames does not fit."""
-        if not self.folder.keeps:
+        if self.folder is None:
             return
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
@@ -371,50 +383,45 @@ class RunLoop:
         )
         self.folder.check_space(int(SPACE_MARGIN * (each * frames + states * state)))
 
-    def _start(self, last: int, frame: list[Part]) -> Log:
-        """Write the output before the first step."""
-        self.folder.start(self.record)
-        with ExitStack() as stack:
-            log = stack.enter_context(closing(self.folder.open_log(self._columns())))
-            self._write_frame(0, last, frame)
-            self._write_checkpoint(log)  # so that a run can always be continued
-            stack.pop_all()
-        return log
+    def _start(self, stack: ExitStack, last: int, frame: list[Part]) -> None:
+        """Write the output before the first step; a stack closes the log."""
+        if self.folder:
+            self.folder.start(self.record)
+        self._open_log(stack, "log", self._columns())
+        self._write_frame(0, last, frame)
+        self._write_checkpoint()  # so that a run can always be continued
 
-    def _resume(self, last: int, frame: list[Part]) -> Log:
+    def _resume(self, stack: ExitStack, last: int, frame: list[Part]) -> None:
         """Remove output after the checkpoint, and report missing output before it.
 
         A run that failed between a step and the frame at its end, for instance in a callback, lacks
-        that frame: the checkpoint has its time, so it is written now.
+        that frame: the checkpoint has its time, so it is written now. A stack closes the log.
         """
+        folder = cast(RunFolder, self.folder)  # from which the run is resumed
         self.record.frames = done = self._frames_done()
         self._first_step = self.simulation.step_count
         self._count()
         times = [self.time.frame_time(index) for index in range(done + 1)]
-        self._owes = self._is_frame_time(done) and done <= last and self.folder.lacks(done, frame)
+        self._owes = self._is_frame_time(done) and done <= last and folder.lacks(done, frame)
         if self._owes:
             times.pop()
-        for gap in self.folder.gaps(
+        for gap in folder.gaps(
             {"log": self._columns(), **self._table_columns()}, self._first_step, times, frame
         ):
             self._warn(gap)
-        self.folder.go_on(self.record, self._first_step)
-        self.folder.frames.resume(times)
-        with ExitStack() as stack:
-            log = stack.enter_context(
-                closing(self.folder.open_log(self._columns(), after_step=self._first_step))
-            )
-            if self._owes:
-                self._write_frame(done, last, frame)
-            stack.pop_all()
-        return log
+        folder.go_on(self.record, self._first_step)
+        folder.frames.resume(times)
+        self._open_log(stack, "log", self._columns(), self._first_step)
+        if self._owes:
+            self._write_frame(done, last, frame)
 
-    def _open_tables(self, stack: ExitStack, after_step: int | None) -> None:
-        """Open the tables beside the log; a stack closes them."""
-        for name, columns in self._table_columns().items():
-            self._tables[name] = stack.enter_context(
-                closing(self.folder.open_log(columns, after_step=after_step, table=name))
-            )
+    def _open_log(
+        self, stack: ExitStack, name: str, columns: tuple[str, ...], after_step: int | None = None
+    ) -> None:
+        """Open the log or another table, which a stack closes."""
+        if self.folder:
+            log = self.folder.open_log(columns, after_step=after_step, table=name)
+            self._logs[name] = stack.enter_context(closing(log))
 
     def _table_columns(self) -> Mapping[str, tuple[str, ...]]:
         return self.simulation.tables() if isinstance(self.simulation, Measured) else {}
@@ -423,7 +430,7 @@ class RunLoop:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
 
     def _advance(
-        self, log: Log, last: int, stop: Callable[[], bool | str], *, resumed: bool
+        self, last: int, stop: Callable[[], bool | str], *, resumed: bool
     ) -> Generator[RunLoop, None, str]:
         """Step until the last frame is written; return the reason of an early stop.
 
@@ -435,37 +442,39 @@ class RunLoop:
         while frame <= last:
             row = self._step(self.time.frame_time(frame))
             done = self._frames_done() >= frame
-            with self._keeping_step(log):
-                log.append(row)
-                for name, table in self._tables.items():
-                    table.append(cast(Measured, self.simulation).measured[name])
+            with self._keeping_step():
+                for name, log in self._logs.items():
+                    log.append(
+                        row if name == "log" else cast(Measured, self.simulation).measured[name]
+                    )
                 self.observer.step(row)
                 if missed(row):
                     self._missed.append((residual_of(row) or 0.0, self.simulation.step_count))
-                self.writer.check()
+                if self.writer:
+                    self.writer.check()
                 if done:
                     self._write_frame(frame, last, self._frame())
             if done:
                 yield self
                 frame += 1
             if self._checkpoint_is_due():
-                self._write_checkpoint(log, beside=True)
+                self._write_checkpoint(beside=True)
             asked = stop()
             if self._somewhere(bool(asked)) and frame <= last:
                 return self._interrupted(asked)
         return ""
 
     @contextmanager
-    def _keeping_step(self, log: Log) -> Iterator[None]:
+    def _keeping_step(self) -> Iterator[None]:
         """Context after a step: on an error on any rank, write a checkpoint.
 
         It is written if the disk allows.
         """
         try:
-            with self.folder.collective.together():
+            with self.collective.together():
                 yield
         except (Exception, KeyboardInterrupt) as error:  # raised again below
-            self._try_to(partial(self._write_checkpoint, log))
+            self._try_to(self._write_checkpoint)
             if isinstance(error, KeyboardInterrupt):
                 self.record.status, self.record.reason = (
                     "stopped",
@@ -475,9 +484,7 @@ class RunLoop:
 
     def _interrupted(self, asked: bool | str) -> str:
         """Return the stop request of any rank."""
-        names = [
-            name if isinstance(name, str) else "" for name in self.folder.collective.exchange(asked)
-        ]
+        names = [name if isinstance(name, str) else "" for name in self.collective.exchange(asked)]
         rank = next((rank for rank, name in enumerate(names) if name), 0)
         return (
             f"interrupted by {names[rank]}{f' on rank {rank}' if rank else ''}"
@@ -530,7 +537,7 @@ class RunLoop:
     def _frame(self) -> list[Part]:
         """Return the parts of a frame that the scene requests."""
         output = self.output
-        if not self.folder.keeps or not (
+        if self.folder is None or not (
             output.particles or output.grid or output.surface or output.volume or self._has_bodies
         ):
             return []
@@ -539,8 +546,11 @@ class RunLoop:
             return [part for part in self.simulation.frame() if wanted[type(part)]]
 
     def _write_frame(self, index: int, last: int, frame: list[Part]) -> None:
-        with self.watch.stage("frames"):
-            self.writer.put(index, self.time.frame_time(index), frame)
+        if self.writer:
+            with self.watch.stage("frames"):
+                self.writer.put(index, self.time.frame_time(index), frame)
+        else:
+            self.record.frames = index
         self.observer.frame(index, last)
 
     def _checkpoint_is_due(self) -> bool:
@@ -551,56 +561,55 @@ class RunLoop:
             clock.monotonic() - self._checkpoint_time >= 60.0 * minutes
         )
 
-    def _write_checkpoint(self, log: Log | None = None, *, beside: bool = False) -> None:
+    def _write_checkpoint(self, *, beside: bool = False) -> None:
         """Write a checkpoint unless there is one of this step.
 
         All output that a resumed run expects is written to disk before.
 
         Args:
-            log: log of the run.
             beside: write while the run continues.
         """
         step = self.simulation.step_count
-        if self._checkpointed == step or not self.folder.keeps:
+        if self._checkpointed == step or self.folder is None or self.writer is None:
             return
+        store = partial(self._store, self.folder)
         files: list[Path] = []
         with self.watch.stage("checkpoints"):
-            if log:
-                for file in (log, *self._tables.values()):
-                    file.sync()
+            for log in self._logs.values():
+                log.sync()
             if beside and isinstance(self.writer, FrameWriter):  # ranks write together
                 state = {name: np.array(array) for name, array in self.simulation.state().items()}
                 self.writer.then(
                     "checkpoints, written",
-                    partial(self._store, Checkpoint(step, self.simulation.time, state)),
+                    partial(store, Checkpoint(step, self.simulation.time, state)),
                 )
             else:
                 self.writer.flush()
-                files = self._store(Checkpoint(step, self.simulation.time, self.simulation.state()))
+                files = store(Checkpoint(step, self.simulation.time, self.simulation.state()))
         self.watch.wrote("checkpoints", *files)
         self._checkpointed, self._checkpoint_time = step, clock.monotonic()
 
-    def _store(self, checkpoint: Checkpoint) -> list[Path]:
-        file = self.folder.checkpoints.write(checkpoint)
-        self.folder.checkpoints.prune(self.output.checkpoints_kept)
+    def _store(self, folder: RunFolder, checkpoint: Checkpoint) -> list[Path]:
+        file = folder.checkpoints.write(checkpoint)
+        folder.checkpoints.prune(self.output.checkpoints_kept)
         return [file]
 
-    def _write_profile(self) -> None:
-        assert self.profile is not None
-        self.profile.write(
-            self.folder.path, self.simulation.step_count - self._first_step, self.record.seconds
+    def _write_profile(self, profile: Profile, folder: RunFolder) -> None:
+        profile.write(
+            folder.path, self.simulation.step_count - self._first_step, self.record.seconds
         )
 
     def _count(self) -> None:
         """Update the record."""
-        if self.writer.newest is not None:
+        if self.writer and self.writer.newest is not None:
             self.record.frames = self.writer.newest
         self.record.steps, self.record.time = self.simulation.step_count, self.simulation.time
         self.record.seconds = round(clock.perf_counter() - self._begun, 3)
 
     def _write_record(self) -> None:
         self._count()
-        self.folder.write_record(self.record)
+        if self.folder:
+            self.folder.write_record(self.record)
 
     def _tell_missed(self) -> None:
         """Warn about steps of this run whose solve missed its tolerance."""
