@@ -243,7 +243,7 @@ def count(
     slabs, lines, chunks = layout.threads(rows)
     dim = (slabs * lines * chunks,) if form.quads else (slabs, lines, chunks)
     bounds = struct.pack(f"<{len(dim)}I4xQQ", *dim, math.prod(dim), 1)
-    parameters = bounds + bytes(rows.__ctype__()) + one.bound.arguments
+    parameters = bounds + bytes(layout.native_of(rows)) + one.bound.arguments
     # Threads of a row within the second slab.
     first = (min(1, slabs - 1) * lines + lines // 2) * chunks
     taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[

@@ -24,6 +24,7 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
 from warp_lcp.benchmarks.problems import Splash, basin
 from warp_lcp.kernels import Rows, StencilKernel
+from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.kernels.types import DeviceArray
 
@@ -227,7 +228,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         rows: Rows,
         *structs: Any,
         stencil: Any = None,
-        bounds: list[Any] | None = None,
+        bounds: BoundOperands | None = None,
         **given: Any,
     ) -> BoundKernel:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)

@@ -11,10 +11,11 @@ import warp as wp
 
 from warp_lcp.default import solve, solve_by_attempts
 from warp_lcp.kernels.fields import Array, real_array
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.operators.restated import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
+from warp_lcp.problem.data_types import BoundValues, Matrix, Values
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
@@ -44,7 +45,7 @@ WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # names of the criteria he
 
 
 def linear_complementarity(
-    A: Any,
+    A: Matrix,
     b: Array,
     *,
     bounds: Any = None,
@@ -182,9 +183,11 @@ class _Fields:
     def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
         self.given, self._shape = b.shape, shape
 
-    def load(self, values: Any, name: str) -> Any:
+    def load(
+        self, values: BoundValues, name: str
+    ) -> np.ndarray | AffineBounds | DeviceArray | float:
         """Return an array in the operator's shape if it has b's shape, else unchanged."""
-        if np.ndim(values) == 0 or isinstance(values, (AffineBounds, wp.array)):
+        if isinstance(values, (AffineBounds, wp.array)) or np.ndim(values) == 0:
             return values
         host = real_array(values, name)
         if host.shape == self.given and host.size == int(np.prod(self._shape)):
@@ -193,9 +196,9 @@ class _Fields:
             raise ValueError(f"{name} has shape {host.shape}: expected {self.given}")
         return host
 
-    def unload(self, field: DeviceArray, dtype: Any = np.float64) -> np.ndarray:
+    def unload(self, field: DeviceArray, dtype: DataType = np.float64) -> np.ndarray:
         """Return a field in b's shape if the sizes agree, else in its own shape."""
-        host = np.array(field.numpy(), dtype=dtype)
+        host: np.ndarray = np.array(field.numpy(), dtype=dtype)
         return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
 
 
@@ -261,7 +264,7 @@ def _is_pair(one: Any) -> bool:
     )
 
 
-def _bound(values: Any, name: str, wrong: float) -> Any:
+def _bound(values: Values, name: str, wrong: float) -> Any:
     """Return a bound in which magnitudes of 1e20 and more are infinite.
 
     Raises:

@@ -13,6 +13,7 @@ import scipy.sparse
 from warp_lcp.kernels.fields import real_array
 from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
 from warp_lcp.problem.bounds import huge_as_infinite
+from warp_lcp.problem.data_types import Matrix, Values, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.program_optimality import (
     ProgramPoint,
@@ -288,9 +289,9 @@ def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
     return QuadraticProgramData(P, q, lower, upper, G, h, C, d), bounding
 
 
-def _entries(M: Any) -> int:
+def _entries(M: Matrix) -> int:
     """Return the number of nonzero entries of a matrix."""
-    return int(M.nnz if scipy.sparse.issparse(M) else np.count_nonzero(M))
+    return int(M.nnz if is_sparse(M) else np.count_nonzero(np.asarray(M)))
 
 
 def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
@@ -325,7 +326,7 @@ def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarra
 
 
 def _rows(
-    matrix: Any, right: Any, name: str, name_of_right: str, n: int
+    matrix: Matrix, right: Any, name: str, name_of_right: str, n: int
 ) -> tuple[Any, np.ndarray | None]:
     """Return a constraint's matrix and right-hand side, None if it does not exist."""
     if matrix is None or right is None:
@@ -338,7 +339,7 @@ def _rows(
     return M, _vector(right, name_of_right, M.shape[0])
 
 
-def _matrix(values: Any, name: str) -> Any:
+def _matrix(values: Values, name: str) -> Any:
     """Return a sparse or dense matrix of float64."""
     if scipy.sparse.issparse(values):
         return scipy.sparse.csr_array(values, dtype=np.float64)
@@ -348,7 +349,7 @@ def _matrix(values: Any, name: str) -> Any:
     return host
 
 
-def _vector(values: Any, name: str, n: int) -> np.ndarray:
+def _vector(values: Values, name: str, n: int) -> np.ndarray:
     host = real_array(values, name).astype(np.float64).ravel()
     if host.shape != (n,) or np.isnan(host).any():
         raise ValueError(
@@ -358,7 +359,7 @@ def _vector(values: Any, name: str, n: int) -> np.ndarray:
     return host
 
 
-def _check_convex(P: Any, q: np.ndarray) -> None:
+def _check_convex(P: Matrix, q: np.ndarray) -> None:
     """Raise ValueError unless the program is convex.
 
     Only then do the first-order conditions hold at minimizers alone.

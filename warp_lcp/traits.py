@@ -17,7 +17,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
+from warp_lcp.problem.protocol import HasRows, HasStencil, declared, has, layout_of, takes
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced.host_system import suits
@@ -205,19 +205,15 @@ class Traits:
         It must accept the operator, its size and the bounds.
         """
         method, problem = METHODS[name], self._problem
+        own = declared(method)
         if name == "quadratic-program" and not (self.symmetric and has_piqp()):
             return False
-        if not takes(method, problem.A) or self.unknowns > getattr(
-            method, "most_unknowns", self.unknowns
-        ):
+        if not takes(method, problem.A) or self.unknowns > (own.most_unknowns or self.unknowns):
             return False
-        abilities = {
-            "preconditioned": problem.preconditioner is not None,
-            "affine_bounds": self.affine,
-            "distributed": self.ranks,
-        }
-        return all(
-            getattr(method, ability, False) for ability, needed in abilities.items() if needed
+        return (
+            (own.preconditioned or problem.preconditioner is None)
+            and (own.affine_bounds or not self.affine)
+            and (own.distributed or not self.ranks)
         )
 
     @property

@@ -6,7 +6,7 @@ On bimatrix games it starts as Lemke and Howson's method.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy.linalg
@@ -18,6 +18,7 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.banded_matrix import BandedFactors
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
+from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
@@ -55,10 +56,10 @@ class LemkeForm:
         pairs: which rows are s = u - l - z, indices.
     """
 
-    M: Any
+    M: Matrix
     q: np.ndarray
     base: np.ndarray
-    map: Any
+    map: Matrix
     pairs: np.ndarray
 
     @classmethod
@@ -255,7 +256,7 @@ class Basis:
         self.inverse: np.ndarray = np.asfortranarray(np.eye(m))
         self.age = 0
 
-    def _start(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
+    def _start(self, M: Matrix, q: np.ndarray, d: np.ndarray) -> None:
         """Set M, q and d; w is basic."""
         m = len(q)
         self.M, self.q, self.d, self.m = M, q, d, m
@@ -386,7 +387,7 @@ class BandedBasis(Basis):
     The variables are in the order of their pairs.
     """
 
-    def __init__(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
+    def __init__(self, M: Matrix, q: np.ndarray, d: np.ndarray) -> None:
         self._start(M, q, d)
         self.factors = BandedFactors(M, d)
         # The pair both of whose variables are nonbasic, once z0 is basic.
