@@ -14,8 +14,9 @@ from warp_lcp.kernels.fields import Array
 from warp_lcp.operators.restated import RestatedProblem, renumbered
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import declared
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve import EPS, Solver, VariationalInequality, Workspace
+from warp_lcp.problem.solve import Solver, VariationalInequality, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, criteria, recommend

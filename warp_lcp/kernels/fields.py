@@ -272,7 +272,9 @@ class Layout:
 
     def host_zeros(self, dtype: DataType) -> np.ndarray:
         """Return zeros of the stored shape on the host."""
-        return zeros(self.size, dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        return np.asarray(
+            zeros(self.size, dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        )
 
     def copy(self, to: DeviceArray, source: DeviceArray) -> None:
         """Copy a stored field to another one of its type."""
@@ -393,7 +395,9 @@ class PaddedLayout(Layout):
 
     def host_zeros(self, dtype: DataType) -> np.ndarray:
         """Return zeros of the stored shape on the host."""
-        return self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        return np.asarray(
+            self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        )
 
     def copy(self, to: DeviceArray, source: DeviceArray) -> None:
         """Copy the part in use of a stored field to another one of its type.

@@ -21,8 +21,6 @@ from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
 from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
 
 if TYPE_CHECKING:
-    from ctypes import _CField as CField
-
     from warp_lcp.kernels.memory import RowsMemory
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
@@ -197,8 +195,8 @@ def native_of(struct: StructInstance | DeviceArray) -> ctypes.Structure:
 
 def offset_of(native: type[ctypes.Structure], name: str) -> int:
     """Return where a member of a struct begins, in bytes."""
-    descriptor: CField = vars(native)[name]
-    return descriptor.offset
+    offset: int = vars(native)[name].offset
+    return offset
 
 
 def _member(value: KernelValue) -> "KernelValue | ctypes.Structure":

@@ -12,6 +12,16 @@ if TYPE_CHECKING:
 else:
     StructInstance = object  # Warp does not export the class of its structs
 
+__all__ = [
+    "DataFrame",
+    "DataType",
+    "DeviceArray",
+    "Dimensions",
+    "FieldType",
+    "StructInstance",
+    "Values",
+]
+
 DeviceArray: TypeAlias = wp.array[Any]
 """Warp array of any dtype and dimension, in the memory of the CPU or of a CUDA device.
 

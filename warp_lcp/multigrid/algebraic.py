@@ -449,7 +449,7 @@ def _places(A: Matrix, pattern: Matrix) -> np.ndarray:
         return np.arange(A.nnz)
     n = np.int64(A.shape[0])
     keys = [np.repeat(np.arange(n), np.diff(m.indptr)) * n + m.indices for m in (A, pattern)]
-    return np.searchsorted(keys[1], keys[0])
+    return np.asarray(np.searchsorted(keys[1], keys[0]))
 
 
 def _ones(matrix: Matrix) -> Matrix:

@@ -100,7 +100,10 @@ class LineLevel:
         self.padding, self.device, self.visits, n = padding, device, visits, padding.size
         self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
         self.factors = 2 if padding.counts[2] > SHORT else 1, 2 if padding.counts[1] > SHORT else 1
-        make = lambda count: zeros(count * n, real, device)  # noqa: E731
+
+        def make(count: int) -> DeviceArray:
+            return zeros(count * n, real, device)
+
         self.weights, self.shares = make(8), make(4)
         self.restricts = self.shares if symmetric else make(4)
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))

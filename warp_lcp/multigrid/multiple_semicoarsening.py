@@ -162,7 +162,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
 
 def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return how much the ratios of rows of weights differ, as a logarithm."""
-    return np.ptp(logs - other, axis=1)
+    return np.asarray(np.ptp(logs - other, axis=1))
 
 
 def _long(stencil: PaddedStencil) -> list[int]:
@@ -199,7 +199,9 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     counts = np.count_nonzero(faces, axis=2)
     # Blocks with few open faces are not representative.
     counted = (2 * counts >= sides[1])[:, long].all(axis=1)
-    return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
+    return np.asarray(
+        (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
+    )
 
 
 def _gathered(weights: DeviceArray, order: DeviceArray) -> np.ndarray:
@@ -207,4 +209,4 @@ def _gathered(weights: DeviceArray, order: DeviceArray) -> np.ndarray:
     GATHER.bind(
         Rows.flat(order.size, order.device), source=weights, order=order, taken=taken
     ).launch()
-    return taken.numpy().astype(np.float64)
+    return np.asarray(taken.numpy().astype(np.float64))

@@ -478,7 +478,7 @@ def _roots(parent: np.ndarray) -> np.ndarray:
     roots = parent[parent]
     while not np.array_equal(roots, roots[roots]):
         roots = roots[roots]
-    return roots
+    return np.asarray(roots)
 
 
 def numbered_components(
@@ -563,4 +563,4 @@ def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
         v[1:] = scipy.sparse.linalg.splu(exact[1:, 1:].tocsc()).solve(
             -exact[1:, [0]].toarray().ravel()
         )
-    return v / v.mean()
+    return np.asarray(v / v.mean())

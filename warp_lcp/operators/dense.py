@@ -121,7 +121,7 @@ class DenseOperator(Pickled):
 
     def host_diagonal(self) -> np.ndarray:
         """Return the diagonal of A on the host, shape (n,)."""
-        return self.matrix.numpy().diagonal()
+        return np.asarray(self.matrix.numpy().diagonal())
 
     def rows(self) -> CompressedRows:
         """Return the rows, in the operator's own memory."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -25,6 +26,7 @@ from warp_lcp.problem.pickling import Pickled, Reduced, made_again
 from warp_lcp.problem.protocol import Operator, layout_of
 
 
+@no_type_check
 @forward_kernel(module="warp_lcp.low_rank")
 def weigh_kernel(
     weights: wp.array2d(dtype=wp.float64),

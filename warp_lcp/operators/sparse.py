@@ -484,7 +484,7 @@ def greedy_colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
     taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
     color = wp.zeros(pattern.shape[0], dtype=wp.int32, device="cpu")
     wp.launch(color_kernel, 1, [*inputs, taken, color, color.size], device="cpu")
-    return color.numpy()
+    return np.asarray(color.numpy())
 
 
 def _checked(matrix: Matrix) -> scipy.sparse.csr_array:

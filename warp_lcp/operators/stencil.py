@@ -546,7 +546,7 @@ class Stencil(GridOperator):
         rounding = 8 * float(np.finfo(wp.dtype_to_numpy(self.dtype)).eps)
         center = np.abs(self._number) if self._center is None else np.abs(self._center.numpy())
         size = np.maximum(self.stencil.d.numpy(), center)  # closed sides cancel some of it
-        return inside & (np.abs(sums.numpy()) <= rounding * size)
+        return np.asarray(inside & (np.abs(sums.numpy()) <= rounding * size))
 
     def __reduce__(self) -> Reduced:
         """Pickle cells and coefficients; Warp functions are pickled as arrays."""

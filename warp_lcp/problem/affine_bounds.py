@@ -231,10 +231,12 @@ class AffineFields:
     def _host(self, side: int, x: np.ndarray) -> np.ndarray:
         index, coefficient = self.index[side].numpy(), self.coefficient[side].numpy()
         with np.errstate(invalid="ignore"):
-            return np.where(
-                index >= 0,
-                self.constant[side].numpy() + coefficient * x[index],
-                self.constant[side].numpy(),
+            return np.asarray(
+                np.where(
+                    index >= 0,
+                    self.constant[side].numpy() + coefficient * x[index],
+                    self.constant[side].numpy(),
+                )
             )
 
 

@@ -253,7 +253,7 @@ class Bounds:
         It is the caller's memory if there is a field on the CPU.
         """
         if self.fields[side].size:
-            return self.fields[side].numpy()
+            return np.asarray(self.fields[side].numpy())
         field = np.full(self.layout.size, self.values[side])
         if self.code.size and not self.in_place:
             field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]

@@ -386,7 +386,7 @@ def _factored(Q: Matrix, B: Matrix) -> Callable[[np.ndarray], np.ndarray] | None
 
 def _gradient(p: ProgramWithRows, point: ProgramPoint) -> np.ndarray:
     """Return Q x + c - G' z - C' y."""
-    return p.Q @ point.x + p.c - p.G.T @ point.z - p.C.T @ point.y
+    return np.asarray(p.Q @ point.x + p.c - p.G.T @ point.z - p.C.T @ point.y)
 
 
 def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float:

@@ -365,7 +365,6 @@ class Declarations:
     """Class attributes by which a method says what it does; those that it lacks have defaults.
 
     Attributes:
-        name: of the method; empty: the words of its class.
         form: of A that it works on, for messages.
         problems: class of problems that it solves; None: LCP.
         supports: capabilities of an operator of which it needs one; empty: products suffice.
@@ -377,7 +376,6 @@ class Declarations:
         most_unknowns: largest number of unknowns; None: any.
     """
 
-    name: str = ""
     form: str = ""
     problems: type | None = None
     supports: tuple[type[Operator], ...] = ()
@@ -389,16 +387,7 @@ class Declarations:
     most_unknowns: int | None = None
 
 
-class NamedMethod:
-    """Base of methods whose name depends on their settings."""
-
-    @property
-    def name(self) -> str:
-        """Name of the method."""
-        raise NotImplementedError
-
-
-class Chain(NamedMethod):
+class Chain:
     """Base of methods that hand over to others; a chain declares what its first method does."""
 
     @property
@@ -417,12 +406,11 @@ def declared(method: Solver | type) -> Declarations:
 @cache
 def _declared_by(kind: type) -> Declarations:
     def of(name: str, usual: Declaration) -> Declaration:
-        value: Declaration | property = getattr(kind, name, usual)
-        return usual if isinstance(value, property) else value
+        value: Declaration = getattr(kind, name, usual)
+        return value
 
     own = Declarations()
     return Declarations(
-        name=of("name", own.name),
         form=of("form", own.form),
         problems=of("problems", own.problems),
         supports=of("supports", own.supports),

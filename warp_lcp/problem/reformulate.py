@@ -94,7 +94,7 @@ class BoxVariationalInequality:
 
     def project(self, x: Vector) -> Vector:
         """Return the projection of x onto K."""
-        return np.clip(x, self.lower, self.upper)
+        return np.asarray(np.clip(x, self.lower, self.upper))
 
     def gap(self, x: Vector) -> float:
         """Return the gap function max over z in K of F(x)'(x - z).
@@ -135,7 +135,7 @@ class ProximalFixedPoint:
 
     def __call__(self, x: Vector) -> Vector:
         """Return prox_K(x - R F(x)); x is a solution where it returns x."""
-        return np.clip(x - self.r * self.F(x), self.lower, self.upper)
+        return np.asarray(np.clip(x - self.r * self.F(x), self.lower, self.upper))
 
 
 def linear_equations_to_boxed(

@@ -36,7 +36,6 @@ from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.merits import Merits, merits_at
 from warp_lcp.problem.protocol import (
-    NamedMethod,
     NamesComponents,
     Scratch,
     asks_beyond_storage,
@@ -70,12 +69,14 @@ class Precision(StrEnum):
     @property
     def iterate(self) -> DataType:
         """Warp's type of the iterate."""
-        return wp.float32 if self is Precision.SINGLE else wp.float64
+        kind: DataType = wp.float32 if self is Precision.SINGLE else wp.float64
+        return kind
 
     @property
     def correction(self) -> DataType:
         """Warp's type of corrections."""
-        return wp.float64 if self is Precision.DOUBLE else wp.float32
+        kind: DataType = wp.float64 if self is Precision.DOUBLE else wp.float32
+        return kind
 
     @property
     def epsilon(self) -> float:
@@ -323,9 +324,8 @@ def method_name(method: Solver) -> str:
 
     Its `name` if it has one, else the words of its class, joined by hyphens.
     """
-    if isinstance(method, NamedMethod):
-        return method.name
-    return declared(method).name or _name_of_class(type(method).__name__)
+    name: str | None = getattr(method, "name", None)  # of the class, or of an instance
+    return name or _name_of_class(type(method).__name__)
 
 
 class Spare(Protocol):
@@ -476,7 +476,8 @@ def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
             "workspace was made for another problem; it fits only the problem that it was made "
             "for, changed in place or not"
         )
-    return work
+    checked: Workspace = work
+    return checked
 
 
 @cache

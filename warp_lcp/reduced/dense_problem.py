@@ -20,9 +20,10 @@ from warp_lcp.problem.data_types import Matrix, SparseMatrix, is_sparse
 from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, has
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.problem.solve import EPS, Precision, Step, WorkspaceBase
+from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 
 # Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.
 SEMIDEFINITE = 1e-10
@@ -92,7 +93,7 @@ class DenseProblem:
 
     def affine(self, x: np.ndarray) -> np.ndarray:
         """Return y = A x + b."""
-        return self.A @ x + self.b
+        return np.asarray(self.A @ x + self.b)
 
     def scaled(self) -> tuple[DenseProblem, np.ndarray]:
         """Return the problem in units in which A and b have entries near 1.
@@ -164,7 +165,7 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     """
     if has(problem.A, HasRows):
         whole = problem.A.rows().matrix()
-        return as_dense(whole)[np.ix_(rows, rows)]
+        return np.asarray(as_dense(whole)[np.ix_(rows, rows)])
     layout = problem.layout
     unit, image, zero = (layout.zeros(wp.float64) for _ in range(3))
     host, matrix = np.zeros(layout.size), np.empty((len(rows), len(rows)))
@@ -238,7 +239,7 @@ def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.solve(A, r)
     except np.linalg.LinAlgError:
-        return np.linalg.lstsq(A, r, rcond=RANK)[0]
+        return np.asarray(np.linalg.lstsq(A, r, rcond=RANK)[0])
 
 
 def semidefinite(A: np.ndarray) -> bool:
@@ -332,7 +333,7 @@ def diagonally_dominant(A: Matrix) -> bool:
     reached = scipy.sparse.csgraph.breadth_first_order(
         (start + backward).tocsr(), n, return_predecessors=False
     )
-    return len(reached) == n + 1
+    return bool(len(reached) == n + 1)
 
 
 def inconsistent(data: DenseProblem) -> bool:
@@ -566,7 +567,7 @@ class DenseWorkspace(WorkspaceBase):
 
     def read_iterate(self) -> np.ndarray:
         """Return the iterate's unknowns, shape (n,)."""
-        return self.x.numpy()[self.data.rows].copy()
+        return np.asarray(self.x.numpy()[self.data.rows].copy())
 
     def write_iterate(self, values: np.ndarray) -> None:
         """Set the iterate's unknowns, shape (n,), projected onto the bounds."""

@@ -13,13 +13,13 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, NamedMethod, check_taken, has
+from warp_lcp.problem.protocol import HasStencil, check_taken, has
 from warp_lcp.problem.solve import Solver, Step, WorkspaceBase, method_name
 from warp_lcp.settings import Settings
 
 
 @dataclass(frozen=True)
-class AssembledMatrix(Settings, NamedMethod):
+class AssembledMatrix(Settings):
     """Another method, on the assembled float64 matrix of a grid.
 
     For domains on which geometric aggregates of whole blocks fail. In channels and walls one cell

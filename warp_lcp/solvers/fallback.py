@@ -466,7 +466,7 @@ class FallbackWorkspace(OptionalMembers):
         The rounding floor is the residual that rounding errors leave.
         """
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
-        return min(self.residual.norm, self._best_norm) <= floor
+        return bool(min(self.residual.norm, self._best_norm) <= floor)
 
     def _workspace(self, place: int) -> Workspace | None:
         """Return the workspace of a method, None if it does not take the problem."""

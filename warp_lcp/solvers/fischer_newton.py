@@ -609,5 +609,5 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     ):
         return np.full(right.shape, np.nan)  # LAPACK's least squares would raise or not return
     if info != 0 or not np.isfinite(factors).all():
-        return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
-    return scipy.linalg.lapack.dgetrs(factors, pivots, right)[0]
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=1e-12)[0])
+    return np.asarray(scipy.linalg.lapack.dgetrs(factors, pivots, right)[0])

@@ -20,8 +20,9 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import EPS, Step
+from warp_lcp.problem.solve import Step
 from warp_lcp.reduced.dense_problem import (
     DenseProblem,
     DenseWorkspace,
@@ -145,7 +146,7 @@ class LemkeForm:
 
     def solution(self, z: np.ndarray) -> np.ndarray:
         """Return x, shape (n,), for z of shape (m,)."""
-        return self.base + self.map @ z
+        return np.asarray(self.base + self.map @ z)
 
 
 # Largest bandwidth that counts as narrow, and number of unknowns up to which a dense inverse costs
@@ -310,7 +311,7 @@ class Basis:
         self.values = self._solve(self.q)
 
     def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
-        return self.inverse[rows]
+        return np.asarray(self.inverse[rows])
 
     def _column(self) -> np.ndarray:
         """Return the column of the entering variable."""
@@ -324,7 +325,7 @@ class Basis:
 
     def _solve(self, r: np.ndarray) -> np.ndarray:
         z = self.inverse @ r
-        return z + self.inverse @ (r - self.matrix @ z)
+        return np.asarray(z + self.inverse @ (r - self.matrix @ z))
 
     def _direction(self) -> np.ndarray:
         """Return the entering column in the current basis, B^-1 c.

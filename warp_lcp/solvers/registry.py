@@ -120,7 +120,8 @@ def method_of(method: str | Solver, name: str = "method") -> Solver:
             f"{name} = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings "
             f"or None{meant}"
         )
-    return METHODS[method]()
+    made: Solver = METHODS[method]()
+    return made
 
 
 def grid_methods() -> tuple[str, ...]:

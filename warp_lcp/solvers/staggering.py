@@ -198,7 +198,7 @@ class StaggeredRound:
         block.couple()
         block.problem.bounds.refresh()
         wp.copy(work.x, block.problem.layout.load(block.guess(), wp.float64))
-        return work.residual.evaluate(work.x)
+        return float(work.residual.evaluate(work.x))
 
 
 def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:

@@ -147,7 +147,7 @@ class Diagonal:
 
     def values(self) -> np.ndarray:
         """Return the diagonal, a stored field on the host, float64."""
-        return self.field().numpy().astype(np.float64) * self._residual.unit
+        return np.asarray(self.field().numpy().astype(np.float64) * self._residual.unit)
 
     def field(self) -> DeviceArray:
         """Return the diagonal / unit, a stored field.
