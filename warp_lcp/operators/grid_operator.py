@@ -31,6 +31,7 @@ from warp_lcp.kernels.launch_graph import copy as copy_array
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Communicator
 from warp_lcp.operators.cell_lists import cells_of
+from warp_lcp.operators.components import ComponentFinder, FloatingComponents
 from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
 from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.pickling import Pickled
@@ -68,6 +69,9 @@ class GridOperator(Pickled):
 
     symmetric = True
     monotone = False  # whether all weights are known to be >= 0
+    # Search for floating components, or what it found for a version.
+    _finder: ComponentFinder | None = None
+    _found: tuple[int, FloatingComponents | None] | None = None
     stencil: PaddedStencil
     _ghosts: Ghosts | None = None  # of a box of cells among others
     _across: Communicator | None = None
@@ -266,7 +270,7 @@ class GridOperator(Pickled):
         twin = copy.copy(self)
         twin._refills = {}
         twin._mask = wp.array(mask.astype(np.uint8), device=self.device)
-        twin._forget_components()
+        twin._finder = twin._found = None
         d, kind = self.stencil.d.numpy(), self.stencil.d.dtype
         if shift is not None:
             kind = self.dtype
@@ -291,9 +295,6 @@ class GridOperator(Pickled):
     def _arguments(self) -> dict[str, Any]:
         """Return the coefficients as arguments of the class."""
         raise NotImplementedError
-
-    def _forget_components(self) -> None:
-        """Discard the search for floating components, of other cells."""
 
     def _check_own(self) -> None:
         """Raise ValueError if the operator is a principal system.

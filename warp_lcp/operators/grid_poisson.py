@@ -116,8 +116,6 @@ class GridPoisson(GridOperator):
         with decomposition.together():
             super().__init__(cells, coefficients, periodic, device, dtype)
 
-    _finder: ComponentFinder | None = None
-
     def _take_coefficients(
         self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Values | None
     ) -> None:
@@ -226,9 +224,6 @@ class GridPoisson(GridOperator):
         """
         return self.component_finder.find(scratch)
 
-    def _forget_components(self) -> None:
-        self._finder = None
-
     @property
     def component_finder(self) -> ComponentFinder:
         """Finder of floating components."""
@@ -272,8 +267,7 @@ class GridPoisson(GridOperator):
     def replica(self) -> GridPoisson:
         """Return a copy of the operator in its own memory."""
         twin = copy.copy(self)
-        twin._refills = {}
-        twin._forget_components()
+        twin._refills, twin._finder = {}, None
         for cached in ("_search", "_rows_in_reach"):
             twin.__dict__.pop(cached, None)
         s, kept = self.stencil, {id(field): wp.clone(field) for field in self._held()}

@@ -77,7 +77,7 @@ def coarsen_spans_kernel(
     spans[k, j] = whole_span(first, last, n)
 
 
-class Gathering(Protocol):
+class GathersFields(Protocol):
     """Collects a field of all processes' boxes, with ghost cells, on every process."""
 
     def collecting(self, mine: DeviceArray, whole: DeviceArray) -> Task:
@@ -102,7 +102,7 @@ class Ghosts(Protocol):
     @property
     def cuts(self) -> list[tuple[int, int]]: ...  # noqa: D102
     @property
-    def gathering(self) -> Gathering: ...  # noqa: D102
+    def gathering(self) -> GathersFields: ...  # noqa: D102
 
     def fill(self, field: DeviceArray) -> None:
         """Fill the ghost cells of a stored field."""

@@ -118,11 +118,6 @@ class Stencil(GridOperator):
             cells, {"coefficients": coefficients, "shift": shift}, periodic, device, dtype
         )
 
-    _found: tuple[int, FloatingComponents | None] | None = None  # of a version
-
-    def _forget_components(self) -> None:
-        self._found = None
-
     def _take_coefficients(
         self, cells: np.ndarray, *, coefficients: Coefficients, shift: Values | None
     ) -> None:

@@ -486,11 +486,12 @@ def check_taken(method: Solver, A: Operator) -> None:
             without requirements.
     """
     if not takes(method, A):
+        needed = described(*declared(method).supports)
         advice = (
             "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which "
             "need only products"
         )
         raise ValueError(
-            f"{type(method).__name__} needs an operator with {described(*declared(method).supports)}; "
+            f"{type(method).__name__} needs an operator with {needed}; "
             f"{type(A).__name__} has none: {advice}"
         )

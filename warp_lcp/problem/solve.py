@@ -583,8 +583,8 @@ class _Loop:
     def _begin_ahead(self, x0: Array | None) -> float | None:
         """Begin a solve on the device if the workspace supports that.
 
-        Returns the value of `OptionalMembers.begin_ahead`. With a callback, merits or a deadline the
-        host takes each step.
+        Returns the value of `OptionalMembers.begin_ahead`. With a callback, merits or a deadline
+        the host takes each step.
         """
         work = self.work
         if not (isinstance(work, OptionalMembers) and work.device_begins):
