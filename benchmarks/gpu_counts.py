@@ -14,7 +14,7 @@ from benchmarks import emulated_cuda  # must precede the package
 from warp_lcp.files.tables import Tables
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.kernel_variant import KernelVariant
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
 # ruff: isort: split
@@ -167,7 +167,7 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
         structs: tuple[DataclassInstance, ...],
         given: Tables,
         stencil: PaddedStencil | None = None,
-        bounds: list[DeviceArray | float] | None = None,
+        bounds: BoundOperands | None = None,
     ) -> BoundKernel:
         bound = bind(declared, rows, structs, given, stencil, bounds)
         fields = {
@@ -250,7 +250,7 @@ def count(name: str, one: Heard, given: Tables, folder: Path, warps: int = 1) ->
     slabs, lines, chunks = layout.threads(rows)
     dim = (slabs * lines * chunks,) if form.quads else (slabs, lines, chunks)
     bounds = struct.pack(f"<{len(dim)}I4xQQ", *dim, math.prod(dim), 1)
-    parameters = bounds + bytes(rows.__ctype__()) + one.bound.arguments
+    parameters = bounds + bytes(layout.native_of(rows)) + one.bound.arguments
     # Threads of a row within the second slab.
     first = (min(1, slabs - 1) * lines + lines // 2) * chunks
     taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[

@@ -23,7 +23,7 @@ from benchmarks import emulated_cuda, gpu_counts  # must precede the package
 from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.launch_graph import Launch
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
 # ruff: isort: split
@@ -255,7 +255,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         structs: tuple[DataclassInstance, ...],
         arguments: Tables,
         stencil: PaddedStencil | None = None,
-        bounds: list[DeviceArray | float] | None = None,
+        bounds: BoundOperands | None = None,
     ) -> BoundKernel:
         bound = bind(declared, rows, structs, arguments, stencil, bounds)
         taken = {name: bound.given[name] for name in declared.arrays}

@@ -25,6 +25,7 @@ from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
 from warp_lcp.benchmarks.problems import Splash, basin
 from warp_lcp.files.tables import Tables
 from warp_lcp.kernels import Rows, StencilKernel
+from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import PoissonArguments
@@ -235,7 +236,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         rows: Rows,
         *structs: DataclassInstance,
         stencil: PaddedStencil | None = None,
-        bounds: list[DeviceArray | float] | None = None,
+        bounds: BoundOperands | None = None,
         **given: object,
     ) -> BoundKernel:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)

@@ -34,6 +34,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -69,8 +70,7 @@ STIFF = 1.0
 VISCOUS_COLUMNS = ("viscous_iterations", "viscous_residual", "dissipated", "wall_work")
 
 
-@dataclass(frozen=True)
-class ViscousFields:
+class ViscousFields(NamedTuple):
     """Fields of a viscous step that its residual reads.
 
     Attributes:

@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Never
+from typing import Never, cast
 
 from warp_lcp.default_chain import default_chain
 from warp_lcp.kernels.fields import Array
 from warp_lcp.operators.restated import RestatedProblem, renumbered
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import declared
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve import EPS, Solver, VariationalInequality, Workspace
+from warp_lcp.problem.solve import Solver, VariationalInequality, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, criteria, recommend
@@ -104,18 +106,29 @@ def solve(
             f"solver: a {type(problem).__name__} needs one of its own methods, pass one"
         )
     check_criteria(stopping)
-    method: Any = method_of(solver, "solver")
+    method = None if solver is None else method_of(solver, "solver")
     if method is None and isinstance(problem, LCP):
         return solve_by_attempts(problem, stopping, x0, callback, fallback=fallback)
-    if workspace is None and isinstance(problem, LCP) and getattr(method, "any_numbering", False):
+    if (
+        workspace is None
+        and isinstance(problem, LCP)
+        and method is not None
+        and declared(method).any_numbering
+    ):
         begun = time.perf_counter()
         restated = renumbered(problem)
         if restated is not None:
             return solve_restated(
                 restated, method, left(stopping or StoppingCriteria(), begun), x0, callback
             )
+    # None only where `solve_by` refuses the problem.
     return solve_by(
-        problem, method, stopping=stopping, x0=x0, workspace=workspace, callback=callback
+        problem,
+        cast(Solver, method),
+        stopping=stopping,
+        x0=x0,
+        workspace=workspace,
+        callback=callback,
     )
 
 
@@ -246,7 +259,7 @@ def _planned(
     name, first = attempt.method, attempt.method == advice.name and not attempt.again
     method = advice.method if attempt.method == advice.name else method_for(name, t)
     chained = problem if restated is None else restated.problem
-    if restated is None and getattr(method, "any_numbering", False):
+    if restated is None and method is not None and declared(method).any_numbering:
         restated = renumbered(problem)
     steps = attempt.steps or steps_allowed(name, t.unknowns)
     stopping = advice.stopping if first else criteria(accuracy, steps)

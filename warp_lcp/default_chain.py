@@ -105,7 +105,9 @@ class PathCreeps(Settings):
 
 def cycles_fail_beside_bodies(progress: Progress) -> bool:
     """Return whether a step on a grid with bodies has failed, or its cycles crawl."""
-    return not has(progress.problem.A, HasStencil) and (fails(progress) or crawls(progress))
+    problem = progress.problem
+    assert isinstance(problem, LCP)
+    return not has(problem.A, HasStencil) and (fails(progress) or crawls(progress))
 
 
 def stalls_or_crawls(progress: Progress) -> bool:
@@ -124,7 +126,11 @@ def weak_preconditioner(progress: Progress) -> bool:
     return (
         stalls(progress)
         or slow_linear_solves(progress)
-        or getattr(progress.problem.A, "near_null_space", None) is not None
+        or (
+            isinstance(progress.problem, LCP)
+            and isinstance(progress.problem.A, SparseOperator)
+            and progress.problem.A.near_null_space is not None
+        )
     )
 
 

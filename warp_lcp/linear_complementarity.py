@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.default import solve, solve_by_attempts
 from warp_lcp.kernels.fields import Array, real_array
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.operators.restated import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
+from warp_lcp.problem.data_types import BoundValues, Multiplies, OperatorLike
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver, Workspace
-from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
 from warp_lcp.solvers.registry import method_of
 
@@ -43,18 +44,30 @@ STATUSES = {  # SciPy's convention: 0 is success, 99 a solve that a callback end
 WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # names of the criteria here
 
 
+@runtime_checkable
+class BoundsOfScipy(Protocol):
+    """A `scipy.optimize.Bounds`."""
+
+    lb: BoundValues
+    ub: BoundValues
+
+
+Pair: TypeAlias = Any  # (lo, hi) of an unknown, or a bound of all unknowns
+Sides: TypeAlias = BoundsOfScipy | Sequence[Pair] | np.ndarray
+
+
 def linear_complementarity(
-    A: Any,
+    A: OperatorLike | Multiplies,
     b: Array,
     *,
-    bounds: Any = None,
+    bounds: Sides | None = None,
     x0: Array | None = None,
     tol: float = 1e-6,
     atol: float = 0.0,
     method: str | Solver | None = None,
     maxiter: int = 1000,
-    preconditioner: Any = None,
-    callback: Callable[..., Any] | None = None,
+    preconditioner: Multiplies | None = None,
+    callback: Callable[..., object] | None = None,
 ) -> OptimizeResult:
     """Solve a complementarity problem with SciPy's conventions.
 
@@ -137,7 +150,11 @@ def linear_complementarity(
             report(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
 
     def run(
-        restated: RestatedProblem, solver: Solver, stopping: Any, x0: Any, callback: Any
+        restated: RestatedProblem,
+        solver: Solver,
+        stopping: StoppingCriteria | MeanCriteria | None,
+        x0: Array | None,
+        callback: Callable[[Record], None] | None,
     ) -> SolveResult:
         """Solve by a method, and store its workspace for the callback."""
         work = solver.init(restated.problem)
@@ -182,9 +199,11 @@ class _Fields:
     def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
         self.given, self._shape = b.shape, shape
 
-    def load(self, values: Any, name: str) -> Any:
+    def load(
+        self, values: BoundValues, name: str
+    ) -> np.ndarray | AffineBounds | DeviceArray | float:
         """Return an array in the operator's shape if it has b's shape, else unchanged."""
-        if np.ndim(values) == 0 or isinstance(values, (AffineBounds, wp.array)):
+        if isinstance(values, (AffineBounds, wp.array)) or np.ndim(values) == 0:
             return values
         host = real_array(values, name)
         if host.shape == self.given and host.size == int(np.prod(self._shape)):
@@ -193,17 +212,17 @@ class _Fields:
             raise ValueError(f"{name} has shape {host.shape}: expected {self.given}")
         return host
 
-    def unload(self, field: DeviceArray, dtype: Any = np.float64) -> np.ndarray:
+    def unload(self, field: DeviceArray, dtype: DataType = np.float64) -> np.ndarray:
         """Return a field in b's shape if the sizes agree, else in its own shape."""
-        host = np.array(field.numpy(), dtype=dtype)
+        host: np.ndarray = np.array(field.numpy(), dtype=dtype)
         return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
 
 
-def _sides_of(bounds: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
+def _sides_of(bounds: Sides | None, shape: tuple[int, ...]) -> tuple[BoundValues, BoundValues]:
     """Return lower and upper bounds of unknowns of a shape."""
     if bounds is None:
         return 0.0, np.inf
-    if hasattr(bounds, "lb") and hasattr(bounds, "ub"):
+    if isinstance(bounds, BoundsOfScipy):
         return bounds.lb, bounds.ub
     expected = (
         f"expected a pair (lo, hi), a list of {int(np.prod(shape))} pairs, a "
@@ -228,7 +247,7 @@ def _sides_of(bounds: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
     return -np.inf if lower is None else lower, np.inf if upper is None else upper
 
 
-def _is_pairs(bounds: Any, n: int) -> bool:
+def _is_pairs(bounds: Sequence[Pair] | np.ndarray, n: int) -> bool:
     """Return whether bounds are SciPy's pairs, one for each of n unknowns.
 
     Raises:
@@ -250,7 +269,7 @@ def _is_pairs(bounds: Any, n: int) -> bool:
     )
 
 
-def _is_pair(one: Any) -> bool:
+def _is_pair(one: object) -> bool:
     """Return whether a value is a sequence of two numbers or None."""
     if isinstance(one, np.ndarray):
         return one.shape == (2,)
@@ -261,7 +280,7 @@ def _is_pair(one: Any) -> bool:
     )
 
 
-def _bound(values: Any, name: str, wrong: float) -> Any:
+def _bound(values: BoundValues, name: str, wrong: float) -> BoundValues:
     """Return a bound in which magnitudes of 1e20 and more are infinite.
 
     Raises:
@@ -286,7 +305,7 @@ def _bound(values: Any, name: str, wrong: float) -> Any:
     )
 
 
-def _method(method: Any) -> Solver:
+def _method(method: str | Solver) -> Solver:
     """Return the method for a name, or a method instance unchanged."""
     method = method_of(method)
     if isinstance(method, type) or not isinstance(method, Solver):
@@ -302,7 +321,7 @@ def _method(method: Any) -> Solver:
     return method
 
 
-def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
+def _told(callback: Callable[..., object] | None) -> Callable[[OptimizeResult], object] | None:
     """Return a function that calls a callback with either of SciPy's signatures."""
     if callback is None:
         return None

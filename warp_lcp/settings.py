@@ -15,16 +15,35 @@ from enum import StrEnum
 from functools import cache, wraps
 from reprlib import repr as short
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Concatenate,
+    Literal,
+    ParamSpec,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+    from pydantic import TypeAdapter
 
 
 class _OrInfinite:
     """Marker of a range that may hold inf."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: Callable[[object], dict[str, object]]
+    ) -> dict[str, object]:
         """Return the schema of the range, inf included."""
         return {**handler(source), "allow_inf_nan": True}
 
@@ -40,7 +59,11 @@ ShareOrAll = Annotated[float, Gt(0), Le(1)]
 Part = Annotated[float, Ge(0), Le(1)]
 Relaxation = Annotated[float, Gt(0), Lt(2)]
 
+Annotation: TypeAlias = object  # a type, or a form of `typing`
 Kind = TypeVar("Kind")
+Owner = TypeVar("Owner")
+Found = TypeVar("Found")
+Given = ParamSpec("Given")
 KINDS = {
     int: "an integer",
     float: "a finite number",
@@ -114,10 +137,10 @@ def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
 
     def wrap(kind: type[Kind]) -> type[Kind]:
         """Return the class with an `__init__` that accepts old names."""
-        init: Any = kind.__init__
+        init: Callable[..., None] = kind.__init__
 
         @wraps(init)
-        def init_by_either_name(self: Any, *args: Any, **settings: Any) -> None:
+        def init_by_either_name(self: Kind, *args: object, **settings: object) -> None:
             """Replace old names by new ones, with a warning."""
             for old, new in names.items():
                 if old in settings:
@@ -134,13 +157,13 @@ def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
                     settings[new] = settings.pop(old)
             init(self, *args, **settings)
 
-        kind.__init__ = init_by_either_name  # type: ignore[method-assign]
+        kind.__init__ = init_by_either_name  # type: ignore[method-assign, assignment]
         return kind
 
     return wrap
 
 
-def renamed_names(module: str, **names: str) -> Callable[[str], Any]:
+def renamed_names(module: str, **names: str) -> Callable[[str], object]:
     """Return a module's `__getattr__` that finds old names, with a DeprecationWarning.
 
     Args:
@@ -148,18 +171,20 @@ def renamed_names(module: str, **names: str) -> Callable[[str], Any]:
         names: old="new", names of the module.
     """
 
-    def find(name: str) -> Any:
+    def find(name: str) -> object:
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         warnings.warn(
             f"{module}.{name} is now {module}.{names[name]}", DeprecationWarning, stacklevel=2
         )
-        return getattr(sys.modules[module], names[name])
+        return vars(sys.modules[module])[names[name]]
 
     return find
 
 
-def renamed_method(old: str, method: Callable[..., Any]) -> Callable[..., Any]:
+def renamed_method(
+    old: str, method: Callable[Concatenate[Owner, Given], Found]
+) -> Callable[Concatenate[Owner, Given], Found]:
     """Return a method that calls one by its new name, with a DeprecationWarning.
 
     Args:
@@ -169,18 +194,19 @@ def renamed_method(old: str, method: Callable[..., Any]) -> Callable[..., Any]:
     new = method.__name__
 
     @wraps(method)
-    def call(self: Any, *args: Any, **given: Any) -> Any:
+    def call(self: Owner, *args: Given.args, **given: Given.kwargs) -> Found:
         warnings.warn(
             f"{type(self).__name__}.{old} is now {type(self).__name__}.{new}",
             DeprecationWarning,
             stacklevel=2,
         )
-        return getattr(self, new)(*args, **given)
+        found: Found = getattr(self, new)(*args, **given)
+        return found
 
     return call
 
 
-def checked(name: str, given: object, annotation: Any) -> Any:
+def checked(name: str, given: object, annotation: Annotation) -> Any:
     """Return a value converted to the type of its annotation.
 
     Args:
@@ -191,7 +217,7 @@ def checked(name: str, given: object, annotation: Any) -> Any:
     Raises:
         SettingError: it is not.
     """
-    value: Any = (
+    value: object = (
         given.item()
         if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0
         else given
@@ -210,12 +236,12 @@ def checked(name: str, given: object, annotation: Any) -> Any:
 
 
 @cache
-def checked_defaults(settings: type[Any]) -> dict[str, tuple[Any, Any]]:
+def checked_defaults(settings: type[DataclassInstance]) -> dict[str, tuple[object, object]]:
     """Return the default of each field of a dataclass that has one.
 
     Each is a pair: as written, and converted to the field's type.
     """
-    hints = ranges(settings)  # type: ignore[arg-type]
+    hints = ranges(settings)
     defaults = {field.name: field.default for field in dataclasses.fields(settings)}
     return {
         name: (value, checked(name, value, hints[name]))
@@ -225,7 +251,7 @@ def checked_defaults(settings: type[Any]) -> dict[str, tuple[Any, Any]]:
 
 
 @cache
-def ranges(settings: type[Any]) -> dict[str, Any]:
+def ranges(settings: type[DataclassInstance]) -> dict[str, Annotation]:
     """Return the annotation of each field of a dataclass."""
     hints = get_type_hints(settings, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(settings)}
@@ -253,7 +279,7 @@ def rule(annotation: Any) -> str:
             return f"a {kind.__name__}, each {rule(parts[0])}"
 
 
-def _range(kind: type, *limits: Any) -> str:
+def _range(kind: type, *limits: object) -> str:
     """Describe a range of numbers in words."""
     limits_by_end = {
         name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)
@@ -273,7 +299,7 @@ def _range(kind: type, *limits: Any) -> str:
 
 
 @cache
-def adapter(annotation: Any) -> Any:
+def adapter(annotation: Any) -> TypeAdapter[Any]:
     """Return the pydantic validator of an annotation.
 
     pydantic is imported here, so that the import of the package does not wait for it.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from functools import cache, cached_property
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -16,8 +15,10 @@ from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.curvature import has_negative_curvature
+from warp_lcp.problem.data_types import Matrix, is_sparse
+from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
+from warp_lcp.problem.protocol import HasRows, HasStencil, declared, has, layout_of, takes
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced.host_system import suits
@@ -85,7 +86,7 @@ class Traits:
         """Return the number of entries of A that a product reads."""
         if self.kind == "sparse":
             A = self._problem.A
-            return A.nnz if isinstance(A, SparseOperator) else int(self._matrix.nnz)
+            return A.nnz if isinstance(A, SparseOperator) else _entries(self._matrix)
         return self.unknowns**2 if self.kind == "dense" else 7 * self.unknowns
 
     @cached_property
@@ -205,19 +206,15 @@ class Traits:
         It must accept the operator, its size and the bounds.
         """
         method, problem = METHODS[name], self._problem
+        own = declared(method)
         if name == "quadratic-program" and not (self.symmetric and has_piqp()):
             return False
-        if not takes(method, problem.A) or self.unknowns > getattr(
-            method, "most_unknowns", self.unknowns
-        ):
+        if not takes(method, problem.A) or self.unknowns > (own.most_unknowns or self.unknowns):
             return False
-        abilities = {
-            "preconditioned": problem.preconditioner is not None,
-            "affine_bounds": self.affine,
-            "distributed": self.ranks,
-        }
-        return all(
-            getattr(method, ability, False) for ability, needed in abilities.items() if needed
+        return (
+            (own.preconditioned or problem.preconditioner is None)
+            and (own.affine_bounds or not self.affine)
+            and (own.distributed or not self.ranks)
         )
 
     @property
@@ -243,7 +240,7 @@ class Traits:
         return layout_of(A).load(A.diagonal(), wp.float64).numpy()[self._known]
 
     @cached_property
-    def _matrix(self) -> Any:
+    def _matrix(self) -> Matrix:
         A = self._problem.A
         if isinstance(A, DenseOperator):
             return A.matrix.numpy()
@@ -292,8 +289,13 @@ def sweeps_to(problem: LCP, accuracy: float) -> float:
     return TRIAL + float(np.log(accuracy / trial.relative_residual) / np.log(rate))
 
 
-def _dense(A: Any) -> np.ndarray:
-    return A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
+def _entries(A: Matrix) -> int:
+    """Return the number of stored entries of a sparse matrix, all of a dense one."""
+    return int(A.nnz if is_sparse(A) else A.size)
+
+
+def _dense(A: Matrix) -> np.ndarray:
+    return np.asarray(as_dense(A), dtype=np.float64)
 
 
 def _pivots(A: np.ndarray) -> np.ndarray | None:
@@ -302,7 +304,7 @@ def _pivots(A: np.ndarray) -> np.ndarray | None:
     return factor.diagonal() ** 2 if info == 0 else None
 
 
-def _definiteness(A: Any, symmetric: bool, d: np.ndarray) -> str:
+def _definiteness(A: Matrix, symmetric: bool, d: np.ndarray) -> str:
     """Return the definiteness of a matrix with a nonnegative diagonal.
 
     It is that of the symmetric part: Gershgorin's circles decide first, then Cholesky

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
 import warp_lcp as wl
+from warp_lcp.problem.solve import Solver
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
@@ -28,7 +28,7 @@ JOINTED = "lemke"
 PIVOTING = 1e-8
 
 # |r_t| <= mu r_n along each tangent: bounds that are affine in x.
-BOXED: dict[str, Callable[[ContactSystem], Any]] = {
+BOXED: dict[str, Callable[[ContactSystem], Solver]] = {
     "nncg": lambda s: wl.NNCG(),
     "psor": lambda s: wl.ProjectedSOR(omega=1.0),
     "projected-jacobi": lambda s: wl.ProjectedJacobi(),
@@ -40,7 +40,7 @@ BOXED: dict[str, Callable[[ContactSystem], Any]] = {
 }
 # A polygonal cone with the slip as an additional unknown: an unsymmetric linear complementarity
 # problem.
-STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
+STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Solver]] = {
     "lemke": lambda s: wl.Lemke(),
     "fischer-newton": lambda s: wl.FischerNewton(),
     "minimum-map-newton": lambda s: wl.MinimumMapNewton(),
@@ -48,7 +48,7 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
 # The circular cone, without an assembled matrix.
-CONE: dict[str, Callable[[], Any]] = {"proximal-gauss-seidel": wl.ProximalGaussSeidel}
+CONE: dict[str, Callable[[], Solver]] = {"proximal-gauss-seidel": wl.ProximalGaussSeidel}
 # Methods for inverse kinematics, whose problems have small dense matrices and no blocks.
 KINEMATIC = (
     "lemke",

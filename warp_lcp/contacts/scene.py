@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,6 +14,7 @@ from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.rigid.joints import WORLD, Joint, JointKind
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene import MOST_CELLS, Domain, Output, Scene
+from warp_lcp.scene.shapes import SolidProperties
 from warp_lcp.scene.table import Complaint, Table, Vector, counted
 from warp_lcp.settings import Count, Positive, Share
 
@@ -88,7 +89,7 @@ class JointTable(Table):
         default=None, description="largest torque of the motor [N m]"
     )
 
-    def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
+    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[Complaint]:
         """Return errors of the joint among these solids in 2 or 3 dimensions."""
         complaints, hinge = [], self.kind == "hinge"
         for number in self.solids:
@@ -184,7 +185,7 @@ class TargetTable(Table):
         min_length=1, description="its places at these times [m], straight lines between"
     )
 
-    def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
+    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[Complaint]:
         """Return errors of the target among these solids in 2 or 3 dimensions."""
         complaints = []
         if self.solid >= len(solids) or not solids[self.solid].is_body:
@@ -226,11 +227,12 @@ class ContactScene(Scene):
 
     @model_validator(mode="before")
     @classmethod
-    def _method_for_joints(cls, data: Any) -> Any:
+    def _method_for_joints(cls, data: object) -> object:
         """Set the default method of scenes with joints."""
-        solver = data.get("solver", {}) if isinstance(data, dict) else None
-        if isinstance(solver, dict) and data.get("joint"):
-            return {**data, "solver": {"method": JOINTED, **solver}}
+        if isinstance(data, dict) and data.get("joint"):
+            solver = data.get("solver", {})
+            if isinstance(solver, dict):
+                return {**data, "solver": {"method": JOINTED, **solver}}
         return data
 
     def body_numbers(self) -> list[int]:

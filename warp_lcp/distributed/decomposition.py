@@ -12,16 +12,16 @@ import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warp_lcp.distributed.collective import Collective
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
-from warp_lcp.kernels.fields import Array
 from warp_lcp.settings import renamed_method
 
 if TYPE_CHECKING:
@@ -184,10 +184,7 @@ class Decomposition:
         return self.collective.together()
 
     def check_operator(
-        self,
-        shape: tuple[int, ...],
-        periodic: Sequence[bool],
-        coefficients: Mapping[str, Array | None],
+        self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, object]
     ) -> None:
         """Check that a grid operator fits the boxes; collective.
 
@@ -218,7 +215,7 @@ class Decomposition:
                         "at least two"
                     )
         kinds = [
-            (name, (value is not None and np.ndim(value) > 0) or value)
+            (name, (value is not None and np.ndim(cast(ArrayLike, value)) > 0) or value)
             for name, value in sorted(coefficients.items())
         ]
         self.ranks.agree("the kind of coefficients", kinds)

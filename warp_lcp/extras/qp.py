@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
@@ -13,6 +13,7 @@ import scipy.sparse
 from warp_lcp.kernels.fields import real_array
 from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
 from warp_lcp.problem.bounds import huge_as_infinite
+from warp_lcp.problem.data_types import Matrix, Values, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.program_optimality import (
     PROVABLE,
@@ -28,12 +29,14 @@ from warp_lcp.problem.program_optimality import (
 )
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Solver
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.quadratic_program import is_convex_program
 
 if TYPE_CHECKING:
     from qpsolvers import Problem, Solution
+    from scipy.optimize import OptimizeResult
 
 NAME = "warp_lcp"
 LOOSER = 10.0  # times tol: limit of each row's residual; methods meet tol in the norm of all rows
@@ -67,10 +70,10 @@ def register() -> None:
 
 def solve_problem(
     problem: Problem,
-    initvals: Any = None,
+    initvals: Values | None = None,
     verbose: bool = False,
     *,
-    method: Any = None,
+    method: str | Solver | None = None,
     tol: float = 1e-9,
     maxiter: int = 500,
 ) -> Solution:
@@ -142,7 +145,7 @@ class _Solve:
     def __init__(
         self,
         program: QuadraticProgramData,
-        method: Any,
+        method: str | Solver | None,
         tol: float,
         maxiter: int,
         x0: np.ndarray | None,
@@ -156,7 +159,7 @@ class _Solve:
         )
         self.point: ProgramPoint | None = None
         self.figures = (np.inf, np.inf, np.inf)
-        self.result: Any = None
+        self.result: OptimizeResult = None
 
     def run(self) -> None:
         """Solve a box directly; else, or if that fails, the optimality conditions."""
@@ -197,23 +200,33 @@ class _Solve:
     def _box(self) -> None:
         """Solve the boxed LCP of P and q in the caller's units."""
         p = self.program
-        sides = {"bounds": (p.lower, p.upper), "x0": self.x0, "method": self.method}
         self.result = found = linear_complementarity(
-            p.Q, p.c, tol=self.tol, maxiter=self.maxiter, **sides
+            p.Q,
+            p.c,
+            bounds=(p.lower, p.upper),
+            x0=self.x0,
+            method=self.method,
+            tol=self.tol,
+            maxiter=self.maxiter,
         )
         x = np.where(
             found.active_mask < 0, p.lower, np.where(found.active_mask > 0, p.upper, found.x)
         )
         self._judge(with_rows(p), ProgramPoint(x, np.zeros(0), np.zeros(0)), None)
 
-    def _by(self, method: Any) -> None:
+    def _by(self, method: str | Solver) -> None:
         """Solve the equilibrated optimality conditions by a method."""
         p, units, conditions = self._scaled, self._units, self._conditions
         n, m = len(p.c), len(p.h)
         x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(conditions.b) - n)]
-        sides = {"bounds": (conditions.lower, conditions.upper), "x0": x0, "method": method}
         self.result = result = linear_complementarity(
-            conditions.A, conditions.b, tol=self.tol, maxiter=self.maxiter, **sides
+            conditions.A,
+            conditions.b,
+            bounds=(conditions.lower, conditions.upper),
+            x0=x0,
+            method=method,
+            tol=self.tol,
+            maxiter=self.maxiter,
         )
         point = ProgramPoint(result.x[:n], result.x[n : n + m], result.x[n + m :])
         if not np.isfinite(result.x).all():
@@ -276,7 +289,7 @@ def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
     C, d = _rows(problem.A, problem.b, "A", "b", n)
     h = None if h is None else huge_as_infinite(h)
     bounding = np.zeros(0, dtype=bool) if h is None else h < np.inf
-    if h is not None:
+    if h is not None and G is not None:
         G, h = (-G[np.flatnonzero(bounding)], -h[bounding]) if bounding.any() else (None, None)
     if d is not None and not np.isfinite(d).all():
         raise ValueError(
@@ -288,12 +301,12 @@ def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
     return QuadraticProgramData(P, q, lower, upper, G, h, C, d), bounding
 
 
-def _entries(M: Any) -> int:
+def _entries(M: Matrix) -> int:
     """Return the number of nonzero entries of a matrix."""
-    return int(M.nnz if scipy.sparse.issparse(M) else np.count_nonzero(M))
+    return int(M.nnz if is_sparse(M) else np.count_nonzero(np.asarray(M)))
 
 
-def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
+def _objective(problem: Problem) -> tuple[Matrix, np.ndarray, np.ndarray, np.ndarray]:
     """Return P's symmetric part, q, lb and ub."""
     q = real_array(problem.q, "q").astype(np.float64).ravel()
     n = len(q)
@@ -325,8 +338,8 @@ def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarra
 
 
 def _rows(
-    matrix: Any, right: Any, name: str, name_of_right: str, n: int
-) -> tuple[Any, np.ndarray | None]:
+    matrix: Matrix | None, right: Values | None, name: str, name_of_right: str, n: int
+) -> tuple[Matrix | None, np.ndarray | None]:
     """Return a constraint's matrix and right-hand side, None if it does not exist."""
     if matrix is None or right is None:
         if matrix is not None or right is not None:
@@ -338,7 +351,7 @@ def _rows(
     return M, _vector(right, name_of_right, M.shape[0])
 
 
-def _matrix(values: Any, name: str) -> Any:
+def _matrix(values: Matrix, name: str) -> Matrix:
     """Return a sparse or dense matrix of float64."""
     if scipy.sparse.issparse(values):
         return scipy.sparse.csr_array(values, dtype=np.float64)
@@ -348,7 +361,7 @@ def _matrix(values: Any, name: str) -> Any:
     return host
 
 
-def _vector(values: Any, name: str, n: int) -> np.ndarray:
+def _vector(values: Values, name: str, n: int) -> np.ndarray:
     host = real_array(values, name).astype(np.float64).ravel()
     if host.shape != (n,) or np.isnan(host).any():
         raise ValueError(
@@ -358,7 +371,7 @@ def _vector(values: Any, name: str, n: int) -> np.ndarray:
     return host
 
 
-def _check_convex(P: Any, q: np.ndarray) -> None:
+def _check_convex(P: Matrix, q: np.ndarray) -> None:
     """Raise ValueError unless the program is convex.
 
     Only then do the first-order conditions hold at minimizers alone.

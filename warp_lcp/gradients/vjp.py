@@ -282,10 +282,10 @@ def _adjoint(
     if has(A, HasBlocks):
         transposed = _transposed(A)
         assert has(transposed, HasBlocks), "as A"
-        block = transposed.on_cells(cells.numpy())
-        right = _projected(_floating(block), g, cells)  # its value in AIR has no effect
+        restricted = transposed.on_cells(cells.numpy())
+        right = _projected(_floating(restricted), g, cells)  # its value in AIR has no effect
         result = solve(
-            LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping
+            LCP(restricted, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping
         )
         return result, result.x.flatten()
     free = cells.numpy() == 1

@@ -24,7 +24,7 @@ from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.fields import checked_device, zeros
-from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, launch_ranges
+from warp_lcp.kernels.launch_graph import Identified, Launch, LaunchGraph, clear, launch_ranges
 from warp_lcp.kernels.layout import grain
 from warp_lcp.kernels.memory import DeviceRows, RowsMemory, Scalar, Slot, larger, rows_memory
 from warp_lcp.settings import renamed_names
@@ -97,7 +97,7 @@ def _corners(
 
 
 @dataclass(frozen=True)
-class Window:
+class Window(Identified):
     """Box of stored cells, low <= (k, j, i) < high, over which kernels run.
 
     Args:

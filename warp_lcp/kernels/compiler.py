@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import warp as wp
 
@@ -35,7 +35,9 @@ LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
 TRIED_VERSIONS = ("1.19",)
 
 
-def forward_kernel(*, module: Any, **options: Any) -> Any:
+def forward_kernel(
+    *, module: wp.Module | str, **options: object
+) -> Callable[[Callable[..., object]], wp.Kernel]:
     """Declare a Warp kernel without a backward pass, in a module of the project.
 
     Args:
@@ -46,10 +48,13 @@ def forward_kernel(*, module: Any, **options: Any) -> Any:
         The decorator.
     """
     project_module(module if isinstance(module, str) else module.name)
-    return wp.kernel(enable_backward=False, module=module, **options)
+    made: Callable[[Callable[..., object]], wp.Kernel] = wp.kernel(
+        enable_backward=False, module=module, **options
+    )
+    return made
 
 
-def project_module(name: str) -> Any:
+def project_module(name: str) -> wp.Module:
     """Return a Warp module with the project's compiler flags.
 
     The module is created if it does not exist. Most modules share their flags: each set of flags
@@ -58,7 +63,7 @@ def project_module(name: str) -> Any:
     """
     flags = wp.config.cpu_compiler_flags
     words = ["-march=native" if flags is None else flags, HEADER_FLAGS]  # Warp's default
-    options: dict[str, Any] = {}
+    options: dict[str, object] = {}
     if ".".join(wp.__version__.split(".")[:2]) in TRIED_VERSIONS:
         options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)
         words += [] if name.startswith(INLINE_LATER) else [INLINE_FIRST]

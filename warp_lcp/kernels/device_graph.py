@@ -14,25 +14,35 @@ import ctypes
 import functools
 import inspect
 import types
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.joined_graphs import settle, waits
-from warp_lcp.kernels.kernel_variant import BLOCKS_OF_QUADS, task_of
+from warp_lcp.kernels.kernel_variant import BLOCKS_OF_QUADS, KernelVariant, task_of
 from warp_lcp.kernels.launch_graph import (
+    Command,
     CommandBuffer,
-    Conditional,
     DeviceCopy,
     Loop,
     NotRecordable,
     Task,
 )
-from warp_lcp.kernels.layout import RowLayout, make_struct, threads
-from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.layout import RowLayout, make_struct, native_of, offset_of, threads
+from warp_lcp.kernels.memory import (
+    ARRAY_BYTES,
+    LAYOUT_BYTES,
+    Extent,
+    KernelArgument,
+    Scalar,
+    slot_of,
+    value_of,
+)
+from warp_lcp.kernels.stencil_kernel import BoundKernel
+from warp_lcp.kernels.thread_pool import Operation, Patch
+from warp_lcp.kernels.types import DataType, DeviceArray, Dimensions
 
 ALIGNED = 16  # bytes
 FIRST = "tasks_"  # member of a kernel's arguments: number of its tasks
@@ -62,7 +72,7 @@ def patch_kernel(
 
 
 @functools.cache
-def pass_from_memory(form: Any) -> Any:
+def pass_from_memory(form: KernelVariant) -> tuple[DataType, wp.Kernel]:
     """Return a kernel's argument struct, and the kernel that reads it from memory.
 
     That kernel takes an array of such structs and reads the first element.
@@ -94,10 +104,10 @@ def pass_from_memory(form: Any) -> Any:
     return Piece, forward_kernel(module=f"{run.module.name}.memory.{words}", **options)(from_memory)
 
 
-_KERNELS: dict[Any, Any] = {}
+_KERNELS: dict[tuple[wp.Kernel, int], tuple[DataType, wp.Kernel]] = {}
 
 
-def kernel_from_memory(kernel: Any, sized: int) -> Any:
+def kernel_from_memory(kernel: wp.Kernel, sized: int) -> tuple[DataType, wp.Kernel]:
     """Return the struct of a Warp kernel's arguments, and a kernel that reads it.
 
     That kernel takes an array of one such struct instead of arguments.
@@ -112,7 +122,7 @@ def kernel_from_memory(kernel: Any, sized: int) -> Any:
     return _KERNELS[kernel, sized]
 
 
-def _made_from_memory(kernel: Any, sized: int) -> Any:
+def _made_from_memory(kernel: wp.Kernel, sized: int) -> tuple[DataType, wp.Kernel]:
     name = kernel.key.replace("__", "_")
     members = {FIRST: wp.int64} | {arg.label: arg.type for arg in kernel.adj.args}
     Given = make_struct(f"Given_{kernel.module.name.replace('.', '_')}_{name}", members)
@@ -147,26 +157,24 @@ class DeviceGraph(CommandBuffer):
     def __init__(self, device: wp.Device) -> None:
         super().__init__(device)
         # Arguments of `_add`, each with its command and its place.
-        self._pieces: list[tuple[int, Any, Any, tuple[int, ...], bytes, int, int]] = []
+        self._pieces: list[tuple[int, wp.Kernel, DataType, tuple[int, ...], bytes, int, int]] = []
         self._patches: list[tuple[int, int, int]] = []
         self._bytes = 0
         # Memory of rows, and the launch dimensions that have been captured.
-        self._extents: list[tuple[Any, tuple[int, ...]]] = []
+        self._extents: list[tuple[Extent, tuple[int, ...]]] = []
         self._buffer: np.ndarray | None = None
-        self._copied: Any = None  # event after which the buffer may be written
+        self._copied: wp.Event | None = None  # event after which the buffer may be written
 
-    def record(self, what: Any) -> None:
+    def record(self, what: "Command | Callable[[], object]") -> None:
         """Record a launch, a copy or a conditional.
 
         Raises:
             NotRecordable: it is a task of the host, or a copy of an array that is replaced.
         """
         if isinstance(what, DeviceCopy):
-            if any(hasattr(array, "slot") for array in (what.to, what.source)):
+            if any(slot_of(array) is not None for array in (what.to, what.source)):
                 raise NotRecordable("a copy of an array that is replaced")
-        elif isinstance(what, Task) or not (
-            isinstance(what, Conditional) or hasattr(what, "launch")
-        ):
+        elif isinstance(what, (Task, Operation)) or callable(what):
             raise NotRecordable("a task of the host")
         super().record(what)
 
@@ -177,20 +185,26 @@ class DeviceGraph(CommandBuffer):
         self._arguments += other._arguments
 
     def launch(
-        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
+        self,
+        kernel: wp.Kernel,
+        dim: Dimensions,
+        inputs: Sequence[KernelArgument],
+        *,
+        device: wp.Device,
+        block_dim: int = 256,
     ) -> None:
         """Record a launch; numbers may be `Scalar`."""
-        dims = tuple(dim) if hasattr(dim, "__len__") else (dim,)
+        dims = tuple(dim) if isinstance(dim, Sequence) else (dim,)
         self._record_kernel(kernel, dims, inputs, (), 0, sized=0, block_dim=block_dim)
 
     def record_tasks(
         self,
-        kernel: Any,
+        kernel: wp.Kernel,
         dim: tuple[int, ...],
-        inputs: list[Any],
-        first: Any,
+        inputs: Sequence[KernelArgument],
+        first: Patch | None,
         sized: int,
-        extent: Any,
+        extent: Extent | None,
     ) -> None:
         """Record a kernel launch with ranges of tasks.
 
@@ -204,7 +218,7 @@ class DeviceGraph(CommandBuffer):
             kernel, room[-len(dim) :], inputs, (first,) if first else (), sized, sized=len(dim)
         )
 
-    def record_pass(self, bound: Any) -> None:
+    def record_pass(self, bound: BoundKernel) -> None:
         """Record the launch of a stencil kernel."""
         patches, layout = bound.patches(), bound.layout
         if not patches:
@@ -220,10 +234,10 @@ class DeviceGraph(CommandBuffer):
         room = (
             bound.form.dim(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
         )
-        memory = bytes(layout.__ctype__()).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
+        memory = bytes(native_of(layout)).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
         self._add(kernel, struct, room, memory, patches, bound)
 
-    def _hold(self, memory: Any) -> tuple[int, ...]:
+    def _hold(self, memory: Extent) -> tuple[int, ...]:
         """Return the launch dimensions for rows in memory.
 
         `fits` compares them with those of a later run.
@@ -233,47 +247,45 @@ class DeviceGraph(CommandBuffer):
 
     def _record_kernel(
         self,
-        kernel: Any,
+        kernel: wp.Kernel,
         dim: tuple[int, ...],
-        inputs: Any,
-        first: Any,
+        inputs: Sequence[KernelArgument],
+        first: tuple[Patch, ...],
         tasks: int,
         *,
         sized: int,
         block_dim: int = 256,
     ) -> None:
-        changing = any(type(v) is Scalar or hasattr(v, "slot") for v in inputs)
+        changing = any(type(v) is Scalar or slot_of(v) is not None for v in inputs)
         if not (changing or first or sized):
             super().launch(kernel, dim, inputs, device=self.device, block_dim=block_dim)
             return
         struct, made = kernel_from_memory(kernel, sized)
         given = struct()
         for arg, value in zip(kernel.adj.args, inputs, strict=True):
-            setattr(given, arg.label, value_of(value))
-        native, patches = type(given.__ctype__()), []
+            setattr(given, arg.label, value_of(value))  # Warp checks the type
+        native, patches = type(native_of(given)), []
         if first:
             offset, address, size = first[0]
-            patches.append(
-                (getattr(native, kernel.adj.args[0].label).offset + offset, address, size)
-            )
+            patches.append((offset_of(native, kernel.adj.args[0].label) + offset, address, size))
         if sized:
-            patches.append((getattr(native, FIRST).offset, tasks, 8))
+            patches.append((offset_of(native, FIRST), tasks, 8))
         for arg, value in zip(kernel.adj.args, inputs, strict=True):
-            offset = getattr(native, arg.label).offset
+            offset = offset_of(native, arg.label)
             if type(value) is Scalar:
                 patches.append((offset, *value.address(arg.type)))
-            elif (slot := getattr(value, "slot", None)) is not None:
+            elif (slot := slot_of(value)) is not None:
                 patches.append((offset, slot.address, ARRAY_BYTES))
-        self._add(made, struct, dim, bytes(given.__ctype__()), patches, (given, inputs), block_dim)
+        self._add(made, struct, dim, bytes(native_of(given)), patches, (given, inputs), block_dim)
 
     def _add(
         self,
-        kernel: Any,
-        struct: Any,
-        dim: Any,
+        kernel: wp.Kernel,
+        struct: DataType,
+        dim: tuple[int, ...],
         memory: bytes,
-        patches: Any,
-        kept: Any,
+        patches: list[Patch],
+        kept: object,
         block_dim: int = 256,
     ) -> None:
         at = self._bytes
@@ -339,11 +351,11 @@ class DeviceGraph(CommandBuffer):
         )
 
     @property
-    def commands(self) -> list[Any]:
+    def commands(self) -> list[Command]:
         """Commands of the program's graph, in order."""
         return self._commands
 
-    def captured(self, commands: list[Any]) -> Any:
+    def captured(self, commands: list[Command]) -> wp.Graph:
         """Capture some launches and return their graph."""
         return self._captured(commands)
 
@@ -436,7 +448,7 @@ class Upload(DeviceGraph):
         super().run()
 
 
-def noted(device: wp.Device, event: Any) -> Any:
+def noted(device: wp.Device, event: wp.Event | None) -> wp.Event | None:
     """Record an event behind all launches so far, and return it."""
     return wp.get_stream(device).record_event(event) if device.is_cuda else None
 

@@ -9,17 +9,23 @@ from __future__ import annotations
 import ctypes
 import math
 import mmap
+import sys
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, ClassVar
+from types import EllipsisType
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.log_filter import start_warp
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataFrame, DataType, DeviceArray, Values
 
-Array = Any  # a numpy array or a wp.array
+if TYPE_CHECKING:
+    from warp_lcp.kernels.layout import Rows
+    from warp_lcp.kernels.vectors import Communicator
+
+Array: TypeAlias = np.ndarray | DeviceArray  # on the host or on a device
 # Elements of a flat field that a CPU thread takes: its operands stay in the L2 cache between fused
 # loops.
 CPU_CHUNK = 8192
@@ -28,7 +34,7 @@ LARGE = 1 << 20  # elements from which the part of a CPU field in use is searche
 HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12
 
 
-def checked_device(device: Any) -> wp.Device:
+def checked_device(device: wp.DeviceLike) -> wp.Device:
     """Return a Warp device; the default one if None.
 
     Raises:
@@ -45,7 +51,7 @@ def checked_device(device: Any) -> wp.Device:
 
 
 def zeros(
-    n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_pages: bool = False
+    n: int | tuple[int, ...], dtype: DataType, device: wp.Device, *, small_pages: bool = False
 ) -> DeviceArray:
     """Return a field of zeros, flat or of a shape; memory is allocated on first write.
 
@@ -62,9 +68,9 @@ def zeros(
         return (
             nothing(dtype, device) if shape == (0,) else wp.empty(shape, dtype=dtype, device=device)
         )
-    if small_pages and size > HUGE_PAGE and hasattr(mmap, "MAP_ANONYMOUS"):
+    if small_pages and size > HUGE_PAGE and sys.platform != "win32":
         memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        if sys.platform == "linux":
             memory.madvise(mmap.MADV_NOHUGEPAGE)
         host: np.ndarray = np.frombuffer(memory, dtype=np.uint8)
     else:
@@ -86,18 +92,18 @@ def _release(host: np.ndarray, pointer: int, size: int) -> None:
 
 
 @cache
-def _width(dtype: Any) -> int:
+def _width(dtype: DataType) -> int:
     """Return the bytes of an element."""
     return int(wp.types.type_size_in_bytes(dtype))
 
 
-def nothing(dtype: Any, device: wp.Device) -> DeviceArray:
+def nothing(dtype: DataType, device: wp.Device) -> DeviceArray:
     """Return the empty flat array of a type; it is shared."""
     return _nothing(dtype, device.alias)
 
 
 @cache
-def _nothing(dtype: Any, alias: str) -> DeviceArray:
+def _nothing(dtype: DataType, alias: str) -> DeviceArray:
     return wp.empty(0, dtype=dtype, device=alias)
 
 
@@ -106,7 +112,7 @@ def zeros_like(field: DeviceArray) -> DeviceArray:
     return zeros(tuple(field.shape), field.dtype, field.device)
 
 
-def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> DeviceArray:
+def kept(host: np.ndarray, dtype: DataType, device: wp.Device) -> DeviceArray:
     """Return a copy of a host array on a device.
 
     On the CPU it is in NumPy's memory, as that of `zeros`.
@@ -119,7 +125,7 @@ def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> DeviceArray:
     )
 
 
-def real_array(values: Any, name: str) -> np.ndarray:
+def real_array(values: Values, name: str) -> np.ndarray:
     """Return an array, or a list or data frame, as a numpy array of real numbers.
 
     Raises:
@@ -137,7 +143,7 @@ def real_array(values: Any, name: str) -> np.ndarray:
         )
     try:
         host = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
-        if host.dtype.kind == "O" and hasattr(values, "to_numpy"):
+        if host.dtype.kind == "O" and isinstance(values, DataFrame):
             host = np.asarray(values.to_numpy())
     except ValueError:
         raise ValueError(f"{name}: its rows differ in length") from None
@@ -157,7 +163,7 @@ def overwrite(to: DeviceArray, source: DeviceArray) -> None:
         ctypes.memmove(to.ptr, source.ptr, source.capacity)
 
 
-def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
+def check_storable(values: np.ndarray, dtype: DataType, name: str) -> None:
     """Check that values can be stored in a type.
 
     Raises:
@@ -174,7 +180,7 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
         )
 
 
-def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
+def check_kept(values: np.ndarray, dtype: DataType, name: str) -> None:
     """Check that no nonzero value becomes 0 in a type.
 
     Raises:
@@ -188,7 +194,7 @@ def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
         )
 
 
-def relative_rounding(values: np.ndarray, dtype: Any) -> float:
+def relative_rounding(values: np.ndarray, dtype: DataType) -> float:
     """Return the largest relative error of values stored in a type.
 
     It is 0 if the type holds all of them exactly.
@@ -216,10 +222,10 @@ class Layout:
         inside: index of the part of a stored field that the operator's shape stands for.
     """
 
-    across: Any = None
-    inside: ClassVar[Any] = ...
+    across: Communicator | None = None
+    inside: ClassVar[EllipsisType | tuple[slice, ...]] = ...
     chunks: DeviceArray | None = None
-    rows: Any = None
+    rows: Rows | None = None
 
     def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
         self.shape, self.device = tuple(shape), device
@@ -230,11 +236,11 @@ class Layout:
         """Number of elements of a stored field."""
         return math.prod(self.stored_shape)
 
-    def zeros(self, dtype: Any) -> DeviceArray:
+    def zeros(self, dtype: DataType) -> DeviceArray:
         """Return a stored field of zeros."""
         return zeros(self.size, dtype, self.device)
 
-    def holds(self, field: Array, dtype: Any) -> bool:
+    def holds(self, field: Array, dtype: DataType) -> bool:
         """Return whether `field` is stored already and can be used without a copy.
 
         It is then a device array.
@@ -247,7 +253,7 @@ class Layout:
             and field.is_contiguous
         )
 
-    def load(self, field: Array, dtype: Any, name: str = "field") -> DeviceArray:
+    def load(self, field: Array, dtype: DataType, name: str = "field") -> DeviceArray:
         """Return `field` as a stored field; no copy is made if it is one already.
 
         Raises:
@@ -264,9 +270,11 @@ class Layout:
         self._fill(target, host.reshape(target.shape))
         return wp.array(stored.ravel(), dtype=dtype, device=self.device, copy=self.device.is_cuda)
 
-    def host_zeros(self, dtype: Any) -> np.ndarray:
+    def host_zeros(self, dtype: DataType) -> np.ndarray:
         """Return zeros of the stored shape on the host."""
-        return zeros(self.size, dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        return np.asarray(
+            zeros(self.size, dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        )
 
     def copy(self, to: DeviceArray, source: DeviceArray) -> None:
         """Copy a stored field to another one of its type."""
@@ -316,7 +324,7 @@ class Padding:
     counts: tuple[int, int, int]
     small_pages: bool = False
 
-    def zeros(self, dtype: Any, device: wp.Device) -> DeviceArray:
+    def zeros(self, dtype: DataType, device: wp.Device) -> DeviceArray:
         """Return a flat stored field of zeros."""
         return zeros(self.size, dtype, device, small_pages=self.small_pages)
 
@@ -348,9 +356,11 @@ class PaddedLayout(Layout):
     Fields have shape (nz, ny, nx) or (ny, nx). With ghost cells a stencil needs no bounds tests.
     """
 
-    inside: ClassVar[Any] = (slice(1, -1),) * 3
+    inside = (slice(1, -1),) * 3
 
-    def __init__(self, shape: tuple[int, ...], device: wp.Device, across: Any = None) -> None:
+    def __init__(
+        self, shape: tuple[int, ...], device: wp.Device, across: Communicator | None = None
+    ) -> None:
         super().__init__(shape, device)
         self.across = across
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
@@ -379,13 +389,15 @@ class PaddedLayout(Layout):
         if self.sparse and taken(HUGE_PAGE) > 1.25 * taken(SMALL_PAGE):
             self.padding = replace(self.padding, small_pages=True)
 
-    def zeros(self, dtype: Any) -> DeviceArray:
+    def zeros(self, dtype: DataType) -> DeviceArray:
         """Return a stored field of zeros."""
         return self.padding.zeros(dtype, self.device)
 
-    def host_zeros(self, dtype: Any) -> np.ndarray:
+    def host_zeros(self, dtype: DataType) -> np.ndarray:
         """Return zeros of the stored shape on the host."""
-        return self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        return np.asarray(
+            self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+        )
 
     def copy(self, to: DeviceArray, source: DeviceArray) -> None:
         """Copy the part in use of a stored field to another one of its type.

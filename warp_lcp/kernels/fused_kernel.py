@@ -1,8 +1,6 @@
 # mypy: ignore-errors
 """Fused kernels: stages that follow each other through memory, some planes apart."""
 
-from typing import Any
-
 from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
 from warp_lcp.kernels.layout import copy_of, put
 from warp_lcp.kernels.stencil_kernel import BoundKernel, StencilKernel
@@ -52,7 +50,7 @@ class FusedKernel:
             )
         self.name, self.stages = name, stages
 
-    def launch(self, *passes: BoundKernel | None, launch: Any = launch_now) -> None:
+    def launch(self, *passes: BoundKernel | None, launch: Launch = launch_now) -> None:
         """Launch the stages, or record them; None leaves one out.
 
         Raises:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.launch_graph import LaunchGraph
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
+
+if TYPE_CHECKING:
+    from warp_lcp.kernels.device_graph import Upload
 
 
 class HostArray:
@@ -26,11 +29,13 @@ class HostArray:
         array: argument of kernels, up to date after `send`.
     """
 
-    def __init__(self, count: int | tuple[int, ...], dtype: Any, device: wp.Device) -> None:
+    def __init__(self, count: int | tuple[int, ...], dtype: DataType, device: wp.Device) -> None:
         self.array: DeviceArray = wp.zeros(count, dtype=dtype, device=device)
         self._shared = wp.get_device(device).is_cpu
-        self.host: Any = self.array.numpy() if self._shared else np.zeros_like(self.array.numpy())
-        self._upload: Any = None  # the copy as a node of CUDA graphs
+        self.host: np.ndarray = (
+            self.array.numpy() if self._shared else np.zeros_like(self.array.numpy())
+        )
+        self._upload: Upload | None = None  # the copy as a node of CUDA graphs
 
     def send(self) -> None:
         """Bring `array` up to date.

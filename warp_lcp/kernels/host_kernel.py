@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -31,14 +30,14 @@ class HostKernel(threading.local):
 
     def __init__(self, kernel: StencilKernel, **numbers: float) -> None:
         self._kernel, self._room, self._tasks = kernel, [0, 0, 0], 0
-        self._numbers: dict[str, Any] = {
+        self._numbers = {
             name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE
         }
 
     def run(
         self,
         reals: Sequence[np.ndarray],
-        indices: Sequence[Any],
+        indices: Sequence[np.ndarray | Sequence[int]],
         *,
         tasks: int = 1,
         work: int = 0,
@@ -80,7 +79,7 @@ class HostKernel(threading.local):
 
     def _launch(self) -> None:
         rows = replace(Rows.entries(self._tasks, self._device), memory=self._rows)
-        self._kernel.bind(rows, **self._arrays, **self._numbers).launch()
+        self._kernel.bind_arguments(rows, (), {**self._arrays, **self._numbers}).launch()
 
     def _reserve(self, *sizes: int) -> None:
         """Allocate at least so many reals, indices and tasks.
@@ -92,7 +91,7 @@ class HostKernel(threading.local):
         ]
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
         self._fields = [np.zeros(tasks) for _ in self._kernel.box]
-        self._arrays: dict[str, Any] = {
+        self._arrays = {
             name: _warp(values) for name, values in zip(self._kernel.box, self._fields, strict=True)
         }
         self._arrays |= {"reals": _warp(self._reals), "indices": _warp(self._indices)}

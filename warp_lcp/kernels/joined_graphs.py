@@ -18,7 +18,8 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import warp as wp
 
@@ -27,12 +28,14 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 if TYPE_CHECKING:
     from warp_lcp.kernels.device_graph import DeviceGraph
 
+Given = ParamSpec("Given")
+Found = TypeVar("Found")
 MOST_SEQUENCES = 64  # sequences that are remembered
 # The device is idle after these functions.
 WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
 # Functions of Warp that give work to a device or wait for it, and the modules where callers look
 # them up.
-SETTLING: tuple[tuple[Any, tuple[str, ...]], ...] = (
+SETTLING: tuple[tuple[ModuleType | type, tuple[str, ...]], ...] = (
     (
         wp,
         (
@@ -75,7 +78,7 @@ class _Waiting(threading.local):
 
 WAITING = _Waiting()
 # Weak references to the stretches, and their graph once there is one.
-_sequences: dict[tuple[int, ...], tuple[tuple[Any, ...], Any]] = {}
+_sequences: dict[tuple[int, ...], tuple[tuple[weakref.ref[DeviceGraph], ...], wp.Graph | None]] = {}
 
 
 @contextmanager
@@ -124,7 +127,7 @@ def settle(program: DeviceGraph | None = None) -> None:
         stretch.note_launch()
 
 
-def _graph_of(programs: list[DeviceGraph]) -> Any:
+def _graph_of(programs: list[DeviceGraph]) -> wp.Graph | None:
     """Return the graph of a sequence of stretches.
 
     Returns None when the sequence comes for the first time.
@@ -147,7 +150,7 @@ def _graph_of(programs: list[DeviceGraph]) -> Any:
     return graph
 
 
-def _forget(key: tuple[int, ...], reference: Any) -> None:
+def _forget(key: tuple[int, ...], reference: weakref.ref[DeviceGraph]) -> None:
     """Forget a sequence after one of its stretches was deleted."""
     _sequences.pop(key, None)
 
@@ -157,18 +160,18 @@ def _settle_before_warp() -> None:
     """Patch functions of Warp to launch the queue first."""
     for owner, names in SETTLING:
         for name in names:
-            if hasattr(owner, name):
-                setattr(owner, name, _settling(getattr(owner, name), idle=name in WAITING_FOR))
+            if (plain := vars(owner).get(name)) is not None:
+                setattr(owner, name, _settling(plain, idle=name in WAITING_FOR))
 
 
-def _settling(plain: Callable[..., Any], *, idle: bool) -> Callable[..., Any]:
+def _settling(plain: Callable[Given, Found], *, idle: bool) -> Callable[Given, Found]:
     """Return a function of Warp that first launches the queued stretches.
 
     `idle`: the device has finished all work after it.
     """
 
     @functools.wraps(plain)
-    def called(*args: Any, **options: Any) -> Any:
+    def called(*args: Given.args, **options: Given.kwargs) -> Found:
         if WAITING.programs and not options.get("record_cmd"):
             settle()
         found = plain(*args, **options)

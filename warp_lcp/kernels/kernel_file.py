@@ -25,12 +25,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import warp as wp
 
 from warp_lcp.kernels.native import HeaderSection, sections
 from warp_lcp.kernels.stencil_kernel import StencilKernel
+from warp_lcp.kernels.types import DataType, FieldType
 
 _INTEGERS = (wp.int8, wp.uint8, wp.int16, wp.uint16, wp.int32, wp.uint32, wp.int64, wp.uint64)
 TYPES = {kind.__name__: kind for kind in (*_INTEGERS, wp.float32, wp.float64, int, bool)} | {
@@ -39,11 +40,33 @@ TYPES = {kind.__name__: kind for kind in (*_INTEGERS, wp.float32, wp.float64, in
     "vec2i": wp.vec2i,
     "mat33": wp.mat33,
 }
-VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
+VECTORS: dict[FieldType, DataType] = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
 FIELDS = ("reads", "writes", "other", "by_row", "whole", "box", "numbers")
 NAMES, FLAGS = ("ring", "sums", "largest"), ("bounds", "finer", "ordered", "by_cell")
 ROLES = ("compute", "stencil", *FIELDS, *NAMES, *FLAGS, "listed", "constants", "module")
 NONE: Mapping[str, float] = {}
+
+
+class Roles(TypedDict):
+    """Roles of a declaration, as arguments of `StencilKernel`."""
+
+    stencil: tuple[FieldType, FieldType] | None
+    reads: dict[str, FieldType]
+    writes: dict[str, FieldType]
+    other: dict[str, FieldType]
+    by_row: dict[str, FieldType]
+    whole: dict[str, FieldType]
+    box: dict[str, FieldType]
+    numbers: dict[str, FieldType]
+    ring: tuple[str, ...]
+    sums: tuple[str, ...]
+    largest: tuple[str, ...]
+    optional: tuple[str, ...]
+    listed: str
+    bounds: bool
+    finer: bool
+    ordered: bool
+    by_cell: bool
 
 
 class KernelFile:
@@ -77,7 +100,7 @@ class KernelFile:
         name: str,
         *,
         module: str = "",
-        compute: Any = None,
+        compute: FieldType | None = None,
         constants: Mapping[str, float] = NONE,
     ) -> StencilKernel:
         """Return a kernel, or a variant of it.
@@ -119,7 +142,9 @@ class _Declaration:
         for word in self._compute:  # a wrong role is reported for every choice of the type
             self._roles(self._type("compute", word))
 
-    def make(self, module: str, compute: Any, constants: Mapping[str, float]) -> StencilKernel:
+    def make(
+        self, module: str, compute: FieldType | None, constants: Mapping[str, float]
+    ) -> StencilKernel:
         """Return the kernel of a module, a type of computations and constants."""
         choices = [self._type("compute", word) for word in self._compute]
         compute = choices[0] if compute is None and len(choices) == 1 else compute
@@ -135,7 +160,11 @@ class _Declaration:
                 f"{self.where}: {self.name}: Python gives no value for the constants "
                 f"{', '.join(missing)}"
             )
-        values: dict[str, Any] = {n: constants.get(n, usual) for n, usual in self.constants.items()}
+        values = {
+            name: value
+            for name, usual in self.constants.items()
+            if (value := constants.get(name, usual)) is not None
+        }
         stem, _, last = self.name.rpartition(".")
         return StencilKernel(
             f"{module or stem}.{last}",
@@ -147,19 +176,35 @@ class _Declaration:
             **self._roles(compute),
         )
 
-    def _roles(self, compute: Any) -> dict[str, Any]:
+    def _roles(self, compute: FieldType | None) -> Roles:
         """Return the roles in the form of `StencilKernel`'s arguments."""
         optional: list[str] = []
-        roles: dict[str, Any] = {role: self._fields(role, compute, optional) for role in FIELDS}
-        roles |= {role: tuple(self._words(role)) for role in NAMES} | {
-            role: role in self.lines for role in FLAGS
-        }
-        stencil = tuple(self._type("stencil", word, compute) for word in self._words("stencil"))
+        fields = {role: self._fields(role, compute, optional) for role in FIELDS}
+        names = {role: tuple(self._words(role)) for role in NAMES}
+        stencil = [self._type("stencil", word, compute) for word in self._words("stencil")]
         if stencil and len(stencil) != 2:
             raise self._wrong("stencil", "needs the types of the diagonal and of the weights")
-        if (listed := self._content("listed")) and roles["whole"].get(listed) is not wp.int32:
+        if (listed := self._content("listed")) and fields["whole"].get(listed) is not wp.int32:
             raise self._wrong("listed", f"names {listed}, which is no int32 array of `whole`")
-        return {**roles, "optional": tuple(optional), "stencil": stencil or None, "listed": listed}
+        return Roles(
+            stencil=(stencil[0], stencil[1]) if stencil else None,
+            reads=fields["reads"],
+            writes=fields["writes"],
+            other=fields["other"],
+            by_row=fields["by_row"],
+            whole=fields["whole"],
+            box=fields["box"],
+            numbers=fields["numbers"],
+            ring=names["ring"],
+            sums=names["sums"],
+            largest=names["largest"],
+            optional=tuple(optional),
+            listed=listed,
+            bounds="bounds" in self.lines,
+            finer="finer" in self.lines,
+            ordered="ordered" in self.lines,
+            by_cell="by_cell" in self.lines,
+        )
 
     def _wrong(self, role: str, why: str) -> ValueError:
         return ValueError(
@@ -184,8 +229,10 @@ class _Declaration:
             return found[1], None
         return found[1], float(found[2] + found[3]) if found[3] else int(found[2])
 
-    def _fields(self, role: str, compute: Any, optional: list[str]) -> dict[str, Any]:
-        fields: dict[str, Any] = {}
+    def _fields(
+        self, role: str, compute: FieldType | None, optional: list[str]
+    ) -> dict[str, FieldType]:
+        fields: dict[str, FieldType] = {}
         content = self._content(role)
         for group in content.split(";") if content else []:
             kind, _, names = group.strip().partition(" ")
@@ -206,7 +253,7 @@ class _Declaration:
                 optional += [name] * word.endswith("?")
         return fields
 
-    def _type(self, role: str, word: str, compute: Any = None) -> Any:
+    def _type(self, role: str, word: str, compute: FieldType | None = None) -> FieldType:
         if word in TYPES:
             return TYPES[word]
         if word == "T" and compute is not None:

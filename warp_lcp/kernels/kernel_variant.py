@@ -8,8 +8,9 @@ import ctypes
 import functools
 import math
 import struct
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, SupportsIndex, TypeAlias
 
 import warp as wp
 
@@ -18,20 +19,26 @@ from warp_lcp.kernels.layout import (
     ANYWHERE,
     Alignment,
     BoundFields,
+    BoundOperands,
+    KernelStencil,
     Pattern,
     RowLayout,
     make_struct,
+    native_of,
     packed,
     stencil_struct,
     threads,
 )
-from warp_lcp.kernels.memory import value_of
+from warp_lcp.kernels.memory import KernelArgument, value_of
 from warp_lcp.kernels.native import HEADERS, shared, text
 from warp_lcp.kernels.thread_pool import TableEntry
+from warp_lcp.kernels.types import DataType, FieldType, StructInstance
 
 if TYPE_CHECKING:
     from warp_lcp.kernels.stencil_kernel import BoundKernel, StencilKernel
 
+Letters: TypeAlias = tuple[tuple[str, DataType], ...]  # with the type of each
+Resolver: TypeAlias = Callable[[FieldType], DataType]  # the type that a letter stands for
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 # Types of fields that quads keep in registers.
@@ -65,8 +72,8 @@ def words_of(quads: Quads | None) -> list[str]:
 @functools.cache
 def form_of(
     declared: "StencilKernel",
-    letters: Any,
-    constants: Any,
+    letters: Letters,
+    constants: tuple[tuple[str, float], ...],
     shape: str | Pattern,
     bounds: str,
     *,
@@ -85,7 +92,7 @@ TOGETHER: dict[
 
 
 def make_kernels_of_module(
-    form: "KernelVariant", letters: Any, shape: str | Pattern, bounds: str
+    form: "KernelVariant", letters: Letters, shape: str | Pattern, bounds: str
 ) -> None:
     """Create all kernels of a variant's module before Warp loads it.
 
@@ -122,8 +129,8 @@ class KernelVariant:
     def __init__(
         self,
         declared: "StencilKernel",
-        letters: dict[str, Any],
-        constants: dict[str, int],
+        letters: dict[str, DataType],
+        constants: dict[str, float],
         shape: str | Pattern,
         bounds: str,
         *,
@@ -161,7 +168,7 @@ class KernelVariant:
         def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
 
         blank = Fields()
-        self._struct, self.native, self._entry = type(blank), type(blank.__ctype__()), None
+        self._struct, self.native, self._entry = type(blank), type(native_of(blank)), None
         self._size = ctypes.sizeof(self.native)
         area, _, last = d.name.rpartition(".")
         variant = ".".join(
@@ -175,7 +182,7 @@ class KernelVariant:
         self.run = wp.func_native(self._code)(run)
 
     def _source(
-        self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any
+        self, letters: dict[str, DataType], constants: dict[str, float], stencil: int, of: Resolver
     ) -> str:
         """Return the kernel's body in C++.
 
@@ -193,7 +200,7 @@ class KernelVariant:
             "FOUND": len(d.found),
             "SUMS": len(d.sums),
         }
-        macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
+        macros = {n: v for n, v in constants.items() if isinstance(v, SupportsIndex)}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [
             f"typedef {C[of(d.compute)]} T;"
         ] * ("T" not in letters)
@@ -320,7 +327,7 @@ class KernelVariant:
             ]
         )
 
-    def _source_of_quads(self, head: list[str], macros: dict[str, Any], of: Any) -> str:
+    def _source_of_quads(self, head: list[str], macros: dict[str, float], of: Resolver) -> str:
         """Return the kernel's body for quads in C++.
 
         It is a loop over planes with the row function twice: for four cells and for fewer.
@@ -393,7 +400,7 @@ class KernelVariant:
             made.append([*lines, f"const auto out_ = writing_({ours});"])
         return made
 
-    def _fields_of_quad(self, of: Any, *, kept: bool) -> list[str]:
+    def _fields_of_quad(self, of: Resolver, *, kept: bool) -> list[str]:
         """Return C++ that declares the fields at a quad's first cell, by name.
 
         `kept`: they are held in registers, as `quad.h` does.
@@ -437,12 +444,17 @@ class KernelVariant:
             made += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
         return made
 
-    def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
+    def fill(
+        self,
+        stencil: KernelStencil | None,
+        bounds: BoundOperands | None,
+        given: dict[str, KernelArgument],
+    ) -> bytes:
         """Return the C layout of the argument struct.
 
         Structs and arrays come first, side by side, as they fill whole eight bytes; then numbers.
         """
-        parts = [] if stencil is None else [stencil.struct.__ctype__()]
+        parts = [] if stencil is None else [native_of(stencil.struct)]
         if bounds is not None:
             lower, least, upper, most, code = bounds
             parts += [*packed((lower, upper, code)), SIDES.pack(least.value, most.value)]
@@ -457,7 +469,7 @@ class KernelVariant:
             ) from None
         return b"".join(parts).ljust(self._size, b"\0")
 
-    def struct_of(self, bound: "BoundKernel") -> Any:
+    def struct_of(self, bound: "BoundKernel") -> StructInstance:
         """Return the argument struct for Warp, which keeps the arrays alive.
 
         A capture on the CPU finds the arrays in it by name.
@@ -475,7 +487,7 @@ class KernelVariant:
         return made
 
     @functools.cached_property
-    def run_in_turn(self) -> Any:
+    def run_in_turn(self) -> wp.Function:
         """`run` for launches of several kernels, which read each other's results.
 
         `__ldg` is not used: its loads may return values from before the launch.
@@ -493,7 +505,7 @@ class KernelVariant:
         return wp.func_native(code)(run)
 
     @functools.cached_property
-    def kernel(self) -> Any:
+    def kernel(self) -> wp.Kernel:
         """The kernel of a launch by itself."""
         run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
         if self.quads:
@@ -540,7 +552,7 @@ class KernelVariant:
             return None
         return form_of(self.declared, *self._chosen, quads=quads)
 
-    def dim(self, layout: Any) -> tuple[int, ...]:
+    def dim(self, layout: RowLayout) -> tuple[int, ...]:
         """Return the dimensions of a launch of the kernel.
 
         Quads use one dimension, because three would be divided in 64 bits.

@@ -5,6 +5,7 @@ On the CPU a thread pool executes them in native code; on CUDA they form a graph
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import threading
@@ -13,12 +14,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import Any, ClassVar, Protocol
+from types import MethodType
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeAlias, cast
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time, is_collective
-from warp_lcp.kernels.memory import ARRAY_BYTES, Scalar, value_of
+from warp_lcp.kernels.layout import offset_of
+from warp_lcp.kernels.memory import ARRAY_BYTES, Extent, KernelArgument, Scalar, slot_of, value_of
 from warp_lcp.kernels.thread_pool import (
     ALONE,
     CELLS,
@@ -32,7 +36,11 @@ from warp_lcp.kernels.thread_pool import (
     ranges,
     team,
 )
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DeviceArray, Dimensions
+
+if TYPE_CHECKING:
+    from warp_lcp.kernels.device_graph import DeviceGraph
+    from warp_lcp.kernels.vectors import Communicator
 
 
 class _Recording(threading.local):
@@ -67,19 +75,21 @@ def loops_on_device(device: wp.Device) -> bool:
     return bool(wp.is_conditional_graph_supported()) if device.is_cuda else team() is not None
 
 
-def device_program(launch: Any = None) -> Any:
+def program_of(launch: Launch | None) -> CommandBuffer | None:
+    """Return the program whose `launch` a function is; None if it launches at once."""
+    recorder = launch.__self__ if isinstance(launch, MethodType) else None
+    return recorder if isinstance(recorder, CommandBuffer) else None
+
+
+def device_program(launch: Launch | None = None) -> DeviceGraph | None:
     """Return the `DeviceGraph` that records this thread's launches.
 
     Returns None if there is none, or if `launch` records.
     """
     program = RECORDING.program
-    if (
-        program is None
-        or not program.device.is_cuda
-        or isinstance(getattr(launch, "__self__", None), CommandBuffer)
-    ):
+    if program is None or not program.device.is_cuda or program_of(launch) is not None:
         return None
-    return program
+    return cast("DeviceGraph", program)  # all programs on CUDA that record are
 
 
 class Launch(Protocol):
@@ -89,12 +99,25 @@ class Launch(Protocol):
     """
 
     def __call__(
-        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...
-    ) -> Any:
+        self,
+        kernel: wp.Kernel,
+        dim: Dimensions,
+        inputs: Sequence[KernelArgument],
+        *,
+        device: wp.Device,
+        block_dim: int = ...,
+    ) -> wp.Launch | None:
         """Launch the kernel now, or record its launch."""
 
 
-def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: Any) -> Any:
+def launch_now(
+    kernel: wp.Kernel,
+    dim: Dimensions,
+    inputs: Sequence[KernelArgument],
+    *,
+    device: wp.Device,
+    **options: int,
+) -> wp.Launch | None:
     """Launch a kernel by Warp at once.
 
     A default argument that held `wp.launch` itself would bypass queued stretches, see
@@ -103,7 +126,7 @@ def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: An
     return wp.launch(kernel, dim, inputs, device=device, **options)
 
 
-def launch_graph(graph: Any) -> None:
+def launch_graph(graph: wp.Graph) -> None:
     """Launch a captured graph by Warp.
 
     As with `launch_now`, no default argument holds Warp's function.
@@ -126,9 +149,7 @@ class Task:
 
     def launch(self, launch: Launch = launch_now) -> None:
         """Perform the task now, or record it between the launches."""
-        recorded = (
-            is_recording() or isinstance(getattr(launch, "__self__", None), CommandBuffer)
-        ) and team() is not None
+        recorded = (is_recording() or program_of(launch) is not None) and team() is not None
         perform(self.operation() if recorded and self.operation else self.function, launch)
 
 
@@ -164,8 +185,8 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
 
     It runs at once if `launch` launches at once.
     """
-    program = getattr(launch, "__self__", None)
-    if not isinstance(program, CommandBuffer):
+    program = program_of(launch)
+    if program is None:
         program = RECORDING.program
     if program is not None:
         program.record(what)
@@ -191,7 +212,7 @@ def together(device: wp.Device) -> Iterator[Launch]:
 
 
 @contextmanager
-def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
+def as_one_table(device: wp.Device, across: Communicator | None = None) -> Iterator[None]:
     """Record the launches of a `with` block as one table for the thread pool.
 
     The table runs at the end of the block. Nothing may be read from the device within. Launches run
@@ -213,24 +234,24 @@ def run_table(table: OperationTable) -> None:
     at_work.run(table)
 
 
-def _run_while(condition: Any, table: OperationTable) -> None:
+def _run_while(condition: np.ndarray, table: OperationTable) -> None:
     """Repeat a table in the thread pool, unless its condition is 0 at the start."""
     if condition[0]:
         run_table(table)
 
 
 def launch_ranges(
-    kernel: Any,
+    kernel: wp.Kernel,
     dim: tuple[int, ...],
     cells: int,
-    inputs: list[Any],
+    inputs: Sequence[KernelArgument],
     *,
-    device: Any,
+    device: wp.Device,
     launch: Launch | None,
     ordered: bool,
     first: Patch | None = None,
     sized: int = 0,
-    extent: Any = None,
+    extent: Extent | None = None,
 ) -> None:
     """Launch or record a kernel whose first argument begins with a range of tasks.
 
@@ -278,19 +299,21 @@ def launch_ranges(
         )
 
 
-def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]:
+def _patches(
+    inputs: Sequence[KernelArgument], kernel: wp.Kernel, native: type[ctypes.Structure]
+) -> Iterator[Patch]:
     """Yield the kernel arguments that are read from memory in each run.
 
     They are numbers and replaceable arrays; the arguments are a struct in C.
     """
     for i, value in enumerate(inputs):
         if type(value) is Scalar:
-            yield (getattr(native, f"p{i}").offset, *value.address(kernel.adj.args[i].type))
-        elif (slot := getattr(value, "slot", None)) is not None:
-            yield getattr(native, f"p{i}").offset, slot.address, ARRAY_BYTES
+            yield offset_of(native, f"p{i}"), *value.address(kernel.adj.args[i].type)
+        elif (slot := slot_of(value)) is not None:
+            yield offset_of(native, f"p{i}"), slot.address, ARRAY_BYTES
 
 
-def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
+def _alone(kernel: wp.Kernel, dim: Dimensions, inputs: Sequence[KernelArgument]) -> Operation:
     """Return a CPU kernel launch as an operation that is not cut."""
     entry, arguments, native = prepared(kernel, dim, [value_of(v) for v in inputs])
     return Operation(
@@ -299,7 +322,14 @@ def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
     )
 
 
-def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
+def launch(
+    kernel: wp.Kernel,
+    dim: Dimensions,
+    inputs: Sequence[KernelArgument],
+    *,
+    device: wp.Device,
+    block_dim: int = 256,
+) -> None:
     """Launch a Warp kernel, now or among recorded launches; numbers may be `Scalar`."""
     program = RECORDING.program
     if program is None and device.is_cpu and team() is not None:
@@ -372,6 +402,23 @@ def _bytes_of(array: DeviceArray) -> int:
     return int(array.size * wp.types.type_size_in_bytes(array.dtype))
 
 
+Command: TypeAlias = "wp.Launch | Operation | Task | Conditional | Loop | DeviceCopy | DeviceCall"
+"""Entry of a program: a launch, or what stands between launches."""
+
+
+def _only_operations(commands: Sequence[Command]) -> list[Operation]:
+    """Return commands that are all operations of the thread pool."""
+    operations = [command for command in commands if isinstance(command, Operation)]
+    assert len(operations) == len(commands), "launches among operations of the thread pool"
+    return operations
+
+
+def _launch_alone(command: Command) -> None:
+    """Launch a command now, or while a graph is captured."""
+    assert not isinstance(command, Operation), "the thread pool executes operations"
+    command.launch()
+
+
 class CommandBuffer:
     """A sequence of kernel launches with fixed arguments.
 
@@ -386,8 +433,8 @@ class CommandBuffer:
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
-        self._commands: list[Any] = []
-        self._arguments: list[Any] = []  # a recorded launch holds addresses only
+        self._commands: list[Command] = []
+        self._arguments: list[object] = []  # a recorded launch holds addresses only
         self._runs = 0
         self._stretches: list[Callable[[], object]] | None = None
         # Launch functions of loops' graphs, by the address of the condition.
@@ -399,7 +446,13 @@ class CommandBuffer:
         return len(self._commands)
 
     def launch(
-        self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256
+        self,
+        kernel: wp.Kernel,
+        dim: Dimensions,
+        inputs: Sequence[KernelArgument],
+        *,
+        device: wp.Device,
+        block_dim: int = 256,
     ) -> None:
         """Record a launch, and keep its arguments alive.
 
@@ -414,7 +467,7 @@ class CommandBuffer:
         else:
             self.record(_alone(kernel, dim, inputs))
 
-    def record(self, what: Any) -> None:
+    def record(self, what: Command | Callable[[], object]) -> None:
         """Record a launch, an operation, a host task or a conditional.
 
         An operation belongs to the thread pool; conditionals need loops on the device.
@@ -422,11 +475,15 @@ class CommandBuffer:
         if isinstance(what, Conditional) and not self.device.is_cuda:
             self._arguments.append(what)
             self._commands += [
-                operation.only_if(what.condition) for operation in what.program._commands
+                operation.only_if(what.condition) for operation in what.program._operations()
             ]
         else:
             self._commands.append(Task(what) if callable(what) else what)
         self._forget_prepared()
+
+    def _operations(self) -> list[Operation]:
+        """Return the commands; the thread pool executes all of them."""
+        return _only_operations(self._commands)
 
     def _forget_prepared(self) -> None:
         """Discard the prepared tables and graphs after new commands."""
@@ -514,7 +571,9 @@ class CommandBuffer:
         It launches a graph, or runs a table in the thread pool.
         """
         if not self.device.is_cuda and team() is not None:
-            return partial(_run_while, condition.numpy(), OperationTable(self._commands, condition))
+            return partial(
+                _run_while, condition.numpy(), OperationTable(self._operations(), condition)
+            )
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             wp.capture_while(condition, self._launch)
         return partial(launch_graph, capture.graph)
@@ -536,25 +595,25 @@ class CommandBuffer:
         for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
             stretch = list(group)
             if is_task:
-                made += [task.function for task in stretch]
+                made += [task.function for task in stretch if isinstance(task, Task)]
             elif self.device.is_cuda:
                 made.append(partial(launch_graph, self._captured(stretch)))
             elif all(isinstance(command, Operation) for command in stretch):
-                made.append(partial(run_table, OperationTable(stretch)))
+                made.append(partial(run_table, OperationTable(_only_operations(stretch))))
             else:
-                made += [command.launch for command in stretch]
+                made += [partial(_launch_alone, command) for command in stretch]
         return made
 
-    def _captured(self, commands: Sequence[Any]) -> Any:
+    def _captured(self, commands: Sequence[Command]) -> wp.Graph:
         """Capture some launches and return their graph."""
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for command in commands:
-                command.launch()
+                _launch_alone(command)
         return capture.graph
 
     def _launch(self) -> None:
         for command in self._commands:
-            command.launch()
+            _launch_alone(command)
 
     def differs(self, other: CommandBuffer) -> str:
         """Return where operations differ from another program's; "" if nowhere.
@@ -573,19 +632,28 @@ class CommandBuffer:
         return ""
 
 
-def _identity(argument: Any) -> Hashable:
+class Identified:
+    """Argument of recorded launches that others replace: recordings know it by its key."""
+
+    @property
+    def identity(self) -> Hashable:
+        """The key; arguments of equal keys share a recording."""
+        raise NotImplementedError
+
+
+def _identity(argument: object) -> Hashable:
     """Return the identity of an argument in a recording.
 
     An array is known by its address, unless it is replaceable; a list by its elements.
     """
     if isinstance(argument, wp.array):
-        slot = getattr(argument, "slot", None)
+        slot = slot_of(argument)
         return (argument.ptr, argument.shape) if slot is None else slot.address
     if isinstance(argument, (list, tuple)):
         return tuple(map(_identity, argument))
     if isinstance(argument, dict):
         return tuple((name, _identity(value)) for name, value in argument.items())
-    return getattr(argument, "identity", argument)
+    return argument.identity if isinstance(argument, Identified) else argument
 
 
 MOST_RECORDED = 32  # recordings of a graph
@@ -616,7 +684,7 @@ class LaunchGraph:
     # Whether CUDA graphs are captured. They have not been run on a GPU yet.
     on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
     # Creates the recording of a device: `device_graph.DeviceGraph`, set by `warp_lcp.kernels`.
-    device_program: ClassVar[Any]
+    device_program: ClassVar[type[DeviceGraph]]
     # For tests: each run records again and compares with the first recording.
     verify: ClassVar[bool] = False
 
@@ -627,7 +695,7 @@ class LaunchGraph:
         self._programs: dict[Hashable, CommandBuffer] = {}
         self._threads = 0
 
-    def run(self, *arguments: Any, variant: Hashable = None) -> None:
+    def run(self, *arguments: object, variant: Hashable = None) -> None:
         """Launch everything, or record it in the program that is being recorded.
 
         Args:
@@ -666,7 +734,7 @@ class LaunchGraph:
         """Record again in the next run, because arrays have been replaced."""
         self._programs = {}
 
-    def _recorded(self, arguments: tuple[Any, ...]) -> CommandBuffer | None:
+    def _recorded(self, arguments: tuple[object, ...]) -> CommandBuffer | None:
         """Return the program of some arguments.
 
         Returns None where a CUDA graph cannot hold it, so that it is launched in each run.

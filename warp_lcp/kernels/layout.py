@@ -6,18 +6,22 @@ such a loop only if the arrays are declared not to alias and if conditionals are
 selections of values that are computed anyway.
 """
 
+import ctypes
 import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, no_type_check
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
+
+if TYPE_CHECKING:
+    from warp_lcp.kernels.memory import RowsMemory
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
 # Otherwise single cells, to compare both on a GPU.
@@ -112,6 +116,24 @@ class RowLayout:
     fz: int
 
 
+class BoundOperands(NamedTuple):
+    """Bounds of x as arguments of kernels that support codes.
+
+    Attributes:
+        lower: field of lower bounds; empty: `least` holds for all unknowns.
+        least: that number.
+        upper: likewise, field of upper bounds.
+        most: that number.
+        code: of `warp_lcp.problem.bounds.Bounds`, wp.uint8; empty: there is none.
+    """
+
+    lower: DeviceArray
+    least: wp.float64
+    upper: DeviceArray
+    most: wp.float64
+    code: DeviceArray
+
+
 @wp.struct
 class BoundFields:
     """Bounds of x, with the operands of `warp_lcp.problem.bounds.Bounds.operands`."""
@@ -125,6 +147,22 @@ class BoundFields:
 
 BLANK = RowLayout()
 NO_ARRAY = bytes(wp.array(dtype=wp.uint8).__ctype__())
+# Class of the declarations of structs, and of numbers that C takes by their `value`.
+STRUCT = type(RowLayout)
+WARP_NUMBERS = (
+    wp.bool,
+    wp.int8,
+    wp.uint8,
+    wp.int32,
+    wp.uint32,
+    wp.int64,
+    wp.uint64,
+    wp.float32,
+    wp.float64,
+)
+StructType = TypeVar("StructType")
+KernelValue: TypeAlias = "DeviceArray | StructInstance | float | None"
+"""Member of a kernel's struct: an array, a struct, a number, or None for an empty array."""
 
 
 def grain(n: int, device: wp.Device) -> int:
@@ -132,7 +170,7 @@ def grain(n: int, device: wp.Device) -> int:
     return 1 if device.is_cuda else n
 
 
-def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> None:
+def check_memory(name: str, array: DeviceArray, dtype: DataType, shape: tuple[int, ...]) -> None:
     """Check an array before its address is passed to kernels.
 
     Raises:
@@ -149,44 +187,52 @@ def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> N
         )
 
 
-def put(struct: Any, members: Mapping[str, Any]) -> Any:
+def native_of(struct: StructInstance | DeviceArray) -> ctypes.Structure:
+    """Return a Warp struct or array as kernels see it."""
+    native: ctypes.Structure = struct.__ctype__()
+    return native
+
+
+def offset_of(native: type[ctypes.Structure], name: str) -> int:
+    """Return where a member of a struct begins, in bytes."""
+    offset: int = vars(native)[name].offset
+    return offset
+
+
+def _member(value: KernelValue) -> "KernelValue | ctypes.Structure":
+    """Return a value as a member of a native struct."""
+    if isinstance(value, wp.array):
+        return value.ctype or native_of(value)
+    return value.value if isinstance(value, WARP_NUMBERS) else value
+
+
+def put(struct: StructType, members: Mapping[str, KernelValue]) -> StructType:
     """Set members of a Warp struct and return it, without checking their types.
 
     It takes a third of the time of setting attributes.
     """
-    native = struct.__ctype__()
+    native = native_of(struct)
     for name, value in members.items():
-        kind = type(value)
-        if kind is wp.array:
-            setattr(native, name, value.ctype or value.__ctype__())
-        elif kind is float or kind is int or kind is bool:
-            setattr(native, name, value)
-        elif value is not None:
-            setattr(
-                native,
-                name,
-                value.__ctype__()
-                if hasattr(value, "__ctype__")
-                else getattr(value, "value", value),
-            )
+        if value is not None:
+            setattr(native, name, _member(value))
     struct.__dict__.update(members)  # keeps the arrays alive
     return struct
 
 
-def copy_of(struct: Any) -> Any:
+def copy_of(struct: StructType) -> StructType:
     """Return a copy of a Warp struct.
 
     It takes a fraction of the time of constructing one with nested structs.
     """
-    native = struct.__ctype__()
+    native = native_of(struct)
     made = object.__new__(type(struct))
     made.__dict__.update(struct.__dict__, _ctype=type(native).from_buffer_copy(native))
     return made
 
 
-def packed(arrays: Sequence[Any]) -> list[Any]:
+def packed(arrays: Sequence[DeviceArray | None]) -> list[ctypes.Structure | bytes]:
     """Return arrays as C structs; None becomes a null array."""
-    return [NO_ARRAY if a is None else a.__ctype__() for a in arrays]
+    return [NO_ARRAY if a is None else native_of(a) for a in arrays]
 
 
 @dataclass(frozen=True)
@@ -206,7 +252,7 @@ class Pattern:
     offsets: tuple[tuple[int, int, int], ...]
     symmetric: bool
     kind: str
-    functions: tuple[Any, ...] = ()
+    functions: tuple[wp.Function | float, ...] = ()
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -258,7 +304,7 @@ class Pattern:
         )
 
     @functools.cached_property
-    def touch(self) -> Any:
+    def touch(self) -> wp.Function | None:
         """A Warp function that calls all weight functions; None if there are none.
 
         A kernel that calls it contains their code.
@@ -270,12 +316,12 @@ class Pattern:
 
 
 @functools.cache
-def _number_of(functions: tuple[Any, ...]) -> str:
+def _number_of(functions: tuple[wp.Function | float, ...]) -> str:
     """Return a key of functions that also distinguishes those of equal names."""
     return f"_{_number_of.cache_info().misses}" if functions else ""
 
 
-def _touching(function: Any, before: Any) -> Any:
+def _touching(function: wp.Function, before: wp.Function | None) -> wp.Function:
     if before is None:
 
         @no_type_check
@@ -292,7 +338,7 @@ def _touching(function: Any, before: Any) -> Any:
 
 
 @functools.cache
-def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
+def stencil_struct(d: DataType, w: DataType, pattern: Pattern | None = None) -> DataType:
     """Return the struct of a stencil with these types of diagonal and weights.
 
     It is a 7-point stencil, unless there is a pattern.
@@ -310,6 +356,26 @@ def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
     return make_struct(name, members | dict.fromkeys(fields, wp.array(dtype=w)))
 
 
+class KernelStencil(Protocol):
+    """Stencil that kernels take: `warp_lcp.operators.padded_stencil.PaddedStencil`, or a product.
+
+    Attributes:
+        d: diagonal, a flat stored field.
+        weights: of the neighbors, stored; None: numbers, or none.
+        pattern: of a compact stencil; None: 7 points.
+        struct: arguments of kernels.
+    """
+
+    @property
+    def d(self) -> DeviceArray: ...  # noqa: D102
+    @property
+    def weights(self) -> tuple[DeviceArray, ...] | None: ...  # noqa: D102
+    @property
+    def pattern(self) -> Pattern | None: ...  # noqa: D102
+    @property
+    def struct(self) -> StructInstance: ...  # noqa: D102
+
+
 @dataclass(frozen=True)
 class PrecomputedProduct:
     """A precomputed product A x + b, passed to a kernel in place of a stencil.
@@ -322,13 +388,14 @@ class PrecomputedProduct:
         y: A x + b, stored.
     """
 
-    d: Any
+    d: DeviceArray
     unit: float
     y: DeviceArray
-    weights = None
+    weights: ClassVar[None] = None
+    pattern: ClassVar[None] = None
 
     @functools.cached_property
-    def struct(self) -> Any:
+    def struct(self) -> StructInstance:
         """Arguments of kernels."""
         check_memory("a known product", self.y, wp.float64, (self.d.size,))
         return put(
@@ -338,11 +405,11 @@ class PrecomputedProduct:
 
 
 @functools.cache
-def _blank_stencil(d: Any) -> Any:
+def _blank_stencil(d: DataType) -> StructInstance:
     return stencil_struct(d, wp.float32)()
 
 
-def make_struct(name: str, members: dict[str, Any]) -> Any:
+def make_struct(name: str, members: dict[str, DataType | DeviceArray]) -> DataType:
     """Return a Warp struct with these members.
 
     Make each struct once: annotations of arrays do not compare equal.
@@ -372,23 +439,23 @@ class Rows:
         alignments: where rows of fields begin, and those of the other level.
     """
 
-    summed: Any
-    single: Any
+    summed: RowLayout
+    single: RowLayout
     size: int
     other_size: int
     device: wp.Device
     place: Mapping[str, int] = field(default_factory=dict)
     ends: tuple[int, ...] = ()
     weight: int = 1
-    memory: Any = None
-    quads: Any = None
+    memory: "RowsMemory | None" = None
+    quads: "RowLayout | None" = None
     alignments: tuple[Alignment, Alignment] = (ANYWHERE, ANYWHERE)
 
     @staticmethod
     def of(
         padding: Padding,
         device: wp.Device,
-        spans: Any = None,
+        spans: DeviceArray | None = None,
         *,
         whole: bool = False,
         more: int = 0,
@@ -463,10 +530,10 @@ class Rows:
         return self._changed(turn=1)
 
     def _changed(self, **members: int) -> "Rows":
-        change = lambda layout: None if layout is None else put(copy_of(layout), members)  # noqa: E731
-        single = change(self.single)
-        summed = single if self.summed is self.single else change(self.summed)
-        return replace(self, single=single, summed=summed, quads=change(self.quads))
+        single = put(copy_of(self.single), members)
+        summed = single if self.summed is self.single else put(copy_of(self.summed), members)
+        quads = None if self.quads is None else put(copy_of(self.quads), members)
+        return replace(self, single=single, summed=summed, quads=quads)
 
     @staticmethod
     def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":
@@ -592,11 +659,11 @@ class Rows:
     def strided(
         size: int,
         device: wp.Device,
-        first: Any,
-        counts: Any,
-        spans: Any = None,
-        cells: Any = None,
-        slab: Any = None,
+        first: Sequence[int],
+        counts: Sequence[int],
+        spans: DeviceArray | None = None,
+        cells: int | None = None,
+        slab: int | None = None,
         *,
         quads: bool = False,
     ) -> "Rows":
@@ -659,7 +726,7 @@ class Rows:
         return made[1]
 
     @functools.cached_property
-    def _pairs(self) -> dict[tuple[int, Any], tuple["Rows", "Rows"]]:
+    def _pairs(self) -> dict[tuple[int, tuple[int, int, int]], tuple["Rows", "Rows"]]:
         """Cache of rows paired with those of another level.
 
         The key is the other level and the factors between both.
@@ -702,7 +769,7 @@ class Rows:
         return planes * rows * chunks
 
 
-def _alignment(layout: Any) -> Alignment:
+def _alignment(layout: RowLayout) -> Alignment:
     """Return the alignment of rows, for reading fields in blocks."""
     first, plane, row = layout.base % 4, layout.s1 % 4, layout.s2 % 4
     if layout.planes * layout.rows * layout.nx < MANY_CELLS_OF_BLOCKS:
@@ -722,6 +789,6 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
     return Rows.by_turns(size, device, min(size, QUAD * CUDA_THREADS), quads=True)
 
 
-def threads(layout: Any) -> tuple[int, int, int]:
+def threads(layout: RowLayout) -> tuple[int, int, int]:
     """Return the number of threads of a launch, by dimension."""
     return -(-layout.planes // layout.slab), layout.rows, layout.chunks

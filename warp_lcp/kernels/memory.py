@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import ctypes
 import struct
-from typing import Any
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import warp as wp
 
-from warp_lcp.kernels.layout import RowLayout
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.layout import RowLayout, native_of, offset_of
+from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
 
-_BLANK: Any = RowLayout()
-LAYOUT = type(_BLANK.__ctype__())
-LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
-_ARRAY: Any = type(wp.array(dtype=wp.uint8).__ctype__())
-ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), _ARRAY.shape.offset
+LAYOUT = type(native_of(RowLayout()))
+LAYOUT_BYTES, BOX_OFFSET = ctypes.sizeof(LAYOUT), offset_of(LAYOUT, "nx")
+_ARRAY = type(native_of(wp.array(dtype=wp.uint8)))
+ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), offset_of(_ARRAY, "shape")
 # Members of a RowLayout from `nx` to `slab`; first (k, j, i).
 BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")
-FORMATS: dict[Any, Any] = {
+Cell: TypeAlias = "ctypes._SimpleCData[Any]"  # memory of one number
+FORMATS: dict[DataType, type[Cell]] = {
     wp.float32: ctypes.c_float,
     wp.float64: ctypes.c_double,
     wp.int32: ctypes.c_int32,
@@ -45,7 +45,7 @@ class Scalar:
     __slots__ = ("_cells", "_scaled", "_value")
 
     def __init__(self, value: float = 0) -> None:
-        self._cells: dict[Any, Any] = {}  # the number in each type that kernels use
+        self._cells: dict[type[Cell], Cell] = {}  # the number in each type that kernels use
         self._scaled: dict[float, Scalar] = {}
         self._value = value
 
@@ -68,22 +68,27 @@ class Scalar:
             self._scaled[factor] = Scalar(self._value * factor)
         return self._scaled[factor]
 
-    def address(self, kind: Any) -> tuple[int, int]:
+    def address(self, kind: DataType) -> tuple[int, int]:
         """Return the address and the bytes of the number in one of Warp's types."""
-        kind = FORMATS[kind]
-        if kind not in self._cells:
-            self._cells[kind] = kind(self._value)
-        return ctypes.addressof(self._cells[kind]), ctypes.sizeof(kind)
+        cell = FORMATS[kind]
+        if cell not in self._cells:
+            self._cells[cell] = cell(self._value)
+        return ctypes.addressof(self._cells[cell]), ctypes.sizeof(cell)
 
 
-def scaled(number: float | Scalar, factor: float) -> Any:
+KernelArgument: TypeAlias = "DeviceArray | StructInstance | Scalar | float | None"
+"""Argument of a kernel: an array, a struct, a number, or None for an empty array."""
+Argument = TypeVar("Argument")
+
+
+def scaled(number: float | Scalar, factor: float) -> float | Scalar:
     """Return a number times a factor."""
     return number.scaled(factor) if isinstance(number, Scalar) else number * factor
 
 
-def value_of(number: Any) -> Any:
+def value_of(number: Argument | Scalar) -> Argument | float:
     """Return a number, or the present value of a `Scalar`."""
-    return number.value if type(number) is Scalar else number
+    return number.value if isinstance(number, Scalar) else number
 
 
 class Slot:
@@ -98,20 +103,38 @@ class Slot:
         self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
         self.address = ctypes.addressof(self._memory)
         self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
-        self._held: Any = None  # the last store passed to `point_to_first`
+        self._held: DeviceArray | None = None  # the last store passed to `point_to_first`
 
     def point_to(self, array: DeviceArray) -> None:
         """Make recorded launches use this array from now on."""
         self._held = None
-        ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
+        ctypes.memmove(self.address, ctypes.addressof(native_of(array)), ARRAY_BYTES)
         array.slot = self
 
     def point_to_first(self, count: int, store: DeviceArray) -> None:
         """Make recorded launches use the first elements of a flat array from now on."""
         if self._held is not store:
-            ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
+            ctypes.memmove(self.address, ctypes.addressof(native_of(store)), ARRAY_BYTES)
             self._held = store
         self._length.value = count
+
+
+def slot_of(argument: KernelArgument) -> Slot | None:
+    """Return the slot of an array that is replaced between runs; None of other arguments."""
+    slot: Slot | None = vars(argument).get("slot") if isinstance(argument, wp.array) else None
+    return slot
+
+
+class Extent(Protocol):
+    """Memory of launch dimensions that change between runs.
+
+    Attributes:
+        extent: dimensions of a launch now.
+        room: those of a captured launch: the largest so far.
+    """
+
+    extent: tuple[int, ...]
+    room: tuple[int, ...]
 
 
 class RowsMemory:
@@ -151,7 +174,7 @@ class RowsMemory:
     ) -> None:
         """Set the rows to whole rows of a box, see `RowLayout`."""
         ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
-        BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
+        BOX.pack_into(self.layout, BOX_OFFSET, nx, rows, planes, grain, chunks, 1)
         PLACE.pack_into(self.place, 0, *place)
         self.tasks.value = planes * rows * chunks
 
@@ -164,7 +187,7 @@ class RowsMemory:
         self.take_box(count, 1, 1, cells, chunks, (0, 0, 0))
         return chunks
 
-    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+    def take(self, layout: RowLayout, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Set the rows.
 
         Args:
@@ -172,7 +195,7 @@ class RowsMemory:
             place: first (k, j, i).
         """
         ctypes.memmove(
-            ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES
+            ctypes.addressof(self.layout), ctypes.addressof(native_of(layout)), LAYOUT_BYTES
         )
         self.place[:] = list(place)
         self.tasks.value = -(-layout.planes // max(layout.slab, 1)) * layout.rows * layout.chunks
@@ -200,7 +223,7 @@ class DeviceRows(RowsMemory):
         self.room: tuple[int, ...] = (1, 1, 1)
         self.places, self.spare = Scalar(), spare
 
-    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+    def take(self, layout: RowLayout, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Set the rows and their launch dimensions."""
         super().take(layout, place)
         self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks

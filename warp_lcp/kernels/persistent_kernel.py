@@ -9,7 +9,6 @@ tasks than a block has threads.
 
 import functools
 import math
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,8 +16,10 @@ import warp as wp
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.kernel_variant import KernelVariant
 from warp_lcp.kernels.launch_graph import Launch, launch_now, perform
-from warp_lcp.kernels.layout import RowLayout, make_struct, threads
+from warp_lcp.kernels.layout import RowLayout, make_struct, native_of, put, threads
 from warp_lcp.kernels.stencil_kernel import BoundKernel
+from warp_lcp.kernels.thread_pool import Operation
+from warp_lcp.kernels.types import DataType, StructInstance
 
 CUDA_THREADS = 512  # threads of a block that inverts a matrix
 THREADS = 256  # threads of a block that executes kernels: with 512 they spill registers
@@ -78,20 +79,20 @@ class PersistentKernel:
         self._name = name
         self.kernel, self._Tables, self._structs = _sequence_kernel(name, forms, clustered)
 
-    def kernel_by_quads(self, *, clustered: bool) -> Any:
+    def kernel_by_quads(self, *, clustered: bool) -> wp.Kernel:
         """Return the kernel as a GPU launches it, by one block or a cluster of them."""
         forms = tuple(dict.fromkeys(form.by_quads or form for form in self._forms))
         return _sequence_kernel(self._name, forms, clustered)[0]
 
     @functools.cached_property
-    def tables(self) -> Any:
+    def tables(self) -> StructInstance:
         """Tables of the kernels by variant, and the order of execution."""
         places = dict[int, tuple[int, int]]()
         kept: list[list[bytes]] = [[] for _ in self._forms]
         for bound in {id(stage): stage for stage in self._stages}.values():
             which = self._forms.index(bound.form)
             places[id(bound)] = which, len(kept[which])
-            kept[which].append(bytes(bound.layout.__ctype__()) + bound.arguments)
+            kept[which].append(bytes(native_of(bound.layout)) + bound.arguments)
         made = self._Tables()
         made.order = wp.array(
             [places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device
@@ -102,7 +103,7 @@ class PersistentKernel:
             # A recorded launch holds the tables alone, so the tables must hold the arrays whose
             # addresses they have.
             typed.kept = stored, self._stages
-            setattr(made, table, typed)
+            put(made, {table: typed})
         return made
 
     def launch(self, launch: Launch = launch_now) -> None:
@@ -111,7 +112,7 @@ class PersistentKernel:
             inputs = [self.tables, 0, len(self._stages), self.threads]
             launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
             return
-        made: dict[int, Any] = {}  # operations of the thread pool for repeated kernels
+        made: dict[int, Operation | None] = {}  # operations of the thread pool for repeated kernels
         for stage in self._stages:
             key = id(stage)
             if key not in made:
@@ -156,7 +157,7 @@ def has_clusters(device: wp.Device) -> bool:
 
 
 @functools.cache
-def _shared(form: KernelVariant | None) -> Any:
+def _shared(form: KernelVariant | None) -> tuple[DataType, wp.Function]:
     """Return the struct of a kernel with its arguments, and its sharing function.
 
     The function distributes the kernel's rows over threads.
@@ -177,7 +178,9 @@ def _shared(form: KernelVariant | None) -> Any:
 
 
 @functools.cache
-def _sequence_kernel(name: str, forms: tuple[KernelVariant, ...], clustered: bool) -> Any:
+def _sequence_kernel(
+    name: str, forms: tuple[KernelVariant, ...], clustered: bool
+) -> tuple[wp.Kernel, DataType, tuple[DataType, ...]]:
     # Warp needs a branch for each variant; unused ones have empty arguments and do nothing.
     (One, first), (Two, second), (Three, third), (Four, fourth), (Five, fifth) = (
         _shared(form) for form in (*forms, *(None,) * (MOST - len(forms)))

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import gc
 import weakref
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import zeros
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 
 BYTES = 1 << 15  # of a buffer: its transfer takes as long as that of eight bytes
 LINE = 64  # bytes of a cache line, which no two readings share
@@ -34,7 +33,7 @@ class DeviceScalar:
     _board: ReadbackBuffer | None
     _view: np.ndarray  # view of an array in host memory
 
-    def __init__(self, device: wp.Device, count: int = 1, dtype: Any = wp.float64) -> None:
+    def __init__(self, device: wp.Device, count: int = 1, dtype: DataType = wp.float64) -> None:
         self.array: DeviceArray
         self._board, self._change = None, 0
         if not device.is_cuda:

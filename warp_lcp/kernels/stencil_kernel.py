@@ -5,12 +5,14 @@ They can be composed to fused kernels. A row function sees a piece: pointers to 
 number n of its cells, the offsets ym, yp, zm, zp of the rows beside it.
 """
 
+from __future__ import annotations
+
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from operator import attrgetter, index
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import warp as wp
 
@@ -29,11 +31,30 @@ from warp_lcp.kernels.kernel_variant import (
     make_kernels_of_module,
 )
 from warp_lcp.kernels.launch_graph import Launch, device_program, is_recording, perform
-from warp_lcp.kernels.layout import PrecomputedProduct, Rows, copy_of, put, threads
-from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar
+from warp_lcp.kernels.layout import (
+    BoundOperands,
+    KernelStencil,
+    PrecomputedProduct,
+    RowLayout,
+    Rows,
+    copy_of,
+    native_of,
+    offset_of,
+    put,
+    threads,
+)
+from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, KernelArgument, Scalar, slot_of
 from warp_lcp.kernels.native import sections
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
+from warp_lcp.kernels.types import DataType, DeviceArray, FieldType, StructInstance
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Getter: TypeAlias = "Callable[[DataclassInstance], Sequence[KernelArgument]]"
+Plan: TypeAlias = "tuple[tuple[str, ...], tuple[Getter | None, ...]]"
+
+ARRAYS = (wp.array, wp.indexedarray)
 BLOCK_BYTES = 16  # bytes that a thread loads at a time
 # Fields of one element a row that row functions only set, or find set: several threads may do so.
 FLAGGED = ("changed", "away")
@@ -116,22 +137,22 @@ class StencilKernel:
 
     name: str
     header: Path
-    compute: Any
-    stencil: tuple[Any, Any] | None = None
+    compute: FieldType
+    stencil: tuple[FieldType, FieldType] | None = None
     bounds: bool = False
-    reads: Mapping[str, Any] = field(default_factory=dict)
-    writes: Mapping[str, Any] = field(default_factory=dict)
+    reads: Mapping[str, FieldType] = field(default_factory=dict)
+    writes: Mapping[str, FieldType] = field(default_factory=dict)
     ring: tuple[str, ...] = ()
-    other: Mapping[str, Any] = field(default_factory=dict)
+    other: Mapping[str, FieldType] = field(default_factory=dict)
     finer: bool = False
-    by_row: Mapping[str, Any] = field(default_factory=dict)
-    whole: Mapping[str, Any] = field(default_factory=dict)
+    by_row: Mapping[str, FieldType] = field(default_factory=dict)
+    whole: Mapping[str, FieldType] = field(default_factory=dict)
     optional: tuple[str, ...] = ()
-    numbers: Mapping[str, Any] = field(default_factory=dict)
+    numbers: Mapping[str, FieldType] = field(default_factory=dict)
     sums: tuple[str, ...] = ()
     largest: tuple[str, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
-    box: Mapping[str, Any] = field(default_factory=dict)
+    box: Mapping[str, FieldType] = field(default_factory=dict)
     listed: str = ""
     ordered: bool = False
     by_cell: bool = False
@@ -225,7 +246,7 @@ class StencilKernel:
         return not (elsewhere or self.ordered or self.by_cell)
 
     @functools.cached_property
-    def arrays(self) -> dict[str, Any]:
+    def arrays(self) -> dict[str, FieldType]:
         """Types of all arrays by name.
 
         `out` receives the sums and maxima, a column each.
@@ -244,11 +265,11 @@ class StencilKernel:
     def bind(
         self,
         rows: Rows,
-        *structs: Any,
-        stencil: Any = None,
-        bounds: list[Any] | None = None,
-        **given: Any,
-    ) -> "BoundKernel":
+        *structs: DataclassInstance,
+        stencil: KernelStencil | None = None,
+        bounds: BoundOperands | None = None,
+        **given: KernelArgument,
+    ) -> BoundKernel:
         """Check the arguments of a launch and bind them.
 
         Args:
@@ -272,11 +293,11 @@ class StencilKernel:
     def bind_arguments(
         self,
         rows: Rows,
-        structs: tuple[Any, ...],
-        given: dict[str, Any],
-        stencil: Any = None,
-        bounds: list[Any] | None = None,
-    ) -> "BoundKernel":
+        structs: tuple[DataclassInstance, ...],
+        given: dict[str, KernelArgument],
+        stencil: KernelStencil | None = None,
+        bounds: BoundOperands | None = None,
+    ) -> BoundKernel:
         """Bind as `bind` does, with structs and keywords as containers.
 
         It serves functions that pass on the arguments of their callers. `given` is modified.
@@ -317,7 +338,10 @@ class StencilKernel:
                 f" in {', '.join(type(s).__name__ for s in structs)}" if structs and missing else ""
             )
             raise TypeError(f"{self.label}: missing {missing}{searched}, unknown {unknown}")
-        types = [getattr(given[n], "dtype", None) for n in self.arrays]
+        types = [
+            value.dtype if isinstance(value := given[n], ARRAYS) else type(value)
+            for n in self.arrays
+        ]
         kind, weights, stored = NUMBERS, None, ()
         if bounds:
             lower, _, upper, _, code = bounds
@@ -328,7 +352,7 @@ class StencilKernel:
                         f"{self.label}: bounds have {length} elements, not {rows.size}"
                     )
         if stencil is not None:
-            d, weights, pattern = stencil.d, stencil.weights, getattr(stencil, "pattern", None)
+            d, weights, pattern = stencil.d, stencil.weights, stencil.pattern
             stored = (type(stencil), pattern, d.dtype, weights[0].dtype if weights else None)
             if d.size != (rows.other_size if self.finer else rows.size):
                 raise ValueError(
@@ -363,7 +387,9 @@ class StencilKernel:
         self._check_memory(rows, given)
         return BoundKernel(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
 
-    def _with_members(self, structs: tuple[Any, ...], given: dict[str, Any]) -> dict[str, Any]:
+    def _with_members(
+        self, structs: tuple[DataclassInstance, ...], given: dict[str, KernelArgument]
+    ) -> dict[str, KernelArgument]:
         """Return the arguments among the structs' members, and those of `given`."""
         kinds = tuple([type(s) for s in structs])
         plan = self._members.get(kinds)
@@ -378,7 +404,7 @@ class StencilKernel:
         ]
         return {**dict(zip(names, values, strict=True)), **given}
 
-    def _plan(self, kinds: tuple[type, ...]) -> tuple[tuple[str, ...], tuple[Any, ...]]:
+    def _plan(self, kinds: tuple[type, ...]) -> Plan:
         """Return the arguments that structs of these classes have.
 
         For each class: a function that gets them, or None.
@@ -395,7 +421,7 @@ class StencilKernel:
         return names, tuple(_getter(share) for share in shares)
 
     def words(
-        self, letters: dict[str, Any], constants: Mapping[str, float], shape: str, bounds: str
+        self, letters: dict[str, DataType], constants: Mapping[str, float], shape: str, bounds: str
     ) -> list[str]:
         """Return the key of a kernel variant.
 
@@ -410,15 +436,21 @@ class StencilKernel:
         kinds = [shape] * bool(self.stencil) + [bounds] * (self.bounds and bounds != NUMBERS)
         return [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
 
-    def _fields_of_rows(self, given: dict[str, Any], stencil: Any, bounds: Any) -> list[Any]:
+    def _fields_of_rows(
+        self,
+        given: dict[str, KernelArgument],
+        stencil: KernelStencil | None,
+        bounds: BoundOperands | None,
+    ) -> list[DeviceArray | None]:
         """Return the fields that quads may read in blocks."""
         fields = [given[name] for name in (*self.reads, *self.writes, *self.other)]
         if stencil is not None:
-            fields += [stencil.d, *(stencil.weights or ()), getattr(stencil, "y", None)]
+            product = [stencil.y] if isinstance(stencil, PrecomputedProduct) else []
+            fields += [stencil.d, *(stencil.weights or ()), *product]
         return [*fields, *(bounds or ())[::2]]
 
     @functools.cached_property
-    def _members(self) -> dict[tuple[type, ...], Any]:
+    def _members(self) -> dict[tuple[type, ...], Plan]:
         """Cached results of `_with_members`, by the classes of structs."""
         return {}
 
@@ -427,13 +459,15 @@ class StencilKernel:
         return frozenset({*self.arrays, *self.numbers})
 
     @functools.cached_property
-    def _forms(self) -> dict[Any, KernelVariant]:
+    def _forms(self) -> dict[tuple[Hashable, ...], KernelVariant]:
         """Cached variants by types and constants, so that types are checked once."""
         return {}
 
-    def _letters(self, stencil: Any, given: dict[str, Any]) -> dict[str, Any]:
+    def _letters(
+        self, stencil: KernelStencil | None, given: dict[str, KernelArgument]
+    ) -> dict[str, DataType]:
         """Resolve the letters, and check the types of all arrays."""
-        letters: dict[str, Any] = {}
+        letters: dict[str, DataType] = {}
         seen: dict[str, str] = {}
         pairs = [(name, kind, given[name]) for name, kind in self.arrays.items()]
         if self.stencil is not None:
@@ -465,15 +499,15 @@ class StencilKernel:
         return letters | dict.fromkeys(self.letters - letters.keys(), wp.float32)
 
     @functools.cached_property
-    def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
+    def _lengths(self) -> list[tuple[Callable[[Rows], int] | None, tuple[str, ...]]]:
         """Names of the arrays of each length.
 
-        The key is the attribute of rows with that length; None: any length.
+        A function returns that length of rows; None: any length.
         """
         sized = (
-            ("size", {**self.reads, **self.writes}),
-            ("other_size", self.other),
-            ("count", self.by_row),
+            (attrgetter("size"), {**self.reads, **self.writes}),
+            (attrgetter("other_size"), self.other),
+            (attrgetter("count"), self.by_row),
         )
         groups = (
             *sized,
@@ -481,14 +515,14 @@ class StencilKernel:
         )
         return [(length, tuple(names)) for length, names in groups if names]
 
-    def _check_memory(self, rows: Rows, given: dict[str, Any]) -> None:
+    def _check_memory(self, rows: Rows, given: dict[str, KernelArgument]) -> None:
         device = rows.device
         for length, names in self._lengths:
-            expected = length and getattr(rows, length)
+            expected = None if length is None else length(rows)
             for name in names:
                 value = given[name]
                 found = 0 if value is None else value.size
-                if not found and name in self.optional and getattr(value, "slot", None) is None:
+                if not found and name in self.optional and slot_of(value) is None:
                     # An empty slice has an address. A list that grows is read when the launch runs.
                     given[name] = None
                 if found != expected is not None and (found or name not in self.optional):
@@ -519,25 +553,24 @@ class StencilKernel:
                 )
 
 
-def _getter(names: list[str]) -> Any:
+def _getter(names: list[str]) -> Getter | None:
     """Return a function from a struct to its members of these names.
 
     Returns None if there are no names.
     """
     if len(names) == 1:
-        return lambda s, name=names[0]: (getattr(s, name),)
+        get = attrgetter(names[0])
+        return lambda struct: (get(struct),)
     return attrgetter(*names) if names else None
 
 
-def in_blocks(fields: list[Any]) -> bool:
+def in_blocks(fields: list[DeviceArray | None]) -> bool:
     """Return whether all fields begin with an aligned block of 16 bytes.
 
     Their memory must not be replaced later.
     """
     arrays = [value for value in fields if isinstance(value, wp.array) and value.size]
-    return all(
-        value.ptr % BLOCK_BYTES == 0 and getattr(value, "slot", None) is None for value in arrays
-    )
+    return all(value.ptr % BLOCK_BYTES == 0 and slot_of(value) is None for value in arrays)
 
 
 class BoundKernel(NamedTuple):
@@ -554,16 +587,16 @@ class BoundKernel(NamedTuple):
     form: KernelVariant
     rows: Rows
     arguments: bytes
-    given: dict[str, Any]
-    kept: Any
+    given: dict[str, KernelArgument]
+    kept: tuple[KernelStencil | None, BoundOperands | None]
 
     @property
-    def fields(self) -> Any:
+    def fields(self) -> StructInstance:
         """The struct of arguments for Warp, which holds references to their memory."""
         return self.form.struct_of(self)
 
     @property
-    def layout(self) -> Any:
+    def layout(self) -> RowLayout:
         """Layout of the rows, for a kernel that sums or one that does not."""
         return (
             self.rows.summed
@@ -612,16 +645,16 @@ class BoundKernel(NamedTuple):
         """
         d, native, patches = self.form.declared, self.form.native, []
         if self.rows.memory is not None:
-            patches += self.rows.memory.patches(LAYOUT_BYTES + native.k0.offset if d.box else None)
+            patches += self.rows.memory.patches(
+                LAYOUT_BYTES + offset_of(native, "k0") if d.box else None
+            )
         for name in self.form.types:
-            if (slot := getattr(self.given[name], "slot", None)) is not None:
-                patches.append(
-                    (LAYOUT_BYTES + getattr(native, name).offset, slot.address, ARRAY_BYTES)
-                )
+            if (slot := slot_of(self.given[name])) is not None:
+                patches.append((LAYOUT_BYTES + offset_of(native, name), slot.address, ARRAY_BYTES))
         for name, kind in d.numbers.items():
             if type(number := self.given[name]) is Scalar:
                 kind = self.form.letters[kind] if isinstance(kind, str) else kind
-                patches.append((LAYOUT_BYTES + getattr(native, name).offset, *number.address(kind)))
+                patches.append((LAYOUT_BYTES + offset_of(native, name), *number.address(kind)))
         return patches
 
     def stage(self, lag: int = 0, **members: int) -> OperationKind:
@@ -633,7 +666,7 @@ class BoundKernel(NamedTuple):
         patches = self.patches() if is_recording() else ()
         return OperationKind(
             self.form.entry(self),
-            bytes(L.__ctype__()) + self.arguments,
+            bytes(native_of(L)) + self.arguments,
             self,
             L.rows * L.chunks,
             threads(L)[0],

@@ -14,19 +14,20 @@ import ctypes
 import functools
 import os
 import struct
+import sys
 import threading
 import time
 import warnings
 from array import array
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Sequence
 
 import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.layout import STRUCT, KernelValue
 from warp_lcp.kernels.native import shared
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray, Dimensions
 
 VARIABLE = "WARP_LCP_THREADS"
 # Environment variables in which MPI launchers give the number of ranks on this machine.
@@ -116,7 +117,7 @@ class TableEntry:
         launch: a recorded launch of it.
     """
 
-    def __init__(self, launch: Any) -> None:
+    def __init__(self, launch: wp.Launch) -> None:
         self.kernel, self.function = launch.kernel, launch.hooks.forward
         # The module stays loaded. The launch itself is not stored, as it would hold arrays.
         self._kept = launch.module_exec, launch.bounds
@@ -144,7 +145,7 @@ class OperationKind:
         self,
         entry: TableEntry,
         arguments: bytes,
-        kept: Any,
+        kept: object,
         plane_tasks: int = 1,
         planes: int = 1,
         lag: int = 0,
@@ -180,7 +181,7 @@ class OperationKind:
             where,
         )
 
-    def content(self) -> tuple[Any, ...]:
+    def content(self) -> tuple[Hashable, ...]:
         """Return the content of the operation, to compare recordings.
 
         It is the kernel, its arguments without the patched ones, and the patches; of a copy, its
@@ -242,7 +243,7 @@ class Operation:
             chunks,
         )
 
-    def content(self) -> tuple[Any, ...]:
+    def content(self) -> tuple[Hashable, ...]:
         """Return the operation's content, without values read from memory in each run."""
         return (
             self.words[0],
@@ -293,7 +294,7 @@ def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: in
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
 
 
-def copied(to: int, source: int, size: int, kept: Any) -> Operation:
+def copied(to: int, source: int, size: int, kept: object) -> Operation:
     """Return the copy of some bytes as an operation.
 
     Args:
@@ -367,7 +368,7 @@ class ThreadPool:
         for i, function in enumerate(_system()):
             self.words[CALLS + i] = function
         for name, word in MADE.items() if _system() else ():
-            getattr(ctypes.CDLL(None), name)(ctypes.c_void_p(self.address + 8 * word), None)
+            ctypes.CDLL(None)[name](ctypes.c_void_p(self.address + 8 * word), None)
         self.words[IDLE_SPINS] = SPINS[size > available_threads()]
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
@@ -441,7 +442,7 @@ class ThreadPool:
             worker.join()
         self.size = 1
 
-    def _retire(self, words: Any) -> None:
+    def _retire(self, words: array[int]) -> None:
         """Keep the former words while a late thread may still read them.
 
         The operations that they describe are done and may be freed.
@@ -467,14 +468,14 @@ def patience(table: OperationTable) -> int:
     return PATIENCE if table.again is None else int(min(PATIENCE, 1e9 * seconds_left()))
 
 
-def arguments_of(launch: Any) -> Any:
+def arguments_of(launch: wp.Launch) -> ctypes.Structure:
     """Return the memory of a recorded launch's arguments, in C's layout."""
     params = launch.params[1:]
     return _arguments(*map(type, params))(*params)
 
 
 @functools.cache
-def _arguments(*types: Any) -> Any:
+def _arguments(*types: type) -> type[ctypes.Structure]:
     return type(
         "LaunchArguments",
         (ctypes.Structure,),
@@ -497,21 +498,21 @@ class Signature:
         kernel: with arrays, vectors, structs, and numbers of `FORMATS`; others are left to Warp.
     """
 
-    def __init__(self, kernel: Any) -> None:
-        self.entries: dict[Any, tuple[TableEntry, Any]] = {}
+    def __init__(self, kernel: wp.Kernel) -> None:
+        self.entries: dict[Dimensions, tuple[TableEntry, type[ctypes.Structure]]] = {}
         self._kinds = [argument.type for argument in kernel.adj.args]
         formats = [] if kernel.is_generic else [_format(kind) for kind in self._kinds]
         self._packing = struct.Struct("".join(formats) + "0Q") if formats and all(formats) else None
-        structs = [kind for kind in self._kinds if isinstance(getattr(kind, "ctype", None), type)]
+        structs = [kind for kind in self._kinds if isinstance(kind, STRUCT)]
         self._structs = {kind: type(kind()) for kind in structs} if self._packing else {}
 
-    def check(self, inputs: Sequence[Any], memory: Any) -> None:
+    def check(self, inputs: Sequence[KernelValue], memory: ctypes.Structure) -> None:
         """Leave all packing to Warp from now on if Warp packs arguments differently."""
         mine = self.pack(inputs)
         if mine is not None and mine[: ctypes.sizeof(memory)] != bytes(memory):
             self._packing = None
 
-    def pack(self, inputs: Sequence[Any]) -> bytes | None:
+    def pack(self, inputs: Sequence[KernelValue]) -> bytes | None:
         """Return arguments packed as in C.
 
         Returns None where Warp should convert or reject one.
@@ -545,7 +546,7 @@ class Signature:
             return None
 
 
-def _format(kind: Any) -> str:
+def _format(kind: DataType | DeviceArray) -> str:
     """Return the `struct` format of an argument type, aligned as in C.
 
     It is "" for a type that cannot be packed.
@@ -554,21 +555,23 @@ def _format(kind: Any) -> str:
         return FORMATS[kind]
     if isinstance(kind, wp.array):
         return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
-    if isinstance(getattr(kind, "ctype", None), type):  # a struct
+    if isinstance(kind, STRUCT):
         return f"0{ALIGNED[ctypes.alignment(kind.ctype)]}{ctypes.sizeof(kind.ctype)}s"
     # Elements of a vector or a matrix.
     of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None
-    of = getattr(of, "_type_", "")
+    of = vars(of).get("_type_", "") if isinstance(of, type) else ""
     return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
 
 
 @functools.lru_cache(maxsize=256)
-def signature_of(kernel: Any) -> Signature:
+def signature_of(kernel: wp.Kernel) -> Signature:
     """Return the types of a kernel's arguments, and its entries."""
     return Signature(kernel)
 
 
-def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, bytes, Any]:
+def prepared(
+    kernel: wp.Kernel, dim: Dimensions, inputs: Sequence[KernelValue]
+) -> tuple[TableEntry, bytes, type[ctypes.Structure]]:
     """Return the table entry of a CPU kernel, its arguments, and their struct."""
     signature = signature_of(kernel)
     if (known := signature.entries.get(dim)) is not None and (
@@ -584,7 +587,7 @@ def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[TableEntry, 
     return made[0], bytes(memory), made[1]
 
 
-def launched_alone(launch: Any, kept: Any = None) -> Operation:
+def launched_alone(launch: wp.Launch, kept: object = None) -> Operation:
     """Return a recorded launch as an operation that is not cut.
 
     `kept` must live as long.
@@ -602,8 +605,8 @@ def _system() -> list[int]:
     """
     try:
         library = ctypes.CDLL(None)
-        addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM]
-        return [*addresses, getattr(time, "CLOCK_MONOTONIC", 1)]
+        addresses = [ctypes.cast(library[name], ctypes.c_void_p).value for name in SYSTEM]
+        return [*addresses, time.CLOCK_MONOTONIC]
     except (OSError, TypeError, AttributeError):
         return []
 
@@ -642,9 +645,7 @@ def _entry() -> TableEntry | None:
 
 def available_threads() -> int:
     """Return the cores that this process may use, shared among ranks of a machine."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     ranks = next((int(os.environ[name]) for name in RANKS if os.environ.get(name, "").isdigit()), 1)
     return min(max(cores // max(ranks, 1), 1), MOST_THREADS)
 
@@ -656,7 +657,7 @@ def _asked_threads() -> int:
     return _checked(value, VARIABLE)
 
 
-def _checked(value: Any, name: str) -> int:
+def _checked(value: int | str, name: str) -> int:
     try:
         count = int(value)
     except (TypeError, ValueError):
@@ -744,5 +745,5 @@ def _leave() -> None:
 
 
 atexit.register(_leave)
-if hasattr(os, "register_at_fork"):
+if sys.platform != "win32":
     os.register_at_fork(after_in_child=_forget)

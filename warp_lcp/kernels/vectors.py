@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, no_type_check
+from typing import TYPE_CHECKING, Protocol, TypeVar, no_type_check
 
 import numpy as np
 import warp as wp
@@ -19,8 +19,18 @@ from warp_lcp.kernels import Rows, StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.kernel_file import KernelFile
-from warp_lcp.kernels.launch_graph import Launch, Task, as_one_table, copy, is_recording, launch_now
+from warp_lcp.kernels.launch_graph import (
+    Launch,
+    Task,
+    as_one_table,
+    copy,
+    is_recording,
+    launch_now,
+    program_of,
+)
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.layout import BoundOperands, KernelStencil
+from warp_lcp.kernels.memory import DeviceRows, KernelArgument, Scalar, value_of
 from warp_lcp.kernels.native import HEADERS, text
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.thread_pool import Operation
@@ -29,6 +39,7 @@ from warp_lcp.kernels.types import DeviceArray
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+Entries = TypeVar("Entries", float, np.ndarray)
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks of the first stage of a sum of very many numbers
 KERNELS = KernelFile(Path(__file__).parent / "headers/vectors.h")
@@ -108,7 +119,7 @@ class Communicator(Protocol):
     All methods are collective and return the same on all ranks.
     """
 
-    def sum(self, values: Any) -> Any:
+    def sum(self, values: Entries) -> Entries:
         """Return sums over all parts, entry by entry."""
 
     def adding(self, sums: np.ndarray) -> Operation:
@@ -117,8 +128,11 @@ class Communicator(Protocol):
         It works in place and runs in the thread pool.
         """
 
-    def max(self, values: Any) -> Any:
+    def max(self, values: Entries) -> Entries:
         """Return the largest over all parts, entry by entry."""
+
+    def min(self, values: Entries) -> Entries:
+        """Return the smallest over all parts, entry by entry."""
 
     def any(self, condition: bool) -> bool:
         """Return whether a condition holds in some part."""
@@ -138,7 +152,7 @@ def segments_of(n: int) -> int:
 def fold(
     kernel: wp.Kernel,
     partials: wp.array[wp.float64],
-    n: Any,
+    n: int | Scalar,
     columns: int,
     out: wp.array[wp.float64],
     slot: int,
@@ -163,8 +177,8 @@ def fold(
         most: upper bound of n, where n is a `Scalar`.
         before: columns before the first that is reduced.
     """
-    device, segments = partials.device, segments_of(n if most is None else most)
-    launch = launch_recorded if is_recording() and not hasattr(launch, "__self__") else launch
+    device, segments = partials.device, segments_of(int(value_of(n)) if most is None else most)
+    launch = launch_recorded if is_recording() and program_of(launch) is None else launch
     if segments > 1:
         blocks = columns * segments * CUDA_BLOCK
         launch(
@@ -273,36 +287,45 @@ class Sums(Reduction):
         )
 
     def of(
-        self, declared: StencilKernel, *structs: DataclassInstance, slot: int = 0, **given: Any
+        self,
+        declared: StencilKernel,
+        *structs: DataclassInstance,
+        stencil: KernelStencil | None = None,
+        bounds: BoundOperands | None = None,
+        slot: int = 0,
+        **given: KernelArgument,
     ) -> np.ndarray:
         """Launch a kernel, bound as by `StencilKernel.bind`; return its sums.
 
         They are in `scalars` from a slot on.
         """
         with as_one_table(self.rows.device, self._across):
-            self._launch(declared, structs, given, slot, wp.launch)
+            self._launch(declared, structs, given, stencil, bounds, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
     def launch(
         self,
         declared: StencilKernel,
         *structs: DataclassInstance,
+        stencil: KernelStencil | None = None,
+        bounds: BoundOperands | None = None,
         slot: int = 0,
         launch: Launch = launch_now,
-        **given: Any,
+        **given: KernelArgument,
     ) -> None:
         """Launch a kernel, or record it; `reading` then has its sums from a slot on."""
-        self._launch(declared, structs, given, slot, launch)
+        self._launch(declared, structs, given, stencil, bounds, slot, launch)
 
     def _launch(
         self,
         declared: StencilKernel,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, Any],
+        given: dict[str, KernelArgument],
+        stencil: KernelStencil | None,
+        bounds: BoundOperands | None,
         slot: int,
         launch: Launch,
     ) -> None:
-        stencil, bounds = given.pop("stencil", None), given.pop("bounds", None)
         given["out"] = self.partials
         declared.bind_arguments(self.rows, structs, given, stencil, bounds).launch(launch)
         self.add_up(slot, columns=len(declared.sums), launch=launch)
@@ -338,9 +361,9 @@ class Tally:
         self,
         rows: Rows,
         *structs: DataclassInstance,
-        stencil: Any = None,
-        bounds: list[Any] | None = None,
-        **given: Any,
+        stencil: KernelStencil | None = None,
+        bounds: BoundOperands | None = None,
+        **given: KernelArgument,
     ) -> None:
         """Launch the kernel over rows, bound as by `StencilKernel.bind`.
 
@@ -352,9 +375,9 @@ class Tally:
         self,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, Any],
-        stencil: Any = None,
-        bounds: list[Any] | None = None,
+        given: dict[str, KernelArgument],
+        stencil: KernelStencil | None = None,
+        bounds: BoundOperands | None = None,
     ) -> None:
         """Launch as `take` does, with arguments as of `StencilKernel.bind_arguments`."""
         self._places, device = rows.places, rows.device
@@ -397,13 +420,14 @@ class Tally:
         self,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, Any],
-        stencil: Any,
-        bounds: Any,
+        given: dict[str, KernelArgument],
+        stencil: KernelStencil | None,
+        bounds: BoundOperands | None,
     ) -> None:
         """Record the kernel on CUDA, for as many places as the rows have in a run."""
         assert self._reading is not None
         memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
+        assert memory is None or isinstance(memory, DeviceRows)
         most = self._places if memory is None else math.prod(memory.room)
         places = self._places if memory is None else memory.places
         if self._partials.size < self._columns * most:

@@ -6,7 +6,7 @@ The scalars and the decision to continue are on the device; an iteration is one 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol, no_type_check
+from typing import ClassVar, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -126,6 +126,18 @@ class KrylovPreconditioner(Protocol):
         """Write z = M r."""
 
 
+@runtime_checkable
+class RecordedPreconditioner(KrylovPreconditioner, Protocol):
+    """Preconditioner whose launches are recorded.
+
+    Attributes:
+        program: writes z = M r.
+    """
+
+    @property
+    def program(self) -> CommandBuffer: ...  # noqa: D102
+
+
 class ConjugateGradient:
     """Preconditioned conjugate gradients for symmetric positive semi-definite A.
 
@@ -150,7 +162,7 @@ class ConjugateGradient:
         across: communicator; None if serial.
     """
 
-    _end_kernel: Any = end_kernel
+    _end_kernel: ClassVar[wp.Kernel] = end_kernel
 
     def __init__(
         self,
@@ -266,9 +278,9 @@ class ConjugateGradient:
 
     def _recorded(self) -> CommandBuffer | None:
         """Return an iteration as a program; None if the preconditioner is not recorded."""
-        cycle = getattr(self._preconditioner, "program", None)
-        if cycle is None:
+        if not isinstance(self._preconditioner, RecordedPreconditioner):
             return None
+        cycle = self._preconditioner.program
         program = CommandBuffer(self.device)
         program.extend(cycle)
         self._advance(program.launch)

@@ -161,7 +161,7 @@ class GMRES:
             self._sums.add_up(0, columns=count)
             self._combine(self._sums.scalars, self._q, count, sign=-1.0)
             column += self._sums.scalars.numpy()[:count]
-        return np.r_[column, np.sqrt(self._stored(count)[-1])]
+        return np.asarray(np.r_[column, np.sqrt(self._stored(count)[-1])])
 
     def _combine(
         self,
@@ -199,7 +199,7 @@ class GMRES:
             x=self._q,
             last=self._restart + 1,
         ).launch()
-        return self._sums.scalars.numpy()
+        return np.asarray(self._sums.scalars.numpy())
 
     def _rotate(self, k: int) -> None:
         """Make column k of H upper triangular by the old rotations and a new one."""

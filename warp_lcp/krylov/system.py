@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +15,20 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
 NORM = KERNELS["krylov.norm"]
 
 
+class KrylovMethod(Protocol):
+    """Krylov method for one system.
+
+    Attributes:
+        x: the solution, a stored field.
+    """
+
+    @property
+    def x(self) -> DeviceArray: ...  # noqa: D102
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Iterate from 0; return the number of iterations and the norm reached."""
+
+
 class KrylovSystem:
     """A system that a Krylov method solves; `r` is its right-hand side."""
 
@@ -22,7 +36,7 @@ class KrylovSystem:
 
     def _iterate_by(
         self,
-        method: Any,
+        method: KrylovMethod,
         weight: DeviceArray | None,
         rows: Rows | None = None,
         across: Communicator | None = None,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import scipy.sparse
@@ -19,9 +19,11 @@ from pyamg.strength import classical_strength_of_connection, symmetric_strength_
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import CommandBuffer
+from warp_lcp.kernels.memory import KernelArgument
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.data_types import SparseMatrix
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
@@ -262,7 +264,7 @@ class AggregateLevel:
             partial(self.A.relax, self.x, self.b, self.lower, self.upper, 1.0, forward=forward)
         )
 
-    def _launch(self, kernel: Any, dim: int, inputs: list[Any]) -> CycleStage:
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list[KernelArgument]) -> CycleStage:
         return Launches.of_kernel(kernel, dim, inputs, self.A.device)
 
 
@@ -282,7 +284,7 @@ class MonotoneAggregation:
     def __init__(self, A: SparseOperator) -> None:
         self.A, self._version, self._levels = A, -1, list[AggregateLevel]()
         self._program: CommandBuffer | None = None
-        self._fields: tuple[Any, ...] = ()
+        self._fields: tuple[DeviceArray, ...] = ()
 
     def refresh(self) -> bool:
         """Coarsen A if it has changed; return whether the method suits it.
@@ -345,7 +347,7 @@ def symmetric_part(host: scipy.sparse.csr_array) -> scipy.sparse.csr_matrix:
     return part
 
 
-def aggregated(strength: scipy.sparse.csr_matrix, stall: float) -> Any:
+def aggregated(strength: scipy.sparse.csr_matrix, stall: float) -> scipy.sparse.csr_matrix | None:
     """Return the aggregate of each unknown.
 
     Returns None if more than a share `stall` of the unknowns remain.
@@ -372,7 +374,9 @@ LEAST = 4  # fine unknowns for a coarse one: two splits of a five-point stencil 
 SPLIT_KEEPS = 0.9  # the largest share of the unknowns that a split may keep
 
 
-def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
+def coarse_points(
+    host: SparseMatrix,
+) -> tuple[scipy.sparse.csr_matrix, scipy.sparse.csr_matrix, np.ndarray] | None:
     """Return P, P'A P and the points of a nearly M-matrix A.
 
     A is a scipy.sparse matrix. Returns None where the coarse matrix is not smaller. A coarse

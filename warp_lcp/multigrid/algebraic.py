@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -21,7 +21,7 @@ from pyamg.strength import symmetric_strength_of_connection
 from warp_lcp.kernels import BoundKernel, KernelFile, Rows
 from warp_lcp.kernels.fields import kept, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import (
     densify_kernel,
@@ -44,13 +44,13 @@ INVERSE = KERNELS["algebraic.inverse"]
 SMOOTH = KERNELS["algebraic.smooth"]
 REMAINDER = KERNELS["algebraic.remainder"]
 WIDEST = np.iinfo(np.uint16).max  # most entries of a row whose positions are stored
-Matrix = Any  # a scipy.sparse.csr_array
+Matrix: TypeAlias = scipy.sparse.csr_array
 
 
 class DeviceMatrix:
     """A sparse matrix of any shape in compressed rows on the device."""
 
-    def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
+    def __init__(self, host: Matrix, real: DataType, device: wp.Device) -> None:
         self.shape, self.device = host.shape, device
         self.indptr, self.indices = (kept(v, wp.int32, device) for v in (host.indptr, host.indices))
         self.values = kept(host.data, real, device)
@@ -113,7 +113,12 @@ class AlgebraicLevel:
     """
 
     def __init__(
-        self, host: Matrix, real: Any, device: wp.Device, weights: tuple[float, float], visits: int
+        self,
+        host: Matrix,
+        real: DataType,
+        device: wp.Device,
+        weights: tuple[float, float],
+        visits: int,
     ) -> None:
         self.size, self.device, self.weights, self.visits = host.shape[0], device, weights, visits
         self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
@@ -121,7 +126,7 @@ class AlgebraicLevel:
         self.x, self.b, self.t, self.inverse = (zeros(self.size, real, device) for _ in range(4))
         self.P: DeviceMatrix | None = None
 
-    def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
+    def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: DataType) -> None:
         """Set the prolongation from a coarser level.
 
         `hosts` are A, P, R = P', and the patterns of A P and of the coarse matrix.
@@ -220,7 +225,7 @@ class AlgebraicHierarchy:
     """
 
     def __init__(
-        self, A: SparseOperator, real: Any, settings: AlgebraicSettings | None = None
+        self, A: SparseOperator, real: DataType, settings: AlgebraicSettings | None = None
     ) -> None:
         self.settings, self.real, self.source, self.device = (
             settings or AlgebraicSettings(),
@@ -362,7 +367,7 @@ def _coarsen(
     source: SparseOperator,
     A: Matrix,
     pattern: Matrix,
-    real: Any,
+    real: DataType,
     settings: AlgebraicSettings,
     most: int,
 ) -> list[AlgebraicLevel]:
@@ -444,7 +449,7 @@ def _places(A: Matrix, pattern: Matrix) -> np.ndarray:
         return np.arange(A.nnz)
     n = np.int64(A.shape[0])
     keys = [np.repeat(np.arange(n), np.diff(m.indptr)) * n + m.indices for m in (A, pattern)]
-    return np.searchsorted(keys[1], keys[0])
+    return np.asarray(np.searchsorted(keys[1], keys[0]))
 
 
 def _ones(matrix: Matrix) -> Matrix:

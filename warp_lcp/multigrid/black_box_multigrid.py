@@ -16,17 +16,18 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import warp as wp
 
 from warp_lcp.kernels import BoundKernel, KernelFile, Rows
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, recorded
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.dense_inverse import DenseInverse
+from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
 from warp_lcp.problem.protocol import HasStencil, Operator, has
@@ -88,12 +89,21 @@ class LineLevel:
     """
 
     def __init__(
-        self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool, visits: int = 1
+        self,
+        padding: Padding,
+        real: DataType,
+        device: wp.Device,
+        *,
+        symmetric: bool,
+        visits: int = 1,
     ) -> None:
         self.padding, self.device, self.visits, n = padding, device, visits, padding.size
         self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
         self.factors = 2 if padding.counts[2] > SHORT else 1, 2 if padding.counts[1] > SHORT else 1
-        make = lambda count: zeros(count * n, real, device)  # noqa: E731
+
+        def make(count: int) -> DeviceArray:
+            return zeros(count * n, real, device)
+
         self.weights, self.shares = make(8), make(4)
         self.restricts = self.shares if symmetric else make(4)
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))
@@ -262,7 +272,7 @@ class BlackBoxMultigrid:
     def __init__(
         self,
         stencil: PaddedStencil,
-        real: Any,
+        real: DataType,
         *,
         symmetric: bool,
         settings: CycleSettings | None = None,
@@ -357,4 +367,6 @@ def needs_lines(A: HasStencil) -> bool:
     if s.pattern is None or s.padding.counts[0] > 1 or any(s.periodic):
         return False
     along = sorted(s.mean_weights[:2])
-    return not (A.symmetric and getattr(A, "monotone", False) and along[0] >= EVEN * along[1])
+    return not (
+        A.symmetric and isinstance(A, GridOperator) and A.monotone and along[0] >= EVEN * along[1]
+    )

@@ -7,13 +7,13 @@ is fixed at 0. Positive semi-definite matrices need no pivoting.
 
 import functools
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.layout import RowLayout, stencil_struct
 from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, meet
+from warp_lcp.kernels.types import DataType
 
 square = wp.array2d(dtype=wp.float64)
 # Threshold relative to the coarsest level's diagonal: rounding error of a singular component's last
@@ -67,7 +67,7 @@ def beside(L: RowLayout, periodic: wp.vec3i, r: int, axis: int, way: int):
 
 
 @functools.cache
-def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
+def coarsest_kernels(variable: bool, d_type: DataType, real: DataType) -> SimpleNamespace:
     """Return the kernels `factor` and `invert`, each in a module of its own.
 
     `factor` computes L D L' by one thread, `invert` works by one block. Each takes long to compile.

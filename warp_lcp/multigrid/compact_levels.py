@@ -6,13 +6,12 @@ Patterns of aggregates, and memory of the weights.
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.layout import Pattern
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 
 Counts = tuple[int, int, int]
 
@@ -39,7 +38,7 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
 
 
 def weights_block(
-    pattern: Pattern, padding: Padding, real: Any, device: wp.Device
+    pattern: Pattern, padding: Padding, real: DataType, device: wp.Device
 ) -> tuple[DeviceArray, tuple[DeviceArray, ...]]:
     """Return memory for a pattern's weights, and its field for each weight.
 

@@ -21,12 +21,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol, Self
 
 import warp as wp
 
 from warp_lcp.kernels import BoundKernel, FusedKernel
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
+from warp_lcp.kernels.memory import KernelArgument
 
 
 class CycleStage(Protocol):
@@ -52,13 +53,13 @@ class CycleLevel(Protocol):
         See `CoarsestSolver` for the coarsest level.
         """
 
-    def descend(self, coarse: Any, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
+    def descend(self, coarse: Self, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
         """Return steps 1 and 2; x is taken as 0 if `from_zero`."""
 
-    def coarsen_bounds(self, coarse: Any) -> Iterable[CycleStage]:
+    def coarsen_bounds(self, coarse: Self) -> Iterable[CycleStage]:
         """Return step 3, unless it is part of step 2."""
 
-    def ascend(self, coarse: Any, *, projected: bool) -> Iterable[CycleStage]:
+    def ascend(self, coarse: Self, *, projected: bool) -> Iterable[CycleStage]:
         """Return steps 5 and 6."""
 
 
@@ -148,7 +149,9 @@ class Launches:
     function: Callable[..., object]
 
     @classmethod
-    def of_kernel(cls, kernel: Any, dim: int, inputs: list[Any], device: wp.Device) -> Launches:
+    def of_kernel(
+        cls, kernel: wp.Kernel, dim: int, inputs: list[KernelArgument], device: wp.Device
+    ) -> Launches:
         """Return the launch of a Warp kernel."""
         return cls(partial(_launch_kernel, kernel, dim, inputs, device))
 
@@ -158,7 +161,7 @@ class Launches:
 
 
 def _launch_kernel(
-    kernel: Any, dim: int, inputs: list[Any], device: wp.Device, *, launch: Launch
+    kernel: wp.Kernel, dim: int, inputs: list[KernelArgument], device: wp.Device, *, launch: Launch
 ) -> None:
     launch(kernel, dim, inputs, device=device)
 

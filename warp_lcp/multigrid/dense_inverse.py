@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -18,6 +18,10 @@ from warp_lcp.kernels.persistent_kernel import CUDA_THREADS
 from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
 from warp_lcp.multigrid.cycle import CycleStage
 from warp_lcp.multigrid.cycle_passes import ASSEMBLE, ELIMINATE, INVERT, SOLVE
+from warp_lcp.multigrid.stencil_level import StencilLevel
+
+if TYPE_CHECKING:
+    from warp_lcp.multigrid.black_box_multigrid import LineLevel
 
 
 class DenseInverse:
@@ -33,7 +37,7 @@ class DenseInverse:
         product: the kernel x = inverse b.
     """
 
-    def __init__(self, level: Any) -> None:
+    def __init__(self, level: StencilLevel | LineLevel) -> None:
         self.level, self._counts, self._device = (
             level,
             level.stencil.padding.counts,
@@ -99,6 +103,7 @@ class DenseInverse:
         The CPU computes L D L' and the columns of the inverse; CUDA uses Gauss-Jordan elimination
         by one block.
         """
+        assert isinstance(self.level, StencilLevel)
         s, changed, real, m = (
             self.level.stencil,
             self.level.changed,
@@ -137,6 +142,7 @@ class DenseInverse:
 
     def _sweeps(self, *, from_zero: bool) -> Iterator[CycleStage]:
         """Yield projected pairs of sweeps, forward and backward: symmetric."""
+        assert isinstance(self.level, StencilLevel)
         level, settings = self.level, self.level.settings
         on_cpu = self._device.is_cpu
         pairs = settings.projected_sweeps if on_cpu else settings.projected_sweeps_cuda

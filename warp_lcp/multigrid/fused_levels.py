@@ -8,14 +8,16 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Iterable
 from collections.abc import Sequence as Listed
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_lcp.kernels import PersistentKernel
+from warp_lcp.kernels import BoundKernel, PersistentKernel
+from warp_lcp.kernels.launch_graph import Task
 from warp_lcp.kernels.persistent_kernel import has_clusters
-from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle
+from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle, CycleStage
 
 if TYPE_CHECKING:
     from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -42,9 +44,9 @@ class FusedCoarseLevels:
     @functools.cached_property
     def coarsening(self) -> PersistentKernel:
         """Stages that compute all levels from the first one."""
-        stages: list[Any] = [
+        stages = _kernels(
             s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)
-        ]
+        )
         return PersistentKernel("small_levels.coarsen", stages)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> tuple[PersistentKernel]:
@@ -52,11 +54,20 @@ class FusedCoarseLevels:
         key = visits, projected, from_zero
         if key not in self._sequences:
             cycle = Cycle(self.levels, self._solve, projected)
-            stages: list[Any] = list(cycle.stages(visits=visits, from_zero=from_zero))
+            stages = _kernels(cycle.stages(visits=visits, from_zero=from_zero))
             self._sequences[key] = PersistentKernel(
                 "small_levels.projected" if projected else "small_levels.cycle", stages
             )
         return (self._sequences[key],)
+
+
+def _kernels(stages: Iterable[CycleStage | Task]) -> list[BoundKernel]:
+    """Return stages, all of which are kernels: small levels lie in one process."""
+    kernels = []
+    for stage in stages:
+        assert isinstance(stage, BoundKernel), "levels in one launch consist of kernels"
+        kernels.append(stage)
+    return kernels
 
 
 def cells_of_one_launch(settings: CycleSettings, device: wp.Device) -> int:

@@ -14,6 +14,7 @@ import warp as wp
 from warp_lcp.kernels import BoundKernel, Rows
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Launch
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import CONVERT
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.cycle import CycleStage, Leg
@@ -187,7 +188,7 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
 
 
 def _sweeps_beside(
-    level: StencilLevel, y: Any, x: Any, depth: int, *, projected: bool
+    level: StencilLevel, y: DeviceArray, x: DeviceArray, depth: int, *, projected: bool
 ) -> Iterator[BoundKernel]:
     """Yield one of a leg's sweeps, from x to y, in cells near those of others.
 

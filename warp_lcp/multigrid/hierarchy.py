@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Required, TypedDict
 
 import warp as wp
 
@@ -17,7 +17,7 @@ from warp_lcp.kernels import BoundKernel, FusedKernel, Rows
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer, copy, recording
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import convert
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
@@ -38,6 +38,18 @@ from warp_lcp.multigrid.fused_levels import FusedCoarseLevels, cells_of_one_laun
 from warp_lcp.multigrid.halo_levels import share_changes, whole_counts
 from warp_lcp.multigrid.stencil_level import Pair, StencilLevel
 from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kernel
+
+
+class HierarchyOptions(TypedDict, total=False):
+    """Options of a `Hierarchy`, as it explains them."""
+
+    bounded: Required[bool]
+    settings: CycleSettings | None
+    bounds: Pair | None
+    shifted: bool
+    shrunk: float
+    strength: list[float] | None
+    finest: StencilLevel | None
 
 
 class Hierarchy:
@@ -66,7 +78,7 @@ class Hierarchy:
     def __init__(
         self,
         stencil: PaddedStencil,
-        real: Any,
+        real: DataType,
         *,
         bounded: bool,
         settings: CycleSettings | None = None,
@@ -273,7 +285,8 @@ class Hierarchy:
         """Record the gathering of the last level's stencil, and the levels below it."""
         assert self._gathered is not None
         ours, finest = self.levels[-1].stencil, self._gathered.finest
-        gathering: Any = ours.ghosts.gathering  # type: ignore[union-attr]
+        assert ours.ghosts is not None
+        gathering = ours.ghosts.gathering
         theirs = finest.stencil
         for mine, whole in zip(
             (ours.d, *(ours.weights or ())), (theirs.d, *(theirs.weights or ())), strict=True
@@ -350,8 +363,8 @@ class Hierarchy:
         s, counts = fine.stencil, fine.stencil.padding.counts
         whole = whole_counts(s)
         factors = self._factors(whole)
-        fewer: Any = tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True))
-        padding = Padding(fewer, s.padding.small_pages)
+        nz, ny, nx = (-(-n // f) for n, f in zip(counts, reversed(factors), strict=True))
+        padding = Padding((nz, ny, nx), s.padding.small_pages)
         # A coarse face sums as many finer ones as cells are aggregated along the other axes.
         for axis in range(3):
             self._strength[axis] *= math.prod(factors) / factors[axis]
@@ -408,7 +421,7 @@ class Hierarchy:
 
 def _finest_level(
     stencil: PaddedStencil,
-    real: Any,
+    real: DataType,
     settings: CycleSettings,
     *,
     bounded: bool,

@@ -6,16 +6,16 @@ There is a hierarchy for each direction of strong coupling.
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import Rows
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid.cycle import CycleStage
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.multigrid.hierarchy import Hierarchy, HierarchyOptions
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.sparse import GATHER
 
@@ -47,21 +47,29 @@ class MultipleSemicoarsening(Hierarchy):
     """
 
     def __init__(
-        self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any
+        self,
+        stencil: PaddedStencil,
+        real: DataType,
+        strengths: list[Strength],
+        **options: Unpack[HierarchyOptions],
     ) -> None:
         settings = options.pop("settings", None) or CycleSettings()
         # A fused launch of all levels starts from x = 0, so the finest level must not be part of
         # it.
         fewer = math.prod(stencil.padding.counts) - 1
-        names = ("one_launch_cpu", "one_launch_cuda", "one_launch_cluster")
         settings = replace(
-            settings, **{name: min(getattr(settings, name), fewer) for name in names}
+            settings,
+            one_launch_cpu=min(settings.one_launch_cpu, fewer),
+            one_launch_cuda=min(settings.one_launch_cuda, fewer),
+            one_launch_cluster=min(settings.one_launch_cluster, fewer),
         )
-        super().__init__(stencil, real, **options, settings=settings)
+        self.companions: list[Hierarchy] = []  # `refresh` of the base comes before theirs exist
+        options["settings"] = settings
+        super().__init__(stencil, real, **options)
         # W-cycles save a step in ten and cost two to four times as much.
         options["settings"] = replace(settings, gamma=1)
         self.companions = [
-            Hierarchy(stencil, real, **options, strength=strength, finest=self.finest)
+            Hierarchy(stencil, real, **options | {"strength": strength, "finest": self.finest})
             for strength in strengths
         ]
         self._marks = wp.zeros_like(self.finest.changed)
@@ -77,7 +85,7 @@ class MultipleSemicoarsening(Hierarchy):
     def refresh(self) -> None:
         """Update the operator's rows and weights."""
         super().refresh()
-        for companion in getattr(self, "companions", ()):
+        for companion in self.companions:
             companion.refresh()
 
     def rebuild_changed(self) -> None:
@@ -104,7 +112,9 @@ class MultipleSemicoarsening(Hierarchy):
             yield from part.cycles[projected].stages(from_zero=place == 0)
 
 
-def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarchy:
+def make_hierarchy(
+    stencil: PaddedStencil, real: DataType, **options: Unpack[HierarchyOptions]
+) -> Hierarchy:
     """Return the hierarchy of a stencil; options as of `Hierarchy`."""
     strengths = turns(stencil) if stencil.ghosts is None else []
     return (
@@ -152,7 +162,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
 
 def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return how much the ratios of rows of weights differ, as a logarithm."""
-    return np.ptp(logs - other, axis=1)
+    return np.asarray(np.ptp(logs - other, axis=1))
 
 
 def _long(stencil: PaddedStencil) -> list[int]:
@@ -189,7 +199,9 @@ def _sampled(stencil: PaddedStencil) -> np.ndarray:
     counts = np.count_nonzero(faces, axis=2)
     # Blocks with few open faces are not representative.
     counted = (2 * counts >= sides[1])[:, long].all(axis=1)
-    return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
+    return np.asarray(
+        (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
+    )
 
 
 def _gathered(weights: DeviceArray, order: DeviceArray) -> np.ndarray:
@@ -197,4 +209,4 @@ def _gathered(weights: DeviceArray, order: DeviceArray) -> np.ndarray:
     GATHER.bind(
         Rows.flat(order.size, order.device), source=weights, order=order, taken=taken
     ).launch()
-    return taken.numpy().astype(np.float64)
+    return np.asarray(taken.numpy().astype(np.float64))

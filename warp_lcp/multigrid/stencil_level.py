@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
 
 from warp_lcp.kernels import BoundKernel, Rows, StencilKernel
 from warp_lcp.kernels.fields import nothing, zeros
 from warp_lcp.kernels.launch_graph import Task
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.memory import KernelArgument
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.compact_levels import mask
@@ -21,6 +22,9 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
 Pair = tuple[DeviceArray, DeviceArray]
+
+
+Bound = TypeVar("Bound")
 
 
 class StencilLevel:
@@ -46,7 +50,7 @@ class StencilLevel:
     def __init__(
         self,
         stencil: PaddedStencil,
-        real: Any,
+        real: DataType,
         settings: CycleSettings,
         *,
         bounded: bool,
@@ -66,7 +70,7 @@ class StencilLevel:
         self.block: DeviceArray | None = None
         self.factors = 1, 1, 1
         # Bound kernels by their keys: a W-cycle repeats few of them many times.
-        self._bound: dict[Any, Any] = {}
+        self._bound: dict[Hashable, Any] = {}
         # Visits by a cycle of the next finer level; reduction of cells since a level that was
         # visited more often.
         self.visits, self.shrunk = 1, 1.0
@@ -147,7 +151,7 @@ class StencilLevel:
         """Return the kernel that sums the residual over aggregates, by default all."""
         there = rows or self._coarser_rows(coarse)
 
-        def make() -> Any:
+        def make() -> BoundKernel:
             return passes.RESTRICT.bind(
                 there, stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b
             )
@@ -184,7 +188,7 @@ class StencilLevel:
 
     def filling(self, name: str) -> list[BoundKernel | Task]:
         """Return the exchange that fills the ghost cells of x or t."""
-        return self._once(name, lambda: self.stencil.fillings(getattr(self, name)))
+        return self._once(name, lambda: self.stencil.fillings({"x": self.x, "t": self.t}[name]))
 
     @cached_property
     def near(self) -> DeviceArray:
@@ -378,9 +382,9 @@ class StencilLevel:
         for w in coarse.stencil.weights or ():
             yield from coarse.stencil.fillings(w)
 
-    def _once(self, key: Any, make: Callable[[], Any]) -> Any:
+    def _once(self, key: Hashable, make: Callable[[], Bound]) -> Bound:
         """Return the bound kernel with this key, created at its first use."""
-        made = self._bound.get(key)
+        made: Bound | None = self._bound.get(key)
         if made is None:
             made = self._bound[key] = make()
         return made
@@ -415,17 +419,10 @@ class StencilLevel:
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
         lower, upper = self._sides(projected)
-        start: dict[str, Any] = {"from_zero": from_zero} if "from_zero" in kind.numbers else {}
-        make = lambda: kind.bind(  # noqa: E731
-            rows or self.stencil.rows,
-            stencil=self.stencil,
-            x=x,
-            y=y,
-            b=self.b,
-            lower=lower,
-            upper=upper,
-            omega=omega,
-            projected=projected,
-            **start,
+        start = {"from_zero": from_zero} if "from_zero" in kind.numbers else {}
+        arguments: dict[str, KernelArgument] = {"x": x, "y": y, "b": self.b}
+        arguments |= {"lower": lower, "upper": upper, "omega": omega, "projected": projected}
+        make = lambda: kind.bind_arguments(  # noqa: E731
+            rows or self.stencil.rows, (), arguments | start, self.stencil
         )
         return self._once((kind, id(rows), y is self.x, omega, projected, from_zero), make)

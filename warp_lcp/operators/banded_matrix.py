@@ -35,12 +35,12 @@ class BandedMatrix:
     @property
     def diagonal(self) -> np.ndarray:
         """The main diagonal, shape (n,)."""
-        return self.bands[self.width]
+        return np.asarray(self.bands[self.width])
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x, shape (n,)."""
         n, k = len(x), self.width
-        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
+        return np.asarray(scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x))
 
     def solve(
         self, free: np.ndarray, r: np.ndarray, shift: np.ndarray | float = 0.0
@@ -79,7 +79,7 @@ def bandwidth(A: DenseOperator | SparseOperator) -> int:
     """Return the distance of the farthest entry from the diagonal."""
     if isinstance(A, SparseOperator):
         return A.bandwidth
-    return max(scipy.linalg.bandwidth(A.matrix.numpy()))
+    return int(max(scipy.linalg.bandwidth(A.matrix.numpy())))
 
 
 def bands_of(A: DenseOperator | SparseOperator, width: int) -> np.ndarray:
@@ -144,16 +144,20 @@ class BandedFactors:
     def solve(self, r: np.ndarray) -> np.ndarray:
         """Return C^-1 r, r of shape (m,) or (m, columns)."""
         s = self._back(r)
-        return s - np.multiply.outer(self._update, s[self._p] / self._denominator)
+        return np.asarray(s - np.multiply.outer(self._update, s[self._p] / self._denominator))
 
     def rows(self, indices: np.ndarray) -> np.ndarray:
         """Return rows of C^-1, shape (len(indices), m)."""
         unit = np.zeros((self.m, len(indices) + 1))
         unit[np.r_[indices, self._p], np.arange(len(indices) + 1)] = 1.0
         t = self._back(unit, transposed=True).T
-        return t[:-1] - np.multiply.outer(self._update[indices] / self._denominator, t[-1])
+        return np.asarray(
+            t[:-1] - np.multiply.outer(self._update[indices] / self._denominator, t[-1])
+        )
 
     def _back(self, r: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-        return scipy.linalg.lapack.dgbtrs(
-            self._lu, self.k, self.k, r, self._pivots, trans=int(transposed)
-        )[0]
+        return np.asarray(
+            scipy.linalg.lapack.dgbtrs(
+                self._lu, self.k, self.k, r, self._pivots, trans=int(transposed)
+            )[0]
+        )

@@ -6,17 +6,17 @@ Only the array of types is as large as the grid.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from warp_lcp.kernels.fields import real_array
+from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 
 TOGETHER = 1 << 20  # cells of a list that are processed together
 
 
-def cells_of(shape: Sequence[int], fluid: Any, solid: Any) -> np.ndarray:
+def cells_of(shape: Sequence[int], fluid: Values, solid: Values) -> np.ndarray:
     """Return cell types of a shape, int8; see `GridPoisson.from_cells`."""
     counts = tuple(shape)
     if len(counts) not in (2, 3) or not all(

@@ -22,7 +22,7 @@ from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.protocol import FLUID
 
-options: dict[str, Any] = {"module": "warp_lcp.components"}
+options: dict[str, str] = {"module": "warp_lcp.components"}
 F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 
@@ -165,7 +165,7 @@ class FloatingComponents:
         """Return sums over all ranks."""
         return sums if self._across is None else self._across.sum(sums)
 
-    def _largest(self, values: Any) -> Any:
+    def _largest(self, values: np.ndarray) -> np.ndarray:
         """Return the largest values over all ranks."""
         return values if self._across is None else self._across.max(values)
 
@@ -478,7 +478,7 @@ def _roots(parent: np.ndarray) -> np.ndarray:
     roots = parent[parent]
     while not np.array_equal(roots, roots[roots]):
         roots = roots[roots]
-    return roots
+    return np.asarray(roots)
 
 
 def numbered_components(
@@ -563,4 +563,4 @@ def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
         v[1:] = scipy.sparse.linalg.splu(exact[1:, 1:].tocsc()).solve(
             -exact[1:, [0]].toarray().ravel()
         )
-    return v / v.mean()
+    return np.asarray(v / v.mean())

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
 from warp_lcp.kernels.layout import make_struct
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
+from warp_lcp.problem.data_types import Matrix
 
 
 @functools.cache
-def matrix_rows(a_type: Any) -> Any:
+def matrix_rows(a_type: DataType) -> DataType:
     """Return the struct of a matrix in compressed rows; `col` may be empty: full rows."""
     members = {
         "ptr": wp.array(dtype=wp.int32),
@@ -55,13 +55,13 @@ class CompressedRows:
     values: DeviceArray
 
     @property
-    def operand(self) -> Any:
+    def operand(self) -> StructInstance:
         """Struct of the rows for kernels."""
         made = matrix_rows(self.values.dtype)()
         made.ptr, made.col, made.a = self.indptr, self.indices, self.values
         return made
 
-    def matrix(self) -> Any:
+    def matrix(self) -> Matrix:
         """Return the matrix on the host, float64.
 
         A scipy.sparse.csr_array, or numpy if every row is full, perhaps in the same memory.

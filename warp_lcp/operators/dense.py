@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -18,10 +17,12 @@ from warp_lcp.kernels.fields import (
     real_array,
     relative_rounding,
 )
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.operators.compressed_rows import CompressedRows
+from warp_lcp.problem.data_types import Matrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.protocol import Derivatives
 from warp_lcp.problem.scale import scale_of_matrix
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
@@ -61,7 +62,11 @@ class DenseOperator(Pickled):
         ValueError: the matrix is not square, empty or not finite.
     """
 
-    def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
+    shape: tuple[int, ...]
+
+    def __init__(
+        self, matrix: Matrix, *, device: wp.DeviceLike = None, dtype: DataType = wp.float64
+    ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         if scipy.sparse.issparse(matrix):
@@ -81,7 +86,7 @@ class DenseOperator(Pickled):
         self._rounding = relative_rounding(host, dtype)
         self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the current matrix."""
         return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
 
@@ -90,7 +95,7 @@ class DenseOperator(Pickled):
         """Number of rows, which are all unknowns."""
         return self.shape[0]
 
-    def update(self, values: Any) -> None:
+    def update(self, values: Values) -> None:
         """Replace the entries: shape (n, n), finite.
 
         `symmetric` and `row_sizes` keep their values.
@@ -116,7 +121,7 @@ class DenseOperator(Pickled):
 
     def host_diagonal(self) -> np.ndarray:
         """Return the diagonal of A on the host, shape (n,)."""
-        return self.matrix.numpy().diagonal()
+        return np.asarray(self.matrix.numpy().diagonal())
 
     def rows(self) -> CompressedRows:
         """Return the rows, in the operator's own memory."""
@@ -131,7 +136,7 @@ class DenseOperator(Pickled):
         """Return the natural residual's d, shape (n,), for the current entries."""
         return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
-    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> Derivatives:
         """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
 
         Shape (n, n), float64.
@@ -142,7 +147,7 @@ class DenseOperator(Pickled):
             )
         }
 
-    def masked(self, free: Any, shift: Any = None) -> DenseOperator:
+    def masked(self, free: Values, shift: Values | None = None) -> DenseOperator:
         """Return P A P + P D P with P the restriction to `free` and D = diag(shift).
 
         `free` has non-zero entries on the rows that stay.
@@ -154,7 +159,14 @@ class DenseOperator(Pickled):
         return DenseOperator(matrix, device=self.device, dtype=self.dtype)
 
     def relax(
-        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
+        self,
+        x: DeviceArray,
+        b: DeviceArray,
+        lower: DeviceArray,
+        upper: DeviceArray,
+        omega: float,
+        *,
+        forward: bool = True,
     ) -> None:
         """Sweep x once in row order, forward or backward, projected onto the bounds."""
         rows, matrix = Rows.flat(x.size, self.device, serial=True), self.matrix.flatten()
@@ -176,7 +188,7 @@ class DenseOperator(Pickled):
 
 @as_operator.register(np.ndarray)
 @as_operator.register(wp.array)
-def _dense(A: Any, device: Any = None, dtype: Any = wp.float64) -> DenseOperator:
+def _dense(A: Matrix, device: wp.DeviceLike = None, dtype: DataType = wp.float64) -> DenseOperator:
     return DenseOperator(
         A, device=A.device if device is None and isinstance(A, wp.array) else device, dtype=dtype
     )

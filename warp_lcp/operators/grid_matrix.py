@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -58,7 +57,7 @@ def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
     return matrix
 
 
-def _weights(A: HasStencil) -> Iterator[tuple[tuple[int, int, int], Any, bool]]:
+def _weights(A: HasStencil) -> Iterator[tuple[tuple[int, int, int], np.ndarray | float, bool]]:
     """Yield the neighbors of a cell and their weights.
 
     Each item is a step (x, y, z), its weight for each stored cell or everywhere, and whether the

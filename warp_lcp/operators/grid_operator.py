@@ -6,7 +6,7 @@ Cell types, padded storage, rows in use, products and sweeps.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
@@ -28,10 +28,12 @@ from warp_lcp.kernels.fields import (
 )
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.kernels.launch_graph import copy as copy_array
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Communicator
 from warp_lcp.operators.cell_lists import cells_of
+from warp_lcp.operators.components import ComponentFinder, FloatingComponents
 from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
+from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 
@@ -66,10 +68,13 @@ class GridOperator(Pickled):
     """
 
     symmetric = True
+    monotone = False  # whether all weights are known to be >= 0
+    # Search for floating components, or what it found for a version.
+    _finder: ComponentFinder | None = None
+    _found: tuple[int, FloatingComponents | None] | None = None
     stencil: PaddedStencil
     _ghosts: Ghosts | None = None  # of a box of cells among others
     _across: Communicator | None = None
-    _finder: Any = None  # of floating components
     _rounding = 0.0  # largest relative rounding of coefficients that were given as arrays
     outside = SOLID  # cell type beyond the array
     # Whether setting cells reads nothing from the device, so that it is recorded once.
@@ -77,11 +82,11 @@ class GridOperator(Pickled):
 
     def __init__(
         self,
-        cells: Any,
-        coefficients: dict[str, Any],
+        cells: Values,
+        coefficients: Mapping[str, object],
         periodic: tuple[bool, ...],
-        device: Any,
-        dtype: Any,
+        device: wp.DeviceLike,
+        dtype: DataType,
     ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
@@ -124,7 +129,9 @@ class GridOperator(Pickled):
         self._fill_stencil()
 
     @classmethod
-    def from_cells(cls, shape: Sequence[int], fluid: Any, solid: Any = (), **options: Any) -> Self:
+    def from_cells(
+        cls, shape: Sequence[int], fluid: Values, solid: Values = (), **options: Any
+    ) -> Self:
         """Create the operator of a grid from lists of its FLUID and SOLID cells.
 
         The other cells are AIR.
@@ -220,7 +227,14 @@ class GridOperator(Pickled):
         self.stencil.product(x, out, plus=b)
 
     def relax(
-        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
+        self,
+        x: DeviceArray,
+        b: DeviceArray,
+        lower: DeviceArray,
+        upper: DeviceArray,
+        omega: float,
+        *,
+        forward: bool = True,
     ) -> None:
         """Sweep stored fields once, each unknown projected onto its bounds.
 
@@ -245,7 +259,7 @@ class GridOperator(Pickled):
         across = self.layout.across
         return self._rounding if across is None else float(across.max(self._rounding))
 
-    def masked(self, free: Any, shift: Any = None) -> Self:
+    def masked(self, free: Values, shift: Values | None = None) -> Self:
         """Return the principal system P A P + P D P.
 
         P is the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0.
@@ -255,7 +269,8 @@ class GridOperator(Pickled):
         )
         twin = copy.copy(self)
         twin._refills = {}
-        twin._mask, twin._finder = wp.array(mask.astype(np.uint8), device=self.device), None
+        twin._mask = wp.array(mask.astype(np.uint8), device=self.device)
+        twin._finder = twin._found = None
         d, kind = self.stencil.d.numpy(), self.stencil.d.dtype
         if shift is not None:
             kind = self.dtype
@@ -361,7 +376,7 @@ class GridOperator(Pickled):
         self._find_rows()
         self._fill_stencil()
 
-    def _in_place(self, field: Any, name: str) -> bool:
+    def _in_place(self, field: Values, name: str) -> bool:
         """Return whether a coefficient field is the caller's padded array; check it."""
         if (
             not isinstance(field, wp.array)
@@ -376,7 +391,7 @@ class GridOperator(Pickled):
         check_coefficients(field.numpy(), self.dtype, name)
         return True
 
-    def _stored_shift(self, shift: Any) -> DeviceArray:
+    def _stored_shift(self, shift: Values | None) -> DeviceArray:
         """Return the shift as a padded array; empty if there is none."""
         if shift is None:
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
@@ -427,7 +442,7 @@ class GridOperator(Pickled):
         return Rows.of(self.layout.padding, self.device, self._reach)
 
 
-def _checked_cells(cells: Any) -> np.ndarray:
+def _checked_cells(cells: Values) -> np.ndarray:
     """Return cell types as a host array."""
     host = real_array(cells, "cells")
     if host.ndim not in (2, 3) or host.size == 0:
@@ -448,7 +463,7 @@ def _checked_cells(cells: Any) -> np.ndarray:
     return host
 
 
-def check_coefficients(values: np.ndarray, dtype: Any, name: str) -> None:
+def check_coefficients(values: np.ndarray, dtype: DataType, name: str) -> None:
     """Check that values are >= 0 and that their type can store them."""
     check_storable(values, dtype, name)
     check_kept(values, dtype, name)

@@ -9,14 +9,14 @@ import copy
 from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Array, overwrite, real_array
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import (
     ComponentFinder,
@@ -26,8 +26,9 @@ from warp_lcp.operators.components import (
 )
 from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import CellDecomposition, PaddedStencil
-from warp_lcp.problem.pickling import OnHost, made_again
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.problem.data_types import Values
+from warp_lcp.problem.pickling import OnHost, Reduced, made_again
+from warp_lcp.problem.protocol import AIR, FLUID, SOLID, Derivatives
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COUNT_FACES = KERNELS["grid_poisson.count_faces"]
@@ -38,7 +39,7 @@ FACE_GRADIENT = KERNELS["grid_poisson.face_gradient"]
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
-Face = Any  # a number or an array
+Face: TypeAlias = Array | float  # of all faces along an axis, or one number
 
 
 class PoissonArguments(TypedDict, total=False):
@@ -103,15 +104,15 @@ class GridPoisson(GridOperator):
 
     def __init__(
         self,
-        cells: Any,
+        cells: Values,
         *,
         face_x: Face = 1.0,
         face_y: Face = 1.0,
         face_z: Face = 1.0,
-        shift: Any = None,
+        shift: Values | None = None,
         periodic: tuple[bool, ...] = (False, False, False),
-        device: Any = None,
-        dtype: Any = wp.float32,
+        device: wp.DeviceLike = None,
+        dtype: DataType = wp.float32,
         decomposition: CellDecomposition | None = None,
     ) -> None:
         coefficients, self.decomposition = (
@@ -127,7 +128,7 @@ class GridPoisson(GridOperator):
             super().__init__(cells, coefficients, periodic, device, dtype)
 
     def _take_coefficients(
-        self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Any
+        self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Values | None
     ) -> None:
         """Store face coefficients and shift, numbers as numbers."""
         given = (face_x, face_y, face_z if cells.ndim == 3 else 1.0)
@@ -143,7 +144,7 @@ class GridPoisson(GridOperator):
         self.shift = self._stored_shift(shift)
         self._check_sums()
 
-    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> Derivatives:
         """Return the derivatives of mu'A x by face coefficients and shift.
 
         (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
@@ -156,7 +157,7 @@ class GridPoisson(GridOperator):
         for field in (multiplier, x):
             s.wrap(field)
         cells = self.cells_around.flatten()
-        derivatives: dict[str, Any] = {}
+        derivatives: Derivatives = {}
         if len(arrays) < len(self._given):
             totals = Sums(Rows.of(self.layout.padding, self.device), 4)
             values = totals.of(
@@ -281,7 +282,10 @@ class GridPoisson(GridOperator):
         for cached in ("_search", "_rows_in_reach"):
             twin.__dict__.pop(cached, None)
         s, kept = self.stencil, {id(field): wp.clone(field) for field in self._held()}
-        copy_of: Any = lambda field: kept[id(field)]  # noqa: E731
+
+        def copy_of(field: DeviceArray) -> DeviceArray:
+            return kept[id(field)]
+
         twin.cells, twin.cells_around, twin._spans, twin.shift = map(
             copy_of, (self.cells, self.cells_around, self._spans, self.shift)
         )
@@ -298,7 +302,7 @@ class GridPoisson(GridOperator):
             overwrite(to, source)
         self.version += 1
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle cells and coefficients; arrays are restored in the padded shape."""
         cells, options = self._pickled()
         given = {
@@ -314,7 +318,7 @@ class GridPoisson(GridOperator):
         }
         return faces | {"shift": self.shift if self.shift.size else None}
 
-    def _stored_face(self, face: Face, axis: int) -> DeviceArray:
+    def _stored_face(self, face: Array, axis: int) -> DeviceArray:
         """Return the coefficients of lower faces as a padded array.
 
         Empty for a number.
@@ -375,8 +379,8 @@ class GridPoisson(GridOperator):
     def _empty_stencil(self) -> PaddedStencil:
         """Allocate the stencil: a count of faces in one byte if coefficients allow it."""
         layout, counts = self.layout, self._counts_faces
-        strength: Any = tuple(map(self._mean_coefficient, self.faces, self.uniform))
-        weights: Any = tuple(layout.zeros(self.dtype) for _ in AXES) if self._has_arrays else None
+        along_x, along_y, along_z = map(self._mean_coefficient, self.faces, self.uniform)
+        weights = tuple(layout.zeros(self.dtype) for _ in AXES) if self._has_arrays else None
         used = [
             c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1
         ]
@@ -390,7 +394,7 @@ class GridPoisson(GridOperator):
             unit,
             self.periodic,
             self._spans,
-            strength,
+            (along_x, along_y, along_z),
             self._ghosts,
         )
 

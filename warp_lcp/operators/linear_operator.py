@@ -7,21 +7,47 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real_array
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
+from warp_lcp.problem.data_types import HasShape, Matrix, Multiplies, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, made_again
 from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
 
-Product = Callable[[np.ndarray], Any]
+Product: TypeAlias = Callable[[np.ndarray], npt.ArrayLike]
+Factor: TypeAlias = Product | Multiplies  # by which A x is computed
 ASYMMETRY = 1e-5  # relative to ||u|| ||A v||: larger than float32 products leave of u'Av = v'Au
+
+
+@runtime_checkable
+class HasType(Protocol):
+    """An object whose products have a type; None: not known."""
+
+    dtype: npt.DTypeLike
+
+
+@runtime_checkable
+class HasAdjoint(Protocol):
+    """An operator of SciPy, with products A' y."""
+
+    def rmatvec(self, x: np.ndarray) -> np.ndarray:
+        """Return A' x."""
+
+
+@runtime_checkable
+class Transposes(Protocol):
+    """A matrix that has a transpose."""
+
+    @property
+    def T(self) -> Multiplies: ...  # noqa: D102, N802
 
 
 class LinearOperator(Pickled, Operator):
@@ -62,13 +88,13 @@ class LinearOperator(Pickled, Operator):
 
     def __init__(
         self,
-        A: Any,
+        A: Factor,
         shape: tuple[int, ...] | None = None,
         *,
         symmetric: bool | None = None,
-        diagonal: Any = None,
+        diagonal: Values | None = None,
         transpose: Product | None = None,
-        device: Any = None,
+        device: wp.DeviceLike = None,
     ) -> None:
         self._given = (A, shape, symmetric, diagonal, transpose)
         self.shape = _shape_of(A, shape)
@@ -97,7 +123,7 @@ class LinearOperator(Pickled, Operator):
             )
         self._scale: np.ndarray | None = None
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the constructor's arguments."""
         return made_again(_made, *self._given, device=self.device)
 
@@ -136,7 +162,7 @@ class LinearOperator(Pickled, Operator):
             )
         return self._scale
 
-    def _field(self, diagonal: Any) -> np.ndarray:
+    def _field(self, diagonal: Values) -> np.ndarray:
         """Return a diagonal as a flat field."""
         host = np.asarray(real_array(diagonal, "diagonal"), dtype=np.float64)
         if host.shape not in ((), self.shape):
@@ -172,15 +198,15 @@ class LinearOperator(Pickled, Operator):
         return image
 
 
-def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
+def _shape_of(A: Factor, shape: tuple[int, ...] | None) -> tuple[int, ...]:
     """Return the shape of A's fields, checked against A's own shape."""
-    matrix_shape: Any = getattr(A, "shape", None)
-    if isinstance(A, Operator) or not (callable(A) or hasattr(A, "__matmul__")):
+    matrix_shape = A.shape if isinstance(A, HasShape) else None
+    if isinstance(A, Operator) or not (callable(A) or isinstance(A, Multiplies)):
         raise ValueError(
             f"A is a {type(A).__name__}: expected a function, or a "
             "scipy.sparse.linalg.LinearOperator"
         )
-    if not hasattr(A, "__matmul__"):
+    if not isinstance(A, Multiplies):
         matrix_shape = None
     elif (
         matrix_shape is None
@@ -193,9 +219,9 @@ def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
         raise ValueError("shape: must be given if A is a function")
     try:
         field_shape = (
-            (int(matrix_shape[0]),)
+            matrix_shape[:1]
             if shape is None
-            else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
+            else tuple(int(n) for n in np.atleast_1d(np.asarray(shape, dtype=object)))
         )
     except (TypeError, ValueError):
         raise ValueError(f"shape = {shape!r}: expected a tuple of integers") from None
@@ -208,13 +234,13 @@ def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
             f"shape = {shape!r}: expected integers >= 1"
             + ("" if matrix_shape is None else f" whose product is {matrix_shape[0]}")
         )
-    if np.dtype(getattr(A, "dtype", None) or np.float64).kind not in "biuf":
+    if isinstance(A, HasType) and np.dtype(A.dtype or np.float64).kind not in "biuf":
         raise ValueError(f"A has type {A.dtype}: expected real numbers")
     return field_shape
 
 
 def _products_of(
-    A: Any, shape: tuple[int, ...], transpose: Product | None
+    A: Factor, shape: tuple[int, ...], transpose: Product | None
 ) -> tuple[Product, Product | None]:
     """Return the functions x -> A x and x -> A'x on fields of a shape.
 
@@ -222,19 +248,22 @@ def _products_of(
     """
     if not (transpose is None or callable(transpose)):
         raise ValueError(f"transpose is a {type(transpose).__name__}: expected a function")
-    if not hasattr(A, "__matmul__"):
+    if not isinstance(A, Multiplies):
         return A, transpose
+    factor: Multiplies = A
 
     def product(x: np.ndarray) -> np.ndarray:
-        return np.asarray(A @ x.ravel()).reshape(shape)
+        return np.asarray(factor @ x.ravel()).reshape(shape)
+
+    if transpose is not None:
+        return product, transpose
+    if not isinstance(A, HasAdjoint):
+        return product, _by_transpose(A, shape) if isinstance(A, Transposes) else None
+    matvec = A.rmatvec
 
     def adjoint(x: np.ndarray) -> np.ndarray:
-        return np.asarray(A.rmatvec(x.ravel())).reshape(shape)
+        return np.asarray(matvec(x.ravel())).reshape(shape)
 
-    if transpose is not None or not hasattr(A, "rmatvec"):
-        return product, (
-            lambda x: np.asarray(A.T @ x.ravel()).reshape(shape)
-        ) if transpose is None and hasattr(A, "T") else transpose
     try:
         adjoint(np.zeros(shape))
     except NotImplementedError:  # SciPy's error if there is no adjoint
@@ -242,8 +271,17 @@ def _products_of(
     return product, adjoint
 
 
+def _by_transpose(A: Transposes, shape: tuple[int, ...]) -> Product:
+    return lambda x: np.asarray(A.T @ x.ravel()).reshape(shape)
+
+
 def _made(
-    A: Any, shape: Any, symmetric: Any, diagonal: Any, transpose: Any, device: Any
+    A: Factor,
+    shape: tuple[int, ...] | None,
+    symmetric: bool | None,
+    diagonal: Values | None,
+    transpose: Product | None,
+    device: wp.DeviceLike,
 ) -> LinearOperator:
     return LinearOperator(
         A, shape, symmetric=symmetric, diagonal=diagonal, transpose=transpose, device=device
@@ -251,5 +289,7 @@ def _made(
 
 
 @as_operator.register(scipy.sparse.linalg.LinearOperator)
-def _linear(A: Any, device: Any = None, dtype: Any = wp.float64) -> LinearOperator:
+def _linear(
+    A: Matrix, device: wp.DeviceLike = None, dtype: DataType = wp.float64
+) -> LinearOperator:
     return LinearOperator(A, device=device)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -18,13 +18,15 @@ from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Communicator, Reduction, add_across
 from warp_lcp.operators.dense import is_rounding
-from warp_lcp.problem.pickling import Pickled, made_again
-from warp_lcp.problem.protocol import layout_of
+from warp_lcp.problem.data_types import Values
+from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.protocol import Operator, layout_of
 
 
+@no_type_check
 @forward_kernel(module="warp_lcp.low_rank")
 def weigh_kernel(
     weights: wp.array2d(dtype=wp.float64),
@@ -90,7 +92,9 @@ class BlockColumns:
 
     across: Communicator | None = None
 
-    def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
+    def __init__(
+        self, size: int, blocks: int, width: int, dtype: DataType, device: wp.Device
+    ) -> None:
         self.size, self.width, self.rank, self.dtype, self.device = (
             size,
             width,
@@ -274,7 +278,12 @@ class LowRankOperator(Pickled):
     """
 
     def __init__(
-        self, columns: Any, weights: Any, *, device: Any = None, dtype: Any = wp.float64
+        self,
+        columns: Values,
+        weights: Values,
+        *,
+        device: wp.DeviceLike = None,
+        dtype: DataType = wp.float64,
     ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
@@ -293,7 +302,7 @@ class LowRankOperator(Pickled):
         self._make(layout, stored, weights)
 
     @classmethod
-    def of_blocks(cls, A: Any, columns: BlockColumns, weights: Any) -> LowRankOperator:
+    def of_blocks(cls, A: Operator, columns: BlockColumns, weights: Values) -> LowRankOperator:
         """Return the operator of columns stored like the fields of A.
 
         Its entries may be rewritten in place; call `update` after that.
@@ -310,12 +319,12 @@ class LowRankOperator(Pickled):
         return cls._of(layout, columns, weights)
 
     @classmethod
-    def _of(cls, layout: Layout, columns: BlockColumns, weights: Any) -> LowRankOperator:
+    def _of(cls, layout: Layout, columns: BlockColumns, weights: Values) -> LowRankOperator:
         made = cls.__new__(cls)
         made._make(layout, columns, weights)
         return made
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the nonzero rows of U, by the elements of the user's fields."""
         rows, blocks, values = self.columns.entries()
         user = np.full(self.layout.size, -1)
@@ -331,7 +340,7 @@ class LowRankOperator(Pickled):
         """W on the host, shape (k, k); it must not be written to."""
         return np.asarray(self._weights.host)
 
-    def update(self, weights: Any = None, *, symmetric: bool | None = None) -> None:
+    def update(self, weights: Values | None = None, *, symmetric: bool | None = None) -> None:
         """Replace the weights, and read columns that have changed in place.
 
         Args:
@@ -349,7 +358,7 @@ class LowRankOperator(Pickled):
             self._turned.send()
         self.version += 1
 
-    def stored_like(self, A: Any) -> LowRankOperator:
+    def stored_like(self, A: Operator) -> LowRankOperator:
         """Return the same operator for fields stored like those of A.
 
         It is the operator itself if its fields are stored in the same way.
@@ -414,7 +423,7 @@ class LowRankOperator(Pickled):
             else wp.array(field.numpy(), dtype=self.dtype, device=self.device)
         )
 
-    def masked(self, free: Any, shift: Any = None) -> LowRankOperator:
+    def masked(self, free: Values, shift: Values | None = None) -> LowRankOperator:
         """Return P U W U' P, P the restriction to `free` (non-zero entries).
 
         Raises:
@@ -433,7 +442,7 @@ class LowRankOperator(Pickled):
         columns.assign(rows[kept], blocks[kept], values[kept])
         return LowRankOperator.of_blocks(self, columns, self.weights.numpy())
 
-    def _make(self, layout: Layout, columns: BlockColumns, weights: Any) -> None:
+    def _make(self, layout: Layout, columns: BlockColumns, weights: Values) -> None:
         """Set all attributes from stored columns and weights."""
         self.layout, self.columns, columns.across = layout, columns, layout.across
         self.shape, self.device, self.dtype, self.rank, self.version = (
@@ -455,7 +464,7 @@ class LowRankOperator(Pickled):
         self.weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
         self.products, self.products_of = DeviceScalar(self.device, self.rank), None
 
-    def _checked_weights(self, weights: Any) -> np.ndarray:
+    def _checked_weights(self, weights: Values) -> np.ndarray:
         """Return W as a host matrix."""
         W, k = np.asarray(real_array(weights, "weights"), dtype=np.float64), self.rank
         W = np.diag(W) if W.ndim == 1 else W
@@ -496,7 +505,12 @@ class LowRankOperator(Pickled):
 
 
 def _of_entries(
-    sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any
+    sizes: tuple[tuple[int, ...], int, int],
+    entries: tuple[np.ndarray, np.ndarray, np.ndarray],
+    weights: np.ndarray,
+    *,
+    device: wp.DeviceLike,
+    dtype: DataType,
 ) -> LowRankOperator:
     """Return an operator from its pickled entries."""
     shape, blocks, width = sizes

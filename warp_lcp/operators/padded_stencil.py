@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, no_type_check
+from typing import Protocol, no_type_check
 
 import numpy as np
 import warp as wp
@@ -27,7 +27,7 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import Padding
 from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
 from warp_lcp.kernels.layout import Pattern, check_memory, put, stencil_struct
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
 from warp_lcp.kernels.vectors import Communicator
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
@@ -77,6 +77,16 @@ def coarsen_spans_kernel(
     spans[k, j] = whole_span(first, last, n)
 
 
+class GathersFields(Protocol):
+    """Collects a field of all processes' boxes, with ghost cells, on every process."""
+
+    def collecting(self, mine: DeviceArray, whole: DeviceArray) -> Task:
+        """Return the task that writes all processes' cells to the whole grid's field."""
+
+    def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = ...) -> None:
+        """Write this process's part of the whole grid's field to its own."""
+
+
 class Ghosts(Protocol):
     """Fills the ghost cells that represent cells of another process.
 
@@ -92,7 +102,7 @@ class Ghosts(Protocol):
     @property
     def cuts(self) -> list[tuple[int, int]]: ...  # noqa: D102
     @property
-    def gathering(self) -> Any: ...  # noqa: D102
+    def gathering(self) -> GathersFields: ...  # noqa: D102
 
     def fill(self, field: DeviceArray) -> None:
         """Fill the ghost cells of a stored field."""
@@ -135,11 +145,11 @@ class CellDecomposition(Protocol):
     @property
     def across(self) -> Communicator | None: ...  # noqa: D102
 
-    def together(self) -> AbstractContextManager[Any]:
+    def together(self) -> AbstractContextManager[object]:
         """Return a block that raises an exception of one process on all processes."""
 
     def check_operator(
-        self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]
+        self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, object]
     ) -> None:
         """Refuse an operator that does not fit the box; collective.
 
@@ -191,7 +201,7 @@ class PaddedStencil:
         return Rows.of(self.padding, self.device, self.spans)
 
     @cached_property
-    def struct(self) -> Any:
+    def struct(self) -> StructInstance:
         """Struct of the stencil for kernels."""
         variable, d, w = self.storage
         fields, names = (
@@ -206,7 +216,7 @@ class PaddedStencil:
         return put(stencil_struct(d, w, self.pattern)(), numbers | {"d": self.d} | weights)
 
     @property
-    def storage(self) -> tuple[bool, Any, Any]:
+    def storage(self) -> tuple[bool, DataType, DataType]:
         """Form and types that select the kernels.
 
         Whether weights are variable, the type of d, the type of the weights.

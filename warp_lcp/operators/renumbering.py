@@ -8,7 +8,6 @@ an order that follows the matrix.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -57,7 +56,7 @@ def renumbering(host: scipy.sparse.csr_array, block: int = 1) -> Renumbering | N
     before = _mean_distance(host)
     if n < SMALLEST or before < SCATTERED * n:
         return None
-    graph: Any = host if block == 1 else _blocks(host, block)
+    graph = host if block == 1 else _blocks(host, block)
     # Breadth first by rows alone: on an unsymmetric pattern this is still an order, without the
     # cost of A + A'.
     nodes = scipy.sparse.csgraph.reverse_cuthill_mckee(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import scipy.sparse
@@ -25,13 +25,15 @@ from warp_lcp.kernels.fields import (
     zeros_like,
 )
 from warp_lcp.kernels.launch_graph import Launch, launch_now
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.renumbering import Renumbering, renumbering
+from warp_lcp.problem.data_types import Matrix, SparseMatrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.protocol import Derivatives
 from warp_lcp.problem.scale import scale_of_matrix
 
 INDICES = wp.array(dtype=wp.int32)
@@ -86,10 +88,10 @@ class MatrixSweep:
     col: DeviceArray
     a: DeviceArray
     d: DeviceArray
-    b: Any
-    lower: Any
-    upper: Any
-    x: Any
+    b: DeviceArray
+    lower: DeviceArray
+    upper: DeviceArray
+    x: DeviceArray
     omega: float
     forward: bool
 
@@ -134,13 +136,15 @@ class SparseOperator(Pickled):
         [ 0. -1.  6.] True
     """
 
+    shape: tuple[int, ...]
+
     def __init__(
         self,
-        matrix: Any,
+        matrix: Matrix,
         *,
-        device: Any = None,
-        dtype: Any = wp.float64,
-        near_null_space: Any = None,
+        device: wp.DeviceLike = None,
+        dtype: DataType = wp.float64,
+        near_null_space: Values | None = None,
     ) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
@@ -164,7 +168,7 @@ class SparseOperator(Pickled):
         self._turned_from = 0
         self._take(host)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the current matrix."""
         return made_again(
             SparseOperator,
@@ -196,7 +200,7 @@ class SparseOperator(Pickled):
         """Return the current A on the host, in float64."""
         return self._matrix_of(self.values.numpy())
 
-    def update(self, values: Any) -> None:
+    def update(self, values: Values) -> None:
         """Replace the entries; the sparsity pattern is fixed.
 
         Args:
@@ -330,7 +334,7 @@ class SparseOperator(Pickled):
             1,
         )
 
-    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> Derivatives:
         """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
 
         In the order of `indices`.
@@ -340,7 +344,7 @@ class SparseOperator(Pickled):
         entries = np.repeat(multiplier.numpy(), np.diff(self._indptr)) * x.numpy()[self._indices]
         return {"matrix": wp.array(entries, dtype=wp.float64, device=self.device)}
 
-    def masked(self, free: Any, shift: Any = None) -> SparseOperator:
+    def masked(self, free: Values, shift: Values | None = None) -> SparseOperator:
         """Return P A P + P D P with P the restriction to `free` and D = diag(shift).
 
         `free` has non-zero entries on the rows that stay.
@@ -357,10 +361,10 @@ class SparseOperator(Pickled):
 
     def relax(
         self,
-        x: Any,
-        b: Any,
-        lower: Any,
-        upper: Any,
+        x: DeviceArray,
+        b: DeviceArray,
+        lower: DeviceArray,
+        upper: DeviceArray,
         omega: float,
         *,
         forward: bool = True,
@@ -480,10 +484,10 @@ def greedy_colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
     taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
     color = wp.zeros(pattern.shape[0], dtype=wp.int32, device="cpu")
     wp.launch(color_kernel, 1, [*inputs, taken, color, color.size], device="cpu")
-    return color.numpy()
+    return np.asarray(color.numpy())
 
 
-def _checked(matrix: Any) -> scipy.sparse.csr_array:
+def _checked(matrix: Matrix) -> scipy.sparse.csr_array:
     """Return a matrix in compressed rows, sorted, without duplicates, in float64."""
     if not scipy.sparse.issparse(matrix):
         raise ValueError(
@@ -502,7 +506,7 @@ def _checked(matrix: Any) -> scipy.sparse.csr_array:
     return host
 
 
-def _check_indices(matrix: Any) -> None:
+def _check_indices(matrix: SparseMatrix) -> None:
     """Refuse indices out of range.
 
     SciPy's conversions and the kernels would access other memory with them.
@@ -526,7 +530,7 @@ def _check_indices(matrix: Any) -> None:
         ) from reason
 
 
-def _near_null_space(given: Any, n: int) -> np.ndarray:
+def _near_null_space(given: Values, n: int) -> np.ndarray:
     """Return fields as an array of shape (n, k), float64."""
     B = real_array(given, "near_null_space").astype(np.float64)
     B = B[:, None] if B.ndim == 1 else B
@@ -576,5 +580,7 @@ def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
 
 @as_operator.register(scipy.sparse.sparray)
 @as_operator.register(scipy.sparse.spmatrix)
-def _sparse(A: Any, device: Any = None, dtype: Any = wp.float64) -> SparseOperator:
+def _sparse(
+    A: Matrix, device: wp.DeviceLike = None, dtype: DataType = wp.float64
+) -> SparseOperator:
     return SparseOperator(A, device=device, dtype=dtype)

@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any, TypeAlias, no_type_check
 
 import numpy as np
 import scipy
@@ -19,14 +19,15 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import check_kept, check_storable, real_array
 from warp_lcp.kernels.layout import Pattern
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
-from warp_lcp.problem.pickling import OnHost, made_again
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.problem.data_types import Values
+from warp_lcp.problem.pickling import OnHost, Reduced, made_again
+from warp_lcp.problem.protocol import AIR, FLUID, SOLID, Derivatives, Scratch
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 DIAGONAL = KERNELS["stencil.diagonal"]
@@ -42,6 +43,10 @@ AROUND = Pattern(
     kind="arrays",
 )
 Offset = tuple[int, int, int]  # along x, y, z
+Coefficient: TypeAlias = Values | wp.Function
+"""Coefficient of a neighbor: a number, a field, or a Warp function of the cell."""
+Coefficients: TypeAlias = Mapping[tuple[int, ...], Coefficient] | Values
+"""Coefficients by offset, or an array of 3 x 3 (x 3) numbers."""
 
 __all__ = ["Stencil"]
 
@@ -95,14 +100,14 @@ class Stencil(GridOperator):
 
     def __init__(
         self,
-        cells: Any,
-        coefficients: Mapping[tuple[int, ...], Any] | Any,
+        cells: Values,
+        coefficients: Coefficients,
         *,
-        shift: Any = None,
+        shift: Values | None = None,
         periodic: tuple[bool, ...] = (False, False, False),
         outside: int = SOLID,
-        device: Any = None,
-        dtype: Any = wp.float32,
+        device: wp.DeviceLike = None,
+        dtype: DataType = wp.float32,
     ) -> None:
         if outside not in (AIR, SOLID):
             raise ValueError(
@@ -113,7 +118,9 @@ class Stencil(GridOperator):
             cells, {"coefficients": coefficients, "shift": shift}, periodic, device, dtype
         )
 
-    def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
+    def _take_coefficients(
+        self, cells: np.ndarray, *, coefficients: Coefficients, shift: Values | None
+    ) -> None:
         """Check the coefficients, and store them in the form that kernels use.
 
         The forms are numbers, Warp functions, or arrays. Of symmetric coefficients half of the
@@ -193,12 +200,13 @@ class Stencil(GridOperator):
         )
         self._numbers = tuple(-float(values[o]) for o in offsets) if kind == "numbers" else ()
         sizes = {o: float(np.abs(full[o][fluid]).mean()) if fluid.any() else 0.0 for o in around}
-        self._strength: Any = tuple(
+        along_x, along_y, along_z = (
             sum(size for o, size in sizes.items() if o[axis]) / 2 for axis in range(3)
         )
+        self._strength = (along_x, along_y, along_z)
 
     @property
-    def given(self) -> dict[tuple[int, ...], Any]:
+    def given(self) -> dict[tuple[int, ...], Coefficient]:
         """Coefficients by offset, as given."""
         return {_named(offset, len(self.shape)): value for offset, value in self._given.items()}
 
@@ -209,7 +217,7 @@ class Stencil(GridOperator):
             "outside": self.outside,
         }
 
-    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> Derivatives:
         """Return the derivatives by each offset's coefficients and by the shift.
 
         mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; for
@@ -220,7 +228,7 @@ class Stencil(GridOperator):
         self.stencil.wrap(x)
         rows, cells = Rows.of(self.layout.padding, self.device), self.cells_around.flatten()
 
-        def of(offset: Offset, shape: tuple[int, ...]) -> Any:
+        def of(offset: Offset, shape: tuple[int, ...]) -> DeviceArray | float:
             """Return the derivative by the coefficients of an offset, of a given shape."""
             part = self.layout.zeros(wp.float64) if shape else None
             step, row, plane = (
@@ -258,7 +266,7 @@ class Stencil(GridOperator):
         Its diagonal includes the contributions of closed sides.
         """
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-        transposed: dict[tuple[int, ...], Any] = {
+        transposed: dict[tuple[int, ...], Coefficient] = {
             (0,) * len(self.shape): np.where(
                 fluid.reshape(self.shape), self.diagonal().numpy(), 1.0
             )
@@ -339,7 +347,7 @@ class Stencil(GridOperator):
         )
         return {o: np.broadcast_to(f, counts) for o, f in folded.items()}
 
-    def _evaluated(self, function: Any) -> np.ndarray:
+    def _evaluated(self, function: wp.Function) -> np.ndarray:
         """Return the values of a Warp function at all cells."""
         out = wp.zeros(self.layout.padding.counts, dtype=wp.float64, device=self.device)
         wp.launch(_evaluation(function), out.shape, [out], device=self.device)
@@ -347,7 +355,7 @@ class Stencil(GridOperator):
         check_storable(values, self.dtype, f"coefficients: {function.key}")
         return values
 
-    def evaluated(self, function: Any) -> np.ndarray:
+    def evaluated(self, function: wp.Function) -> np.ndarray:
         """Return the values of one of the pattern's functions as a stored field."""
         return np.pad(self._evaluated(function), 1).ravel()
 
@@ -385,14 +393,15 @@ class Stencil(GridOperator):
     def _empty_stencil(self) -> PaddedStencil:
         """Return the stencil with an allocated diagonal."""
         layout = self.layout
-        options: dict[str, Any] = {
-            "periodic": self.periodic,
-            "spans": self._spans,
-            "strength": self._strength,
-            "pattern": self._pattern,
-        }
         return PaddedStencil(
-            layout.padding, layout.zeros(self.dtype), self._weights, self._numbers, **options
+            layout.padding,
+            layout.zeros(self.dtype),
+            self._weights,
+            self._numbers,
+            periodic=self.periodic,
+            spans=self._spans,
+            strength=self._strength,
+            pattern=self._pattern,
         )
 
     def _fill_stencil(self) -> None:
@@ -431,7 +440,7 @@ class Stencil(GridOperator):
         self.stencil.wrap(x)
         TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
 
-    def boundary_term(self, values: Any) -> DeviceArray:
+    def boundary_term(self, values: Values) -> DeviceArray:
         """Return the contribution to b of given values in AIR cells, instead of 0.
 
         The sums of a_o(i) value_(i + o), float64, shape of `cells`.
@@ -462,14 +471,14 @@ class Stencil(GridOperator):
         self.stencil.product(boundary, out)
         return self.layout.unload(out)
 
-    def floating_components(self, scratch: Any = None) -> FloatingComponents | None:
+    def floating_components(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the components on which rows sum to 0, or None.
 
         A symmetric A is singular there.
         """
-        if self._finder is None or self._finder[0] != self.version:
-            self._finder = self.version, self._find_floating()
-        found: FloatingComponents | None = self._finder[1]
+        if self._found is None or self._found[0] != self.version:
+            self._found = self.version, self._find_floating()
+        found: FloatingComponents | None = self._found[1]
         return found
 
     def _find_floating(self) -> FloatingComponents | None:
@@ -532,9 +541,9 @@ class Stencil(GridOperator):
         rounding = 8 * float(np.finfo(wp.dtype_to_numpy(self.dtype)).eps)
         center = np.abs(self._number) if self._center is None else np.abs(self._center.numpy())
         size = np.maximum(self.stencil.d.numpy(), center)  # closed sides cancel some of it
-        return inside & (np.abs(sums.numpy()) <= rounding * size)
+        return np.asarray(inside & (np.abs(sums.numpy()) <= rounding * size))
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle cells and coefficients; Warp functions are pickled as arrays."""
         cells, options = self._pickled()
         n = cells.ndim
@@ -579,7 +588,7 @@ class StoredStencil(GridOperator):
         self,
         cells: np.ndarray,
         d: DeviceArray,
-        weights: tuple[Any, ...],
+        weights: tuple[DeviceArray | float, ...],
         pattern: Pattern | None,
         *,
         symmetric: bool,
@@ -599,6 +608,7 @@ class StoredStencil(GridOperator):
         own, fields, _, _ = self._made
         own.assign(d)
         for place, field in enumerate(fields):
+            assert isinstance(field, wp.array), "the weights are fields"
             wp.copy(field, weights, src_offset=place * field.size, count=field.size)
         padded = np.full(self.layout.stored_shape, AIR, dtype=np.int8)
         padded[1:-1, 1:-1, 1:-1] = cells.reshape(self.layout.padding.counts)
@@ -648,7 +658,7 @@ def _named(offset: Offset, dimension: int) -> tuple[int, ...]:
     return offset[::-1][3 - dimension :]
 
 
-def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
+def _by_offset(coefficients: Coefficients, dimension: int) -> dict[Offset, Coefficient]:
     """Return coefficients by offset along x, y, z, the center included."""
     if not isinstance(coefficients, Mapping):
         host = real_array(coefficients, "coefficients")
@@ -661,7 +671,7 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
         coefficients = {
             tuple(i - 1 for i in place): float(host[place]) for place in places if host[place]
         }
-    by_offset: dict[Offset, Any] = {}
+    by_offset: dict[Offset, Coefficient] = {}
     for offset, value in coefficients.items():
         steps = tuple(offset) if isinstance(offset, tuple) else (offset,)
         if len(steps) != dimension or not all(
@@ -680,7 +690,7 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
 
 
 @functools.cache
-def _of_three(function: Any, dimension: int) -> Any:
+def _of_three(function: wp.Function, dimension: int) -> wp.Function:
     """Return a Warp function of (k, j, i) in float64 for a function of the cell."""
     count = len(function.input_types)
     if count != dimension:
@@ -704,7 +714,7 @@ def _of_three(function: Any, dimension: int) -> Any:
 
 
 @functools.cache
-def _evaluation(function: Any) -> Any:
+def _evaluation(function: wp.Function) -> wp.Kernel:
     """Return a kernel that evaluates a Warp function of (k, j, i) at all cells."""
 
     @no_type_check

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import ADD, rows_of
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.problem.data_types import Matrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled
+from warp_lcp.problem.pickling import Pickled, Reduced
 from warp_lcp.problem.protocol import (
     AppliesPlus,
     HasCells,
     HasColumns,
     HasStencil,
+    Masks,
     NamesComponents,
     Operator,
+    Scratch,
     StoresRounded,
     has,
     layout_of,
@@ -49,7 +51,7 @@ class SumOperator(Pickled):
         ValueError: shapes, devices or layouts differ.
     """
 
-    def __init__(self, A: Any, B: Any) -> None:
+    def __init__(self, A: Matrix, B: Matrix) -> None:
         first, second = as_operator(A), as_operator(B)
         if tuple(first.shape) != tuple(second.shape):
             raise ValueError(
@@ -71,7 +73,7 @@ class SumOperator(Pickled):
         self.second: Operator = second
         self.shape, self.device = tuple(first.shape), first.device
         self.dtype = wp.float64 if wp.float64 in (first.dtype, second.dtype) else wp.float32
-        self._scratch: dict[Any, DeviceArray] = {}
+        self._scratch: dict[tuple[DataType, tuple[int, ...]], DeviceArray] = {}
         terms: tuple[Operator, Operator] = (
             (second, first) if isinstance(first, LowRankOperator) else (first, second)
         )
@@ -82,7 +84,7 @@ class SumOperator(Pickled):
         if has(self._plain, HasStencil) and isinstance(self._low, LowRankOperator):
             self.grid, self.low = self._plain, self._low
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the current terms."""
         return SumOperator, (self.first, self.second)
 
@@ -131,7 +133,7 @@ class SumOperator(Pickled):
         self.apply(x.reshape(stored), out.reshape(stored))
         ADD.bind(rows_of(out), z=b, x=out).launch()
 
-    def floating_components(self, scratch: Any = None) -> Any:
+    def floating_components(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the components on which the sum is singular, or None.
 
         Also None if a term does not provide its own.
@@ -163,15 +165,15 @@ class SumOperator(Pickled):
             default=0.0,
         )
 
-    def masked(self, free: Any, shift: Any = None) -> SumOperator:
+    def masked(self, free: Values, shift: Values | None = None) -> SumOperator:
         """Return P (A + B) P + P D P with P the restriction to `free`, D = diag(shift).
 
         `free` has non-zero entries on the rows that stay; all terms need `masked`.
         """
-        first: Any = self.first
-        second: Any = self.second
-        if isinstance(self.first, LowRankOperator):  # it cannot take a shift
-            return SumOperator(self.first.masked(free), second.masked(free, shift))
+        first, second = self.first, self.second
+        assert has(first, Masks) and has(second, Masks), "all terms need `masked`"
+        if isinstance(first, LowRankOperator):  # it cannot take a shift
+            return SumOperator(first.masked(free), second.masked(free, shift))
         return SumOperator(first.masked(free, shift), second.masked(free))
 
     def _add(self, x: DeviceArray, out: DeviceArray | None, *, transposed: bool) -> DeviceArray:
@@ -200,7 +202,7 @@ class SumOperator(Pickled):
         ADD.bind(rows_of(out), z=other.flatten(), x=out.flatten()).launch()
 
 
-def grid_and_low_rank(A: Any) -> tuple[HasStencil, LowRankOperator] | None:
+def grid_and_low_rank(A: Matrix) -> tuple[HasStencil, LowRankOperator] | None:
     """Return the terms of a symmetric sum of a stencil and a low-rank operator.
 
     None if A is another operator.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
@@ -15,6 +15,7 @@ import warp as wp
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import Layout, real_array
 from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.data_types import BoundValues, Values
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
@@ -53,7 +54,7 @@ def evaluate_kernel(S: AffineSide, x: f64, out: f64):
 SIDES = ("lower", "upper")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class AffineBounds:
     """Bounds on one side that depend on x: c_i + k_i x_j with j = index_i.
 
@@ -75,13 +76,13 @@ class AffineBounds:
         ValueError: shapes differ, an index is no unknown's, a coefficient is not finite.
     """
 
-    constant: Any
-    index: Any
-    coefficient: Any
+    constant: np.ndarray
+    index: np.ndarray
+    coefficient: np.ndarray
 
-    def __post_init__(self) -> None:
+    def __init__(self, constant: Values, index: Values, coefficient: Values) -> None:
         """Broadcast numbers to the shape of `index`, and check all."""
-        index = np.asarray(self.index)
+        index = np.asarray(index)
         if not np.issubdtype(index.dtype, np.integer):
             raise ValueError(f"index has type {index.dtype}: expected integers")
         if index.size and (index.min() < -1 or index.max() >= index.size):
@@ -90,8 +91,8 @@ class AffineBounds:
                 f"{index.size - 1}"
             )
         object.__setattr__(self, "index", index)
-        for name in ("constant", "coefficient"):
-            value = np.asarray(real_array(getattr(self, name), name), dtype=np.float64)
+        for name, given in (("constant", constant), ("coefficient", coefficient)):
+            value = np.asarray(real_array(given, name), dtype=np.float64)
             if value.shape not in ((), index.shape):
                 raise ValueError(
                     f"{name} has shape {value.shape}: expected a number or {index.shape}"
@@ -106,7 +107,7 @@ class AffineBounds:
 
     @classmethod
     def friction(
-        cls, normal: Any, mu: Any, lower: Any = 0.0, upper: Any = np.inf
+        cls, normal: Values, mu: Values, lower: Values = 0.0, upper: Values = np.inf
     ) -> tuple[AffineBounds, AffineBounds]:
         """Return the bounds of a friction box: |x_i| <= mu_i x_j with j = normal_i.
 
@@ -131,7 +132,7 @@ class AffineBounds:
         if not (np.broadcast_to(mu, index.shape)[tangential] >= 0).all():
             raise ValueError("mu holds a negative value or NaN: friction coefficients are >= 0")
         slope = np.where(tangential, mu, 0.0)
-        sides = (np.where(tangential, 0.0, side) for side in (lower, upper))
+        sides = (np.where(tangential, 0.0, np.asarray(side)) for side in (lower, upper))
         low, high = (
             cls(constant, index, sign * slope)
             for constant, sign in zip(sides, (-1.0, 1.0), strict=True)
@@ -158,7 +159,7 @@ class AffineFields:
         sides: both sides as AffineBounds.
     """
 
-    def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
+    def __init__(self, layout: Layout, lower: BoundValues, upper: BoundValues) -> None:
         sides = [
             side if isinstance(side, AffineBounds) else _constant(layout, side, name)
             for side, name in zip((lower, upper), SIDES, strict=True)
@@ -230,14 +231,18 @@ class AffineFields:
     def _host(self, side: int, x: np.ndarray) -> np.ndarray:
         index, coefficient = self.index[side].numpy(), self.coefficient[side].numpy()
         with np.errstate(invalid="ignore"):
-            return np.where(
-                index >= 0,
-                self.constant[side].numpy() + coefficient * x[index],
-                self.constant[side].numpy(),
+            return np.asarray(
+                np.where(
+                    index >= 0,
+                    self.constant[side].numpy() + coefficient * x[index],
+                    self.constant[side].numpy(),
+                )
             )
 
 
-def affine_side(constant: DeviceArray, index: Any = None, coefficient: Any = None) -> AffineSide:
+def affine_side(
+    constant: DeviceArray, index: DeviceArray | None = None, coefficient: DeviceArray | None = None
+) -> AffineSide:
     """Return bounds as a kernel argument; constant ones without index."""
     side = AffineSide()
     side.constant = constant
@@ -246,13 +251,13 @@ def affine_side(constant: DeviceArray, index: Any = None, coefficient: Any = Non
     return side
 
 
-def affine_fields(layout: Layout, lower: Any, upper: Any) -> AffineFields | None:
+def affine_fields(layout: Layout, lower: BoundValues, upper: BoundValues) -> AffineFields | None:
     """Return the fields of bounds if a side is affine, None if neither is."""
     affine = isinstance(lower, AffineBounds) or isinstance(upper, AffineBounds)
     return AffineFields(layout, lower, upper) if affine else None
 
 
-def _constant(layout: Layout, side: Any, name: str) -> AffineBounds:
+def _constant(layout: Layout, side: Values, name: str) -> AffineBounds:
     """Return constant bounds as affine ones."""
     host = real_array(side, name)
     shape = layout.shape if host.ndim == 0 else host.shape

@@ -9,7 +9,7 @@ import copy
 import math
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import warp as wp
@@ -17,9 +17,11 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import LARGE, Array, Layout, nothing, overwrite, real_array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
+from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
-from warp_lcp.problem.affine_bounds import affine_fields
+from warp_lcp.problem.affine_bounds import AffineBounds, affine_fields
+from warp_lcp.problem.data_types import BoundValues
 from warp_lcp.problem.pickling import OnHost
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
@@ -34,6 +36,9 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/bound_codes.h")
 ENCODE = KERNELS["bounds.encode"]
 CODE_ROWS = KERNELS["bounds.code_rows"]
 DECODE = KERNELS["bounds.decode"]
+
+
+GivenSide: TypeAlias = "float | np.ndarray | OnHost | AffineBounds"  # of a pickle
 
 
 class Bounds:
@@ -58,7 +63,7 @@ class Bounds:
             is; empty if bounds are not coded.
     """
 
-    def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
+    def __init__(self, layout: Layout, lower: BoundValues, upper: BoundValues) -> None:
         self.layout, self.device = layout, layout.device
         self._none, self._no_code = nothing(wp.float64, self.device), nothing(wp.uint8, self.device)
         self.fields, self.values, self.code = (
@@ -133,22 +138,22 @@ class Bounds:
             overwrite(to, source)
 
     @property
-    def operands(self) -> list[Any]:
+    def operands(self) -> BoundOperands:
         """The bounds as arguments of kernels that support codes.
 
         For each side a field, or an empty array and the number that is then used; last the code.
         """
         numbers = [wp.float64(v) for v in self.values]
         if self.code.size:
-            return [self._none, numbers[0], self._none, numbers[1], self.code]
-        return [self.fields[0], numbers[0], self.fields[1], numbers[1], self.code]
+            return BoundOperands(self._none, numbers[0], self._none, numbers[1], self.code)
+        return BoundOperands(self.fields[0], numbers[0], self.fields[1], numbers[1], self.code)
 
     def follow(self, x: DeviceArray) -> None:
         """Evaluate bounds that depend on x at x (stored, float64)."""
         if self.affine is not None:
             self.affine.evaluate(x)
 
-    def given_again(self) -> tuple[Any, Any]:
+    def given_again(self) -> tuple[GivenSide, GivenSide]:
         """Return the current values of both sides, for a pickle."""
         if self.affine is not None:
             return self.affine.sides
@@ -248,7 +253,7 @@ class Bounds:
         It is the caller's memory if there is a field on the CPU.
         """
         if self.fields[side].size:
-            return self.fields[side].numpy()
+            return np.asarray(self.fields[side].numpy())
         field = np.full(self.layout.size, self.values[side])
         if self.code.size and not self.in_place:
             field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]

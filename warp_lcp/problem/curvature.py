@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasColumns, HasRows, HasStencil, has
+from warp_lcp.problem.protocol import HasColumns, HasHostDiagonal, HasRows, HasStencil, has
 
 NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is not rounding of products
 
@@ -31,9 +31,7 @@ def has_negative_curvature(problem: LCP) -> bool:
         return False
     by_rows = has(A, HasRows)
     if by_rows:
-        diagonal = (
-            A.host_diagonal() if hasattr(A, "host_diagonal") else A.diagonal().numpy().ravel()
-        )
+        diagonal = A.host_diagonal() if has(A, HasHostDiagonal) else A.diagonal().numpy().ravel()
         if not (diagonal < 0).any():  # the usual case, decided quickly
             return False
     lower, upper = problem.bounds.host(0), problem.bounds.host(1)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import warp as wp
 from scipy.sparse import bsr_array, csr_array
 
+from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.solve import VariationalInequality
 
 
@@ -58,16 +58,16 @@ class FrictionalContact(VariationalInequality):
 
     def __init__(
         self,
-        first: Any,
-        second: Any,
-        one: Any,
-        other: Any,
-        b: Any,
-        friction: Any,
+        first: Values,
+        second: Values,
+        one: Values,
+        other: Values,
+        b: Values,
+        friction: Values,
         bodies: int,
         *,
-        yields: Any = None,
-        device: Any = None,
+        yields: Values | None = None,
+        device: wp.DeviceLike = None,
     ) -> None:
         self.first, self.second = (np.asarray(side, dtype=np.int64) for side in (first, second))
         self.one, self.b, self.friction = (
@@ -96,16 +96,16 @@ class FrictionalContact(VariationalInequality):
             )
         k, dim, q = self.one.shape
         expected = {
-            "other": (k, dim, q),
-            "b": (k, dim),
-            "yields": (k, dim),
-            "friction": (k,),
-            "first": (k,),
-            "second": (k,),
+            "other": (self.other, (k, dim, q)),
+            "b": (self.b, (k, dim)),
+            "yields": (self.yields, (k, dim)),
+            "friction": (self.friction, (k,)),
+            "first": (self.first, (k,)),
+            "second": (self.second, (k,)),
         }
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}: expected {shape}")
+        for name, (values, shape) in expected.items():
+            if values.shape != shape:
+                raise ValueError(f"{name} has shape {values.shape}: expected {shape}")
         for name, values in shapes.items():
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} holds values that are not finite")

@@ -9,21 +9,35 @@ import copy
 from collections.abc import Hashable
 from functools import cached_property, singledispatch
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows
-from warp_lcp.kernels.fields import LARGE, Array, Layout, overwrite, real_array
+from warp_lcp.kernels.fields import LARGE, Layout, overwrite, real_array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataFrame, DataType, DeviceArray
 from warp_lcp.kernels.vectors import ADD, Sums, rows_of
 from warp_lcp.problem.bounds import INFINITE, Bounds
-from warp_lcp.problem.pickling import OnHost, Pickled
+from warp_lcp.problem.data_types import (
+    BoundValues,
+    ConvertsToArray,
+    Multiplies,
+    OperatorLike,
+    Values,
+)
+from warp_lcp.problem.pickling import OnHost, Pickled, Reduced
 from warp_lcp.problem.preconditioner import Preconditioner
-from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
+from warp_lcp.problem.protocol import (
+    AppliesPlus,
+    HasCells,
+    Operator,
+    Replicates,
+    has,
+    layout_of,
+    missing,
+)
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 CHECK = KERNELS["problem.check"]
@@ -33,7 +47,9 @@ CHECKED_BY_NUMPY = 12_000
 
 
 @singledispatch
-def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator:
+def as_operator(
+    A: OperatorLike, device: wp.DeviceLike = None, dtype: DataType = wp.float64
+) -> Operator:
     """Return A as an operator.
 
     Operators register here the arrays from which they are made (numpy arrays, scipy.sparse
@@ -48,18 +64,17 @@ def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator
     Raises:
         ValueError: A is neither, or lacks members of `wl.Operator`; the message names them.
     """
-    missing = [name for name in members(Operator) if not hasattr(A, name)]
-    if not missing:
+    if has(A, Operator):
         return A
-    if hasattr(A, "__array__") or hasattr(A, "to_numpy"):
+    if isinstance(A, (ConvertsToArray, DataFrame)):
         return as_operator(real_array(A, "A"), device, dtype)
-    if hasattr(A, "apply"):
-        without = f"A is a {type(A).__name__} without {', '.join(missing)}"
+    if "apply" not in (lacks := missing(A, Operator)):
+        without = f"A is a {type(A).__name__} without {', '.join(lacks)}"
         raise ValueError(
             f"{without}: an operator needs them; a subclass of wl.Operator must define only shape, "
             "device and apply"
         )
-    if hasattr(A, "__matmul__") or callable(A):
+    if isinstance(A, Multiplies) or callable(A):
         raise ValueError(
             f"A is a {type(A).__name__}: pass wl.LinearOperator(A, ...), which needs only products"
         )
@@ -110,12 +125,12 @@ class LCP(Pickled):
 
     def __init__(
         self,
-        A: Operator | Array,
-        b: Array,
-        lower: Any = 0.0,
-        upper: Any = np.inf,
+        A: OperatorLike,
+        b: Values,
+        lower: BoundValues = 0.0,
+        upper: BoundValues = np.inf,
         *,
-        preconditioner: Any = None,
+        preconditioner: Multiplies | None = None,
     ) -> None:
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
@@ -134,7 +149,7 @@ class LCP(Pickled):
             None if preconditioner is None else Preconditioner(preconditioner, self.layout)
         )
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the operator, b and the bounds with their current values.
 
         Fields that are used in place are restored as device arrays.
@@ -174,7 +189,7 @@ class LCP(Pickled):
         None if the problem has no copies: only problems of a `GridPoisson` on the CPU have, whose
         fields are not used in place.
         """
-        form = getattr(self.A, "form", None)
+        form = self.A.form if has(self.A, Replicates) else None
         if (
             form is None
             or self.bounds.form is None
@@ -190,14 +205,15 @@ class LCP(Pickled):
         twin = copy.copy(self)
         for cached in ("lower", "upper", "_counts"):
             twin.__dict__.pop(cached, None)
-        operator: Any = self.A  # its form exists
-        twin.A, twin.b, twin.bounds = operator.replica(), wp.clone(self.b), self.bounds.replica()
+        assert has(self.A, Replicates), "its form exists"
+        twin.A, twin.b, twin.bounds = self.A.replica(), wp.clone(self.b), self.bounds.replica()
         twin.unknown = _unknown(twin.A, twin.layout)
         return twin
 
     def take(self, other: LCP) -> None:
         """Copy the data of a problem of the same form."""
-        self.A.take(other.A)  # type: ignore[attr-defined]
+        assert has(self.A, Replicates), "its form exists"
+        self.A.take(other.A)
         self.bounds.take(other.bounds)
         overwrite(self.b, other.b)
         for cached in ("lower", "upper"):
@@ -277,7 +293,13 @@ class LCP(Pickled):
             raise ValueError(f"lower > upper in {crossed} unknowns")
 
 
-def _made(A: Operator, b: Array, lower: Any, upper: Any, preconditioner: Any) -> LCP:
+def _made(
+    A: Operator,
+    b: Values,
+    lower: BoundValues,
+    upper: BoundValues,
+    preconditioner: Multiplies | None,
+) -> LCP:
     return LCP(A, b, lower, upper, preconditioner=preconditioner)
 
 

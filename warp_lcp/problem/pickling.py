@@ -7,12 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Self, TypeAlias, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.types import DeviceArray
+
+Reduced: TypeAlias = tuple[Callable[..., object], tuple[object, ...]]  # of `__reduce__`
+Made = TypeVar("Made")
+TYPES = {
+    kind.__name__: kind for kind in (wp.int8, wp.uint8, wp.int32, wp.int64, wp.float32, wp.float64)
+}
 
 
 class OnHost:
@@ -24,7 +30,7 @@ class OnHost:
     def __init__(self, array: DeviceArray) -> None:
         self._array = array
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle a copy on the host."""
         return _on_device, (
             self._array.numpy().copy(),
@@ -39,7 +45,7 @@ class Pickled:
     For pickles and `copy.deepcopy`; `copy.copy` shares all attributes.
     """
 
-    def __copy__(self) -> Any:
+    def __copy__(self) -> Self:
         """Return an object with the same attributes."""
         twin = object.__new__(type(self))
         twin.__dict__.update(self.__dict__)
@@ -49,22 +55,22 @@ class Pickled:
 class FieldsOnHost(Pickled):
     """A dataclass that pickles its fields, device arrays as host arrays."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         """Pickle the fields in their order, as arguments.
 
         None replaces a field whose metadata exclude it.
         """
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         values = [
-            getattr(self, field.name) if field.metadata.get("pickled", True) else None
+            vars(self)[field.name] if field.metadata.get("pickled", True) else None
             for field in fields
         ]
         return type(self), tuple(OnHost(v) if isinstance(v, wp.array) else v for v in values)
 
 
 def made_again(
-    make: Callable[..., Any], *arguments: Any, device: wp.Device, **options: Any
-) -> tuple[Any, ...]:
+    make: Callable[..., Made], *arguments: object, device: wp.Device, **options: object
+) -> Reduced:
     """Return the value of an operator's `__reduce__`.
 
     It restores `make(*arguments, device=..., **options)` on that device. Types (wp.float32) are
@@ -78,15 +84,18 @@ def made_again(
 
 
 def _made(
-    make: Callable[..., Any], arguments: tuple[Any, ...], device: str, options: dict[str, Any]
-) -> Any:
+    make: Callable[..., Made],
+    arguments: tuple[object, ...],
+    device: str,
+    options: dict[str, object],
+) -> Made:
     if "dtype" in options:
-        options = {**options, "dtype": getattr(wp, options["dtype"])}
+        options = {**options, "dtype": TYPES[options["dtype"]]}
     return make(*arguments, device=_present(device), **options)
 
 
 def _on_device(host: np.ndarray, dtype: str, device: str) -> DeviceArray:
-    return wp.array(host, dtype=getattr(wp, dtype), device=_present(device))
+    return wp.array(host, dtype=TYPES[dtype], device=_present(device))
 
 
 def _present(device: str) -> wp.Device:

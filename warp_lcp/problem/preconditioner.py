@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from warp_lcp.kernels.fields import Layout
+from warp_lcp.problem.data_types import HasPreconditioner, HasShape, Multiplies
 
 # Relative to ||u|| ||M v||: a larger asymmetry than rounding leaves, with which conjugate gradients
 # fail sooner or later.
@@ -30,10 +29,10 @@ class Preconditioner:
             or fields are stored with ghost cells.
     """
 
-    def __init__(self, M: Any, layout: Layout) -> None:
-        n, shape = layout.size, getattr(M, "shape", None)
-        if not hasattr(M, "__matmul__"):
-            hint = ": PyAMG's is ml.aspreconditioner()" if hasattr(M, "aspreconditioner") else ""
+    def __init__(self, M: Multiplies, layout: Layout) -> None:
+        n, shape = layout.size, M.shape if isinstance(M, HasShape) else None
+        if not isinstance(M, Multiplies):
+            hint = ": PyAMG's is ml.aspreconditioner()" if isinstance(M, HasPreconditioner) else ""
             raise ValueError(
                 f"preconditioner is a {type(M).__name__}: expected an object with products M @ "
                 f"r{hint}"

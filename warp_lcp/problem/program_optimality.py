@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 
+from warp_lcp.problem.data_types import Matrix, is_sparse
+from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.reformulate import QuadraticProgramData
 from warp_lcp.problem.scale import scaled
 
@@ -40,7 +41,9 @@ PROVABLE = 40_000
 class ProgramWithRows(QuadraticProgramData):
     """A program with G, h, C and d, which are empty if it has no such rows."""
 
+    G: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
     h: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    C: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
     d: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -95,13 +98,13 @@ def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
     """
     matrices, n = (program.Q, program.G, program.C), len(program.c)
     h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
-    dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
+    dense = n + len(h) + len(d) <= SMALL or not any(is_sparse(M) for M in matrices)
 
-    def made(M: Any) -> Any:
+    def made(M: Matrix | None) -> Matrix:
         if M is None:
             M = np.zeros((0, n))
         if dense:
-            return M.toarray() if scipy.sparse.issparse(M) else M
+            return as_dense(M)
         return scipy.sparse.csr_array(M)
 
     Q, G, C = map(made, matrices)
@@ -139,10 +142,9 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
     costs = np.abs(D * program.c)[program.c != 0]
     slope = float(np.median(costs)) if len(costs) else 0.0
     sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
-    sigma = _power_of_two(sigma)
-    cost = _power_of_two(
-        1 / (max(sigma * bend, slope) or 1.0)
-    )  # times sigma: scale of the gradient sigma D (Q x + c)
+    sigma = float(_power_of_two(sigma))
+    # Times sigma: scale of the gradient sigma D (Q x + c).
+    cost = float(_power_of_two(1 / (max(sigma * bend, slope) or 1.0)))
     scaled_program = ProgramWithRows(
         scaled(Q, cost * sigma * D, D),
         cost * D * program.c,
@@ -338,7 +340,7 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
 
 
 def _newton(
-    p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any
+    p: ProgramWithRows, now: ProgramPoint, low: np.ndarray, high: np.ndarray, tight: np.ndarray
 ) -> ProgramPoint | None:
     """Return the solution of the equations of an active set, None if not finite.
 
@@ -365,13 +367,13 @@ def _newton(
     return ProgramPoint(x, z, multipliers[len(active) :])
 
 
-def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
+def _factored(Q: Matrix, B: Matrix) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return a solver of [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL.
 
     None where the factors are singular.
     """
     n, k = Q.shape[0], B.shape[0]
-    if scipy.sparse.issparse(Q):
+    if is_sparse(Q):
         M = scipy.sparse.block_array(
             [[Q, -B.T], [B, scipy.sparse.csr_array((k, k))]]
         ) + PROXIMAL * scipy.sparse.eye_array(n + k)
@@ -388,7 +390,7 @@ def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
 
 def _gradient(p: ProgramWithRows, point: ProgramPoint) -> np.ndarray:
     """Return Q x + c - G' z - C' y."""
-    return p.Q @ point.x + p.c - p.G.T @ point.z - p.C.T @ point.y
+    return np.asarray(p.Q @ point.x + p.c - p.G.T @ point.z - p.C.T @ point.y)
 
 
 def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float:
@@ -397,25 +399,19 @@ def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float
     return float((values / np.where(whole > 0, whole, 1.0)).max(initial=0.0))
 
 
-def _stacked(*parts: Any) -> Any:
-    return (
-        scipy.sparse.vstack(parts).tocsr() if scipy.sparse.issparse(parts[0]) else np.vstack(parts)
-    )
+def _stacked(*parts: Matrix) -> Matrix:
+    return scipy.sparse.vstack(parts).tocsr() if is_sparse(parts[0]) else np.vstack(parts)
 
 
-def _largest(M: Any, axis: int) -> np.ndarray:
+def _largest(M: Matrix, axis: int) -> np.ndarray:
     if not min(M.shape):
         return np.zeros(M.shape[1 - axis])
-    return (
-        abs(M).max(axis=axis).toarray().ravel()
-        if scipy.sparse.issparse(M)
-        else abs(M).max(axis=axis)
-    )
+    return as_dense(abs(M).max(axis=axis)).ravel()
 
 
 def _nonzero(values: np.ndarray) -> np.ndarray:
     return np.where(values > 0, values, 1.0)
 
 
-def _power_of_two(value: Any) -> Any:
-    return 2.0 ** np.round(np.log2(value))
+def _power_of_two(value: np.ndarray | float) -> np.ndarray:
+    return np.asarray(2.0 ** np.round(np.log2(value)))

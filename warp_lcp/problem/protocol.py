@@ -8,23 +8,41 @@ lists in `supports` the capabilities of which it needs one.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeGuard, TypeVar, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Generic,
+    Protocol,
+    TypeAlias,
+    TypeGuard,
+    TypeVar,
+    runtime_checkable,
+)
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import Layout
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray, Values
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
 
 if TYPE_CHECKING:
     from warp_lcp.kernels.fields import PaddedLayout
+    from warp_lcp.operators.components import FloatingComponents
     from warp_lcp.operators.compressed_rows import CompressedRows
+    from warp_lcp.operators.low_rank import LowRankOperator
+    from warp_lcp.operators.padded_stencil import PaddedStencil
+    from warp_lcp.problem.solve import Solver
 
 AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding of a number in float32
 Capability = TypeVar("Capability", bound="Operator")
+Declaration = TypeVar("Declaration")
+Scratch: TypeAlias = tuple[DeviceArray, DeviceArray]  # stored fields that may be overwritten
+Derivatives: TypeAlias = dict[str, "Derivative"]  # by the names of a constructor's arguments
+Derivative: TypeAlias = DeviceArray | float | Mapping[tuple[int, ...], DeviceArray | float] | None
 
 
 @runtime_checkable
@@ -45,7 +63,7 @@ class Operator(Protocol):
     """
 
     shape: tuple[int, ...]
-    dtype: Any = wp.float64
+    dtype: DataType = wp.float64
     device: wp.Device
     symmetric: bool = False
 
@@ -103,7 +121,14 @@ class Relaxes(Operator, Protocol):
     """Sweep in the operator's own order."""
 
     def relax(
-        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True
+        self,
+        x: DeviceArray,
+        b: DeviceArray,
+        lower: DeviceArray,
+        upper: DeviceArray,
+        omega: float,
+        *,
+        forward: bool = True,
     ) -> None:
         """Sweep once: x_i = clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i) in turn.
 
@@ -159,7 +184,7 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
         layout: with a ghost cell on each side.
     """
 
-    stencil: Any
+    stencil: PaddedStencil
     periodic: tuple[bool, bool, bool]
     layout: PaddedLayout
 
@@ -167,7 +192,7 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
 class HasBlocks(HasCells, HasLayout, Versioned, Protocol):
     """Restriction to some of the cells, the others being AIR: blocks of unknowns."""
 
-    def on_cells(self, cells: np.ndarray) -> Any:
+    def on_cells(self, cells: np.ndarray) -> HasBlocks:
         """Return an operator with the same coefficients on other cells.
 
         Padded as `cells` is. Coefficients elsewhere have no effect.
@@ -183,7 +208,7 @@ class HasColumns(Operator, Protocol):
     """
 
     grid: HasStencil
-    low: Any
+    low: LowRankOperator
 
 
 class AppliesPlus(Operator, Protocol):
@@ -212,7 +237,7 @@ class NamesComponents(Operator, Protocol):
     They are projected out, or b is INFEASIBLE there.
     """
 
-    def floating_components(self, scratch: Any = None) -> Any:
+    def floating_components(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, None if there are none.
 
         See `warp_lcp.operators.components.FloatingComponents`.
@@ -236,10 +261,42 @@ class StoresRounded(Operator, Protocol):
         """
 
 
+class Replicates(Operator, Protocol):
+    """Copies of an operator in memory of their own, to which others of its form are copied.
+
+    Attributes:
+        form: sizes, types and numbers of operators that can take each other's data; None: this
+            operator has no copies.
+    """
+
+    @property
+    def form(self) -> Hashable | None: ...  # noqa: D102
+
+    def replica(self) -> Operator:
+        """Return a copy in its own memory."""
+
+    def take(self, other: Operator) -> None:
+        """Copy the data of an operator of the same form."""
+
+
+class Masks(Operator, Protocol):
+    """Principal systems, as operators."""
+
+    def masked(self, free: Values, shift: Values | None = None) -> Operator:
+        """Return P A P + P D P with P the restriction to `free`, D = diag(shift)."""
+
+
+class HasHostDiagonal(Operator, Protocol):
+    """Diagonal in memory of the host."""
+
+    def host_diagonal(self) -> np.ndarray:
+        """Return the diagonal, shape (n,)."""
+
+
 class HasCoefficients(Operator, Protocol):
     """Derivatives of a scalar by the data of A, for `wl.vjp`."""
 
-    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> dict[str, Any]:
+    def coefficient_gradient(self, multiplier: DeviceArray, x: DeviceArray) -> Derivatives:
         """Return the derivatives of mu'A x by the constructor's arguments, by name.
 
         Each has the shape that was given, as a wp.float64 array on A's device, or is a number where
@@ -290,12 +347,80 @@ def members(capability: type[Operator]) -> tuple[str, ...]:
     )
 
 
+def missing(A: object, capability: type[Operator]) -> list[str]:
+    """Return the members of a capability that an object does not have."""
+    return [name for name in members(capability) if not hasattr(A, name)]
+
+
 def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
     """Return whether an operator has a capability: all of its members.
 
     `isinstance` of protocols would take 10 us.
     """
-    return all(hasattr(A, name) for name in members(capability))
+    return not missing(A, capability)
+
+
+@dataclass(frozen=True)
+class Declarations:
+    """Class attributes by which a method says what it does; those that it lacks have defaults.
+
+    Attributes:
+        form: of A that it works on, for messages.
+        problems: class of problems that it solves; None: LCP.
+        supports: capabilities of an operator of which it needs one; empty: products suffice.
+        affine_bounds: whether it takes bounds that are affine in x.
+        preconditioned: whether it uses the problem's preconditioner.
+        distributed: whether it works on several ranks.
+        definite: whether it needs a positive definite A.
+        any_numbering: whether the order of unknowns may be changed for it.
+        most_unknowns: largest number of unknowns; None: any.
+    """
+
+    form: str = ""
+    problems: type | None = None
+    supports: tuple[type[Operator], ...] = ()
+    affine_bounds: bool = False
+    preconditioned: bool = False
+    distributed: bool = False
+    definite: bool = False
+    any_numbering: bool = False
+    most_unknowns: int | None = None
+
+
+class Chain:
+    """Base of methods that hand over to others; a chain declares what its first method does."""
+
+    @property
+    def first(self) -> Solver:
+        """The method that begins."""
+        raise NotImplementedError
+
+
+def declared(method: Solver | type) -> Declarations:
+    """Return the declarations of a method, or of its class."""
+    while isinstance(method, Chain):
+        method = method.first
+    return _declared_by(method if isinstance(method, type) else type(method))
+
+
+@cache
+def _declared_by(kind: type) -> Declarations:
+    def of(name: str, usual: Declaration) -> Declaration:
+        value: Declaration = getattr(kind, name, usual)
+        return value
+
+    own = Declarations()
+    return Declarations(
+        form=of("form", own.form),
+        problems=of("problems", own.problems),
+        supports=of("supports", own.supports),
+        affine_bounds=of("affine_bounds", own.affine_bounds),
+        preconditioned=of("preconditioned", own.preconditioned),
+        distributed=of("distributed", own.distributed),
+        definite=of("definite", own.definite),
+        any_numbering=of("any_numbering", own.any_numbering),
+        most_unknowns=of("most_unknowns", own.most_unknowns),
+    )
 
 
 def version_of(A: Operator) -> int | None:
@@ -303,7 +428,7 @@ def version_of(A: Operator) -> int | None:
     return A.version if has(A, Versioned) else None
 
 
-def asks_beyond_storage(A: Any, share: float) -> bool:
+def asks_beyond_storage(A: Operator, share: float) -> bool:
     """Return whether a tolerance is below the storage rounding of A's entries.
 
     `share` is a relative tolerance; entries stored in float32 are rounded.
@@ -316,28 +441,28 @@ def layout_of(A: Operator) -> Layout:
     return A.layout if has(A, HasLayout) else Layout(A.shape, A.device)
 
 
-def takes(method: Any, A: Operator) -> bool:
+def takes(method: Solver | type, A: Operator) -> bool:
     """Return whether a method, or its class, takes an operator.
 
     A must have one of the capabilities in `supports`, if that names any.
     """
-    asked = getattr(method, "supports", ())
-    return not hasattr(method, "problems") and (
-        not asked or any(has(A, capability) for capability in asked)
+    own = declared(method)
+    return own.problems is None and (
+        not own.supports or any(has(A, capability) for capability in own.supports)
     )
 
 
-def families(method: Any) -> set[str]:
+def families(method: Solver | type) -> set[str]:
     """Return the families of our own operators that a method, or its class, takes.
 
     "dense", "sparse", "grid"; empty for methods of other problems.
     """
-    if hasattr(method, "problems"):
+    own = declared(method)
+    if own.problems is not None:
         return set()
-    asked = getattr(method, "supports", ())
     return (
-        {family for capability in asked for family in CAPABILITIES[capability][1]}
-        if asked
+        {family for capability in own.supports for family in CAPABILITIES[capability][1]}
+        if own.supports
         else set(FAMILIES)
     )
 
@@ -353,7 +478,7 @@ def described(*capabilities: type[Operator]) -> str:
     )
 
 
-def check_taken(method: Any, A: Operator) -> None:
+def check_taken(method: Solver, A: Operator) -> None:
     """Check that a method takes an operator.
 
     Raises:
@@ -361,11 +486,12 @@ def check_taken(method: Any, A: Operator) -> None:
             without requirements.
     """
     if not takes(method, A):
+        needed = described(*declared(method).supports)
         advice = (
             "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which "
             "need only products"
         )
         raise ValueError(
-            f"{type(method).__name__} needs an operator with {described(*method.supports)}; "
+            f"{type(method).__name__} needs an operator with {needed}; "
             f"{type(A).__name__} has none: {advice}"
         )

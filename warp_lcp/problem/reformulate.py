@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
+import warp as wp
 
+from warp_lcp.problem.data_types import Matrix, Values, dense, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.scale import scale_of_matrix
 
@@ -39,7 +40,7 @@ class Reformulation:
     """
 
     problem: LCP
-    A: Any
+    A: Matrix
     b: Vector
     lower: Vector
     upper: Vector
@@ -61,13 +62,13 @@ class QuadraticProgramData:
         d: shape (k,).
     """
 
-    Q: Any
+    Q: Matrix
     c: Vector
     lower: Vector
     upper: Vector
-    G: Any = None
+    G: Matrix | None = None
     h: Vector | None = None
-    C: Any = None
+    C: Matrix | None = None
     d: Vector | None = None
 
     def objective(self, x: Vector) -> float:
@@ -93,7 +94,7 @@ class BoxVariationalInequality:
 
     def project(self, x: Vector) -> Vector:
         """Return the projection of x onto K."""
-        return np.clip(x, self.lower, self.upper)
+        return np.asarray(np.clip(x, self.lower, self.upper))
 
     def gap(self, x: Vector) -> float:
         """Return the gap function max over z in K of F(x)'(x - z).
@@ -134,16 +135,18 @@ class ProximalFixedPoint:
 
     def __call__(self, x: Vector) -> Vector:
         """Return prox_K(x - R F(x)); x is a solution where it returns x."""
-        return np.clip(x - self.r * self.F(x), self.lower, self.upper)
+        return np.asarray(np.clip(x - self.r * self.F(x), self.lower, self.upper))
 
 
-def linear_equations_to_boxed(A: Any, b: Vector, *, device: Any = None) -> Reformulation:
+def linear_equations_to_boxed(
+    A: Matrix, b: Vector, *, device: wp.DeviceLike = None
+) -> Reformulation:
     """Return A x + b = 0 as a boxed LCP without bounds ([Book] eq. 1.71)."""
     n = len(b)
     return _same(A, b, np.full(n, -np.inf), np.full(n, np.inf), device)
 
 
-def lcp_to_boxed(A: Any, b: Vector, *, device: Any = None) -> Reformulation:
+def lcp_to_boxed(A: Matrix, b: Vector, *, device: wp.DeviceLike = None) -> Reformulation:
     """Return an LCP as a boxed LCP with l = 0, u = inf ([Book] eq. 1.72).
 
     0 <= x, A x + b >= 0, complementary: a mixed LCP without equations.
@@ -151,7 +154,9 @@ def lcp_to_boxed(A: Any, b: Vector, *, device: Any = None) -> Reformulation:
     return mixed_to_boxed(A, b, np.zeros(len(b), dtype=bool), device=device)
 
 
-def mixed_to_boxed(A: Any, b: Vector, equations: Vector, *, device: Any = None) -> Reformulation:
+def mixed_to_boxed(
+    A: Matrix, b: Vector, equations: Vector, *, device: wp.DeviceLike = None
+) -> Reformulation:
     """Return a mixed LCP as a boxed LCP ([Book] eq. 1.76-1.77).
 
     y_E = 0 on the equations E: l = -inf there, 0 elsewhere.
@@ -170,7 +175,9 @@ def mixed_to_boxed(A: Any, b: Vector, equations: Vector, *, device: Any = None) 
     )
 
 
-def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) -> Reformulation:
+def mixed_to_lcp(
+    A: Matrix, b: Vector, equations: Vector, *, device: wp.DeviceLike = None
+) -> Reformulation:
     """Return a mixed LCP as an LCP by the Schur complement.
 
     On the unknowns N with bounds: A_NN - A_NE A_EE^-1 A_EN.
@@ -193,7 +200,7 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
         raise ValueError(
             "equations selects every row: this is a linear system, see linear_equations_to_boxed"
         )
-    M = A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
+    M = np.asarray(dense(A), dtype=np.float64)
     try:
         solved = np.linalg.solve(M[np.ix_(E, E)], np.column_stack([M[np.ix_(E, N)], b[E]]))
     except np.linalg.LinAlgError:
@@ -214,7 +221,7 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
 
 
 def boxed_to_lcp(
-    A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any = None
+    A: Matrix, b: Vector, lower: Vector, upper: Vector, *, device: wp.DeviceLike = None
 ) -> Reformulation:
     """Return a boxed LCP as an LCP in x - l (or u - x) and multipliers.
 
@@ -257,7 +264,7 @@ def boxed_to_lcp(
         else core.tocsr()
     )
     r = np.concatenate([sign * (A @ origin + b), (upper - lower)[both]])
-    matrix = M if scipy.sparse.issparse(A) else M.toarray()
+    matrix = M if is_sparse(A) else M.toarray()
     return _made(
         matrix,
         r,
@@ -269,7 +276,7 @@ def boxed_to_lcp(
 
 
 def boxed_to_quadratic_program(
-    A: Any, b: Vector, lower: Vector, upper: Vector
+    A: Matrix, b: Vector, lower: Vector, upper: Vector
 ) -> QuadraticProgramData:
     """Return the quadratic program of a boxed LCP ([Book] eq. 1.58, 1.78).
 
@@ -287,7 +294,7 @@ def boxed_to_quadratic_program(
 
 
 def quadratic_program_to_boxed(
-    program: QuadraticProgramData, *, device: Any = None
+    program: QuadraticProgramData, *, device: wp.DeviceLike = None
 ) -> Reformulation:
     """Return the KKT conditions of a quadratic program as a boxed LCP.
 
@@ -317,12 +324,12 @@ def quadratic_program_to_boxed(
         return _same(program.Q, program.c, program.lower, program.upper, device)
     B = scipy.sparse.vstack(constraints)
     M = scipy.sparse.block_array([[zero(program.Q), -B.T], [B, None]], format="csr")
-    matrix = M if scipy.sparse.issparse(program.Q) else M.toarray()
+    matrix = M if is_sparse(program.Q) else M.toarray()
     return _made(matrix, np.concatenate(r), np.concatenate(lower), upper, lambda z: z[:n], device)
 
 
 def boxed_to_variational_inequality(
-    A: Any, b: Vector, lower: Vector, upper: Vector
+    A: Matrix, b: Vector, lower: Vector, upper: Vector
 ) -> BoxVariationalInequality:
     """Return a boxed LCP as a variational inequality ([Book] 1.1.4).
 
@@ -332,7 +339,7 @@ def boxed_to_variational_inequality(
 
 
 def boxed_to_proximal(
-    A: Any, b: Vector, lower: Vector, upper: Vector, *, r: float | Vector | None = None
+    A: Matrix, b: Vector, lower: Vector, upper: Vector, *, r: float | Vector | None = None
 ) -> ProximalFixedPoint:
     """Return the proximal fixed-point form of a boxed LCP ([Book] eq. 1.52-1.53).
 
@@ -357,7 +364,7 @@ def boxed_to_proximal(
     return ProximalFixedPoint(lambda x: A @ x + b, r, lower, upper)
 
 
-def boxed_to_minimum_map(A: Any, b: Vector, lower: Vector, upper: Vector) -> Map:
+def boxed_to_minimum_map(A: Matrix, b: Vector, lower: Vector, upper: Vector) -> Map:
     """Return a boxed LCP as root finding of the minimum map ([Book] 1.1.3).
 
     H(x) = max(min(x - l, y), x - u), eq. 1.61.
@@ -365,7 +372,7 @@ def boxed_to_minimum_map(A: Any, b: Vector, lower: Vector, upper: Vector) -> Map
     return lambda x: np.maximum(np.minimum(x - lower, A @ x + b), x - upper)
 
 
-def boxed_to_fischer_burmeister(A: Any, b: Vector, lower: Vector, upper: Vector) -> Map:
+def boxed_to_fischer_burmeister(A: Matrix, b: Vector, lower: Vector, upper: Vector) -> Map:
     """Return a boxed LCP as root finding of the Fischer-Burmeister map.
 
     phi(x - l, phi(u - x, -y)) with phi(s, t) = sqrt(s^2 + t^2) - s - t ([Book] eq. 1.48, 1.62).
@@ -382,7 +389,7 @@ def boxed_to_fischer_burmeister(A: Any, b: Vector, lower: Vector, upper: Vector)
     return lambda x: fischer(x - lower, fischer(upper - x, -(A @ x + b)))
 
 
-def _marked(equations: Any, n: int) -> np.ndarray:
+def _marked(equations: Values, n: int) -> np.ndarray:
     """Return the mask of the rows that are equations.
 
     Row numbers and 0/1 integers are refused, because each could be read as the other.
@@ -395,9 +402,13 @@ def _marked(equations: Any, n: int) -> np.ndarray:
     return mask
 
 
-def _same(A: Any, b: Vector, lower: Vector, upper: Vector, device: Any) -> Reformulation:
+def _same(
+    A: Matrix, b: Vector, lower: Vector, upper: Vector, device: wp.DeviceLike
+) -> Reformulation:
     return _made(A, np.asarray(b, dtype=np.float64), lower, upper, lambda x: x, device)
 
 
-def _made(A: Any, b: Vector, lower: Vector, upper: Vector, back: Map, device: Any) -> Reformulation:
+def _made(
+    A: Matrix, b: Vector, lower: Vector, upper: Vector, back: Map, device: wp.DeviceLike
+) -> Reformulation:
     return Reformulation(LCP(as_operator(A, device), b, lower, upper), A, b, lower, upper, back)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.pickling import FieldsOnHost
+from warp_lcp.problem.pickling import FieldsOnHost, Reduced
 
 if TYPE_CHECKING:
+    from warp_lcp.problem.lcp import LCP
     from warp_lcp.problem.merits import Merits
+    from warp_lcp.problem.solve import VariationalInequality
 
 
 class SolveStatus(Enum):
@@ -64,7 +66,7 @@ class SolveStatus(Enum):
         "check the sign of A: y = A x + b needs A, not -A; where the sign is right, try wl.Lemke()"
     )
 
-    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+    def __reduce_ex__(self, protocol: object) -> Reduced:
         """Pickle the name: the message may change."""
         return getattr, (SolveStatus, self.name)
 
@@ -126,7 +128,9 @@ class SolveResult(FieldsOnHost):
     history: list[Record] = field(repr=False)
     grid: tuple[int, ...] | None = None
     method: str | None = None
-    problem: Any = field(default=None, repr=False, compare=False, metadata={"pickled": False})
+    problem: LCP | VariationalInequality | None = field(
+        default=None, repr=False, compare=False, metadata={"pickled": False}
+    )
     version: int | None = field(default=None, repr=False, compare=False)
 
     def __bool__(self) -> bool:

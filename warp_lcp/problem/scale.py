@@ -18,13 +18,18 @@ largest magnitude of each row and column (Ruiz 2001). Such r and c are not uniqu
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
 from warp_lcp.kernels.fields import Layout
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.data_types import Matrix, dense, is_sparse
+
+if TYPE_CHECKING:
+    from warp_lcp.problem.protocol import Operator
 
 # Relative excess of entries over those of the diagonal that storage in float32 causes in
 # semi-definite matrices of low rank.
@@ -40,7 +45,7 @@ class NoTranspose(ValueError):
     """The transpose of an operator without one was requested."""
 
 
-def scale_of_matrix(A: Any) -> np.ndarray:
+def scale_of_matrix(A: Matrix) -> np.ndarray:
     """Return d > 0, shape (n,), of a numpy or scipy.sparse matrix.
 
     An empty row or column counts as 1.
@@ -48,7 +53,7 @@ def scale_of_matrix(A: Any) -> np.ndarray:
     return sizes_of_matrix(A)[0]
 
 
-def sizes_of_matrix(A: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sizes_of_matrix(A: Matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return d, 1 / r and 1 / c, shape (n,); where d_i = |A_ii|, r = c."""
     size = abs(A)
     d = np.asarray(size.diagonal(), dtype=np.float64)
@@ -93,7 +98,7 @@ def scale_by_products(
 
 
 def estimated_scale(
-    A: Any, layout: Layout, unknown: np.ndarray, diagonal: np.ndarray | None = None
+    A: Operator, layout: Layout, unknown: np.ndarray, diagonal: np.ndarray | None = None
 ) -> np.ndarray:
     """Return `scale_by_products` of an operator, a flat stored field.
 
@@ -107,7 +112,9 @@ def estimated_scale(
     """
     z, image = layout.zeros(wp.float64), layout.zeros(wp.float64)
 
-    def images(apply: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
+    def images(
+        apply: Callable[[DeviceArray, DeviceArray], DeviceArray],
+    ) -> Callable[[np.ndarray], np.ndarray]:
         def product(values: np.ndarray) -> np.ndarray:
             z.assign(values * unknown)
             apply(z.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
@@ -121,7 +128,7 @@ def estimated_scale(
     )
 
 
-def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
+def _diagonal_leads(size: Matrix, d: np.ndarray) -> bool:
     """Return whether some r and c make the diagonal of |A| 1 and no entry larger.
 
     Rows that are empty together with their columns do not count. With r_i = g_i / sqrt(d_i) and c_i
@@ -138,7 +145,7 @@ def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
     if w.max() <= 1 + SLACK:
         return True
     # g cannot exist if w_ij w_ji > 1.
-    if (w.multiply(w.T) if scipy.sparse.issparse(w) else w * w.T).max() > 1 + 2 * SLACK:
+    if (w.multiply(w.T) if is_sparse(w) else np.asarray(w * w.T)).max() > 1 + 2 * SLACK:
         return False
     g = np.ones_like(d)
     # Bellman-Ford: reduce g_i until no constraint is violated.
@@ -152,19 +159,19 @@ def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
     return False
 
 
-def scaled(A: Any, left: np.ndarray, right: np.ndarray) -> Any:
+def scaled(A: Matrix, left: np.ndarray, right: np.ndarray) -> Matrix:
     """Return diag(left) A diag(right)."""
-    if not scipy.sparse.issparse(A):
-        return left[:, None] * A * right
+    if not is_sparse(A):
+        return np.asarray(left[:, None] * A * right)
     data = np.repeat(left, np.diff(A.indptr))
     data *= A.data
     data *= right[A.indices]
     return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape)
 
 
-def _largest(A: Any, axis: int) -> np.ndarray:
+def _largest(A: Matrix, axis: int) -> np.ndarray:
     """Return the largest entries of the columns (0) or rows (1) of a matrix.
 
     The matrix has no negative entries.
     """
-    return A.max(axis=axis).toarray().ravel() if scipy.sparse.issparse(A) else A.max(axis=axis)
+    return dense(A.max(axis=axis)).ravel()

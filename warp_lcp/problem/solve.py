@@ -13,7 +13,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
-from typing import Any, Literal, Protocol, get_args, get_type_hints, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    Protocol,
+    TypeGuard,
+    get_args,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import numpy as np
 import warp as wp
@@ -21,15 +30,25 @@ import warp as wp
 from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.kernels.fields import Array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import convert
 from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.merits import Merits, merits_at
-from warp_lcp.problem.protocol import NamesComponents, asks_beyond_storage, has, version_of
+from warp_lcp.problem.protocol import (
+    NamesComponents,
+    Scratch,
+    asks_beyond_storage,
+    declared,
+    has,
+    version_of,
+)
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria, limit_of_steps
+
+if TYPE_CHECKING:
+    from warp_lcp.operators.components import FloatingComponents
 
 # Least norm for which residuals 16 digits smaller have squares that float64 can hold.
 SMALLEST = 1e-138
@@ -48,14 +67,16 @@ class Precision(StrEnum):
     DOUBLE = "double"
 
     @property
-    def iterate(self) -> Any:
+    def iterate(self) -> DataType:
         """Warp's type of the iterate."""
-        return wp.float32 if self is Precision.SINGLE else wp.float64
+        kind: DataType = wp.float32 if self is Precision.SINGLE else wp.float64
+        return kind
 
     @property
-    def correction(self) -> Any:
+    def correction(self) -> DataType:
         """Warp's type of corrections."""
-        return wp.float64 if self is Precision.DOUBLE else wp.float32
+        kind: DataType = wp.float64 if self is Precision.DOUBLE else wp.float32
+        return kind
 
     @property
     def epsilon(self) -> float:
@@ -133,6 +154,7 @@ class Residual(Protocol):
         """Estimate the norm that rounding x to `epsilon` leaves; 0 if there is none."""
 
 
+@runtime_checkable
 class Workspace(Protocol):
     """Memory that a method allocates once for a problem.
 
@@ -166,25 +188,44 @@ class Workspace(Protocol):
         """Set x to the best iterate."""
 
 
-class BeginsOnDevice(Protocol):
-    """A workspace whose device can begin a solve without the host."""
+class OptionalMembers:
+    """Members of workspaces that have defaults.
+
+    Attributes:
+        scratch: stored fields, of 4-byte elements and of bytes, that the search of floating
+            components may overwrite before `start`; None: there are none.
+        device_begins: whether `begin_ahead` may begin a solve.
+    """
+
+    scratch: Scratch | None = None
+    device_begins = False
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether the device has already taken the next step."""
+        return False
+
+    def solution(self) -> DeviceArray | None:
+        """Return x in its precision and stored shape; None: x itself."""
+        return None
 
     def begin_ahead(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
-        """Begin a solve on the device, and take steps.
+        """Begin a solve on the device, and take steps, without the host.
 
         `start` comes next, then the steps. Returns the residual that tolerances refer to, None
-        where nothing has begun.
+        where nothing has begun; by default nothing does.
 
         Args:
             guess: stored field, or None.
             criteria: of the solve.
             steps: largest number of steps of this solve without the host.
         """
+        return None
 
 
-class WorkspaceBase:
+class WorkspaceBase(OptionalMembers):
     """Base of workspaces: x, its residual, and the best iterate.
 
     x is moved in place and rounded to its precision; the best iterate is a copy.
@@ -196,7 +237,7 @@ class WorkspaceBase:
         residual: evaluated at x; a NaturalResidual of its own if None.
     """
 
-    floating: Any = None
+    floating: FloatingComponents | None = None
     _best: DeviceArray | None = None
     _solution: DeviceArray | None = None
 
@@ -278,12 +319,13 @@ def _name_of_class(name: str) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
 
 
-def method_name(method: Any) -> str:
+def method_name(method: Solver) -> str:
     """Return a method's name.
 
     Its `name` if it has one, else the words of its class, joined by hyphens.
     """
-    return getattr(method, "name", None) or _name_of_class(type(method).__name__)
+    name: str | None = getattr(method, "name", None)  # of the class, or of an instance
+    return name or _name_of_class(type(method).__name__)
 
 
 class Spare(Protocol):
@@ -293,7 +335,8 @@ class Spare(Protocol):
         work: the workspace; its problem is a copy.
     """
 
-    work: Any
+    @property
+    def work(self) -> Workspace: ...  # noqa: D102
 
     def give_back(self, result: SolveResult) -> None:
         """Keep the workspace for later solves, if the result does not share its memory."""
@@ -307,14 +350,29 @@ class KeepsWorkspace(Protocol):
         """Return a workspace for the problem, None if `init` has to create one."""
 
 
+@cache
+def _implements(kind: type, protocol: type) -> bool:
+    """Return whether instances have a protocol's methods; looked up once for each class."""
+    return issubclass(kind, protocol)
+
+
+def is_method(solver: object) -> TypeGuard[Solver]:
+    """Return whether an object is a method with its settings."""
+    kind: type = type(solver)
+    return not isinstance(solver, type) and _implements(kind, Solver)
+
+
+def keeps_workspace(solver: Solver) -> TypeGuard[KeepsWorkspace]:
+    """Return whether a method keeps workspaces."""
+    return _implements(type(solver), KeepsWorkspace)
+
+
 def spare_of(solver: Solver, problem: Any) -> Spare | None:
     """Return a workspace of an earlier solve with a problem's data, or None.
 
     The method must have kept one.
     """
-    # A test for the protocol `KeepsWorkspace` would take a twentieth of a small solve.
-    lend = getattr(solver, "spare", None)
-    return None if lend is None else lend(problem)
+    return solver.spare(problem) if keeps_workspace(solver) else None
 
 
 def solve(
@@ -332,7 +390,7 @@ def solve(
     """
     if not isinstance(problem, (LCP, VariationalInequality)):
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
-    if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
+    if not is_method(solver):
         kind = (
             f"the class {solver.__name__}"
             if isinstance(solver, type)
@@ -373,7 +431,8 @@ def refusal(
         solver: the method.
         preconditioned: whether the method has to use the problem's preconditioner.
     """
-    kind, taken = type(solver).__name__, getattr(solver, "problems", LCP)
+    kind, own = type(solver).__name__, declared(solver)
+    taken = own.problems or LCP
     if not isinstance(problem, taken):
         return (
             f"{kind} takes problems of the class {taken.__name__}: this is a "
@@ -381,20 +440,16 @@ def refusal(
         )
     if not isinstance(problem, LCP):
         return None
-    if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
+    if problem.bounds.affine is not None and not own.affine_bounds:
         return (
             f"{kind} cannot use bounds that are affine in x: use ProjectedSOR or another "
             "sweeping method"
         )
-    if (
-        preconditioned
-        and problem.preconditioner is not None
-        and not getattr(solver, "preconditioned", False)
-    ):
+    if preconditioned and problem.preconditioner is not None and not own.preconditioned:
         return (
             f"preconditioner: {kind} does not use one: use MinimumMapNewton or PrimalDualActiveSet"
         )
-    if problem.layout.across is not None and not getattr(solver, "distributed", False):
+    if problem.layout.across is not None and not own.distributed:
         return f"{kind} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton"
     return None
 
@@ -405,15 +460,12 @@ def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
     Raises:
         ValueError: it does not.
     """
-    name = type(solver).__name__
-    if isinstance(work, type) or not all(
-        hasattr(work, part) for part in ("problem", "x", "residual", "start")
-    ):
+    name, made = type(solver).__name__, _workspaces_of(type(solver))
+    if isinstance(work, type) or not (type(work) in made or isinstance(work, Workspace)):
         kind = (
             f"the class {work.__name__}" if isinstance(work, type) else f"a {type(work).__name__}"
         )
         raise ValueError(f"workspace is {kind}: expected what {name}.init(problem) returned")
-    made = _workspaces_of(type(solver))
     if made and type(work) not in made:
         raise ValueError(
             f"workspace is a {type(work).__name__}, made by another method: expected what "
@@ -424,7 +476,8 @@ def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
             "workspace was made for another problem; it fits only the problem that it was made "
             "for, changed in place or not"
         )
-    return work
+    checked: Workspace = work
+    return checked
 
 
 @cache
@@ -483,7 +536,7 @@ class _Loop:
         self.begun = time.perf_counter()
         self.linear = 0
         self.name = method_name(solver)
-        self.floating: Any = None  # components of the operator
+        self.floating: FloatingComponents | None = None  # components of the operator
         self.best_iteration, self.best_norm, self.progress, self.stopped = 0, math.inf, 0, False
         self.best_method = self.name
 
@@ -530,11 +583,11 @@ class _Loop:
     def _begin_ahead(self, x0: Array | None) -> float | None:
         """Begin a solve on the device if the workspace supports that.
 
-        Returns the value of `BeginsOnDevice.begin_ahead`. With a callback, merits or a deadline the
-        host takes each step.
+        Returns the value of `OptionalMembers.begin_ahead`. With a callback, merits or a deadline
+        the host takes each step.
         """
-        work: Any = self.work
-        if not hasattr(work, "begin_ahead"):
+        work = self.work
+        if not (isinstance(work, OptionalMembers) and work.device_begins):
             return None
         watched = (
             self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
@@ -593,11 +646,9 @@ class _Loop:
 
     def _solved(self) -> SolveStatus:
         """Return CONVERGED, or FLOOR for a tolerance below the storage rounding of A."""
-        A, share = (
-            getattr(self.problem, "A", None),
-            self.tolerance / max(self.reference, self.tolerance, SMALLEST),
-        )
-        return SolveStatus.FLOOR if asks_beyond_storage(A, share) else SolveStatus.CONVERGED
+        share = self.tolerance / max(self.reference, self.tolerance, SMALLEST)
+        below = isinstance(self.problem, LCP) and asks_beyond_storage(self.problem.A, share)
+        return SolveStatus.FLOOR if below else SolveStatus.CONVERGED
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
         """Return FLOOR if the best residual is at its rounding floor, else the status.
@@ -658,7 +709,6 @@ class _Loop:
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        origin: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
         version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
         return SolveResult(
             self._found(),
@@ -668,7 +718,8 @@ class _Loop:
             norm,
             relative,
             self.history,
-            **origin,
+            method=self.best_method,
+            problem=self.problem,
             version=version,
         )
 
@@ -707,13 +758,15 @@ class _LoopInBox(_Loop):
             self._record(0, Step("start", 0))
             self._keep(0)
             return ended
-        if getattr(self.solver, "definite", False) and has_negative_curvature(self.problem):
+        if declared(self.solver).definite and has_negative_curvature(self.problem):
             self._record(0, Step("start", 0))
             self._keep(0)
             return SolveStatus.NEGATIVE_CURVATURE
         A = self.problem.A
         floating = (
-            A.floating_components(getattr(self.work, "scratch", None))
+            A.floating_components(
+                self.work.scratch if isinstance(self.work, OptionalMembers) else None
+            )
             if has(A, NamesComponents)
             else None
         )
@@ -807,8 +860,10 @@ class _LoopInBox(_Loop):
     def _found(self) -> DeviceArray:
         """Return x in the problem's original layout, rounded to its precision."""
         layout, x = self.problem.layout, self.work.x
-        if self.problem.in_place and hasattr(self.work, "solution"):
-            return self.work.solution()
+        if self.problem.in_place and isinstance(self.work, OptionalMembers):
+            solution = self.work.solution()
+            if solution is not None:
+                return solution
         if self.problem.in_place:
             out = x.reshape(layout.stored_shape)
         else:

@@ -8,16 +8,29 @@ from __future__ import annotations
 import threading
 from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 from warp_lcp.kernels.thread_pool import get_threads, team
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve import Solver, Workspace
 
 # Largest workspace that is kept, in cells with ghost cells: 45 bytes each, 140 in float64 with
 # fields of faces and bounds.
 MOST_CELLS = 3 << 17
+
+
+class SharedWorkspace(Workspace, Protocol):
+    """A workspace that later solves may use.
+
+    Attributes:
+        problem: its own problem, into which others are copied.
+    """
+
+    problem: LCP
+
+    def forget_solve(self) -> None:
+        """Discard what belongs to the last solve."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +43,7 @@ class SpareWorkspace:
     """
 
     form: Hashable
-    work: Any
+    work: SharedWorkspace
 
     def give_back(self, result: SolveResult) -> None:
         """Keep the workspace for the next solve.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels.layout import BoundOperands
+from warp_lcp.kernels.types import DeviceArray
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
 CLASSIFY = KERNELS["active_set.classify"]
@@ -19,15 +20,15 @@ DIVIDE = KERNELS["principal_system.divide"]
 
 def projected_move(
     rows: Rows,
-    bounds: list[Any],
-    x: Any,
-    along: Any,
+    bounds: BoundOperands,
+    x: DeviceArray,
+    along: DeviceArray | None,
     length: float,
-    to: Any,
+    to: DeviceArray,
     *,
-    z: Any = None,
+    z: DeviceArray | None = None,
     beta: float = 0.0,
-    kept: Any = None,
+    kept: DeviceArray | None = None,
     guarded: bool = True,
 ) -> None:
     """Set `to` = clip(x + length along, l, u) where the direction is not 0.

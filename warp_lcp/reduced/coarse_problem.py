@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -22,6 +22,9 @@ from warp_lcp.problem.protocol import AIR, FLUID, HasStencil
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced.line_system import LineSystem
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 # Accuracy of a correction; interpolation blurs it by one or two layers anyway.
 ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)
@@ -47,10 +50,10 @@ class FullApproximationCorrection:
         coarse: whether A is a coarse problem's.
     """
 
-    def __init__(self, A: Any, settings: Any, *, coarse: bool = False) -> None:
+    def __init__(self, A: Any, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
         self._A, self._coarse, self._version = A, coarse, -1
         self._settings = replace(settings, monotone_cycles=0, direct=False)
-        self._work: Any = None
+        self._work: Any = None  # a NewtonWorkspace, with a coarse problem
         self.start()
 
     def start(self) -> None:
@@ -124,7 +127,7 @@ class CoarseStencilProblem(FullApproximationCorrection):
         settings: of Newton's method.
     """
 
-    def __init__(self, A: HasStencil, system: LineSystem, settings: Any) -> None:
+    def __init__(self, A: HasStencil, system: LineSystem, settings: MinimumMapNewton) -> None:
         self._system, self._hierarchy = system, system.hierarchy
         super().__init__(A, settings)
 

@@ -5,8 +5,6 @@ On a grid, or on the aggregates of a sparse matrix.
 
 from __future__ import annotations
 
-from typing import Any
-
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.multigrid.aggregates import MonotoneAggregation
@@ -15,6 +13,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.reduced.active_set_kernels import projected_move
 from warp_lcp.reduced.grid_system import GridSystem, projected_cycle
+from warp_lcp.reduced.principal_system import PrincipalSystem
 
 LARGE = 1000  # least number of unknowns of a sparse matrix for projected cycles at a cold start
 # From this number of unknowns on, six cycles replace each cycle on a grid. One costs a fifth of a
@@ -70,13 +69,13 @@ class AggregateColdStart:
 
     Args:
         problem: with a sparse matrix.
+        A: its operator.
         count: cycles of a cold start, in units of those on a grid.
     """
 
     repairs = False
 
-    def __init__(self, problem: LCP, count: int) -> None:
-        A: Any = problem.A
+    def __init__(self, problem: LCP, A: SparseOperator, count: int) -> None:
         self._problem, self._count, self._aggregation, self._at_start = (
             problem,
             count,
@@ -102,12 +101,14 @@ class AggregateColdStart:
 
 
 def cold_cycles(
-    problem: LCP, system: Any, sums: Sums, count: int
+    problem: LCP, system: PrincipalSystem, sums: Sums, count: int
 ) -> GridCycles | AggregateColdStart | None:
     """Return the cycles for a bounded problem, None for unsuitable operators."""
     if not problem.bounded:
         return None
     if isinstance(system, GridSystem):
         return GridCycles(problem, system, sums, count)
-    large = isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
-    return AggregateColdStart(problem, count) if large else None
+    A = problem.A
+    if isinstance(A, SparseOperator) and A.unknowns >= LARGE:
+        return AggregateColdStart(problem, A, count)
+    return None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -17,6 +17,7 @@ from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.active_set_kernels import CLASSIFY, ON_FREE, projected_move
@@ -25,8 +26,11 @@ from warp_lcp.reduced.cold_cycles import LARGE, cold_cycles
 from warp_lcp.reduced.dense_system import DampedSteps, DenseSystem
 from warp_lcp.reduced.grid_step_kernels import SLOTS
 from warp_lcp.reduced.line_system import LineSystem
-from warp_lcp.reduced.principal_system import principal_system
+from warp_lcp.reduced.principal_system import PrincipalSystem, principal_system
 from warp_lcp.reduced.sparse_system import SparseSystem
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 
 class CorrectionSystem:
@@ -56,7 +60,9 @@ class CorrectionSystem:
 
     whole = False
 
-    def __init__(self, problem: LCP, settings: Any, iterate: WorkspaceBase | None = None) -> None:
+    def __init__(
+        self, problem: LCP, settings: MinimumMapNewton, iterate: WorkspaceBase | None = None
+    ) -> None:
         self._problem, self._settings, layout = problem, settings, problem.layout
         self.iterate = WorkspaceBase(problem, settings.precision) if iterate is None else iterate
         real, x = self.iterate.precision.correction, self.iterate.x
@@ -289,13 +295,15 @@ class CorrectionSystem:
         self.iterate.round_iterate()
 
 
-def _coarse_problem(problem: LCP, system: Any, settings: Any) -> FullApproximationCorrection | None:
+def _coarse_problem(
+    problem: LCP, system: PrincipalSystem, settings: MinimumMapNewton
+) -> FullApproximationCorrection | None:
     """Return the coarse problem of an operator, None if it has none.
 
     A large sparse matrix has one, and a stencil that needs lines.
     """
-    A: Any = problem.A
-    if isinstance(system, LineSystem):
+    A = problem.A
+    if isinstance(system, LineSystem) and has(A, HasStencil):
         return CoarseStencilProblem(A, system, settings)
     return (
         FullApproximationCorrection(A, settings)

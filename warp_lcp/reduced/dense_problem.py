@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -17,12 +16,15 @@ import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
+from warp_lcp.problem.data_types import Matrix, SparseMatrix, is_sparse
+from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.program_optimality import PROVABLE
 from warp_lcp.problem.protocol import HasRows, has
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.problem.solve import EPS, Precision, Step, WorkspaceBase
+from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 
 # Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.
 SEMIDEFINITE = 1e-10
@@ -61,7 +63,7 @@ class DenseProblem:
     """
 
     rows: np.ndarray
-    A: Any
+    A: Matrix
     b: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
@@ -88,7 +90,7 @@ class DenseProblem:
 
     def affine(self, x: np.ndarray) -> np.ndarray:
         """Return y = A x + b."""
-        return self.A @ x + self.b
+        return np.asarray(self.A @ x + self.b)
 
     def scaled(self) -> tuple[DenseProblem, np.ndarray]:
         """Return the problem in units in which A and b have entries near 1.
@@ -100,7 +102,7 @@ class DenseProblem:
         """
         R, C = self._units()
         b, start = R * self.b, R * (self.A @ np.clip(0.0, self.lower, self.upper))
-        beta = power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
+        beta = float(power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0))
         units = beta * C
         with np.errstate(over="ignore"):  # a bound that overflows in these units is infinite
             sides = self.lower / units, self.upper / units
@@ -136,13 +138,12 @@ class DenseProblem:
             free: shape (n,), bool.
         """
         rows, out = np.flatnonzero(free), x.copy()
-        block: Any = self.A[np.ix_(rows, rows)] if len(rows) else None
         for _ in range(2 if len(rows) else 0):
-            y = self.affine(out)[rows]
+            block, y = self.A[np.ix_(rows, rows)], self.affine(out)[rows]
             out[rows] -= (
                 scipy.sparse.linalg.lsmr(block, y, atol=0.0, btol=0.0)[0]
-                if scipy.sparse.issparse(block)
-                else _solved(block, y)
+                if is_sparse(block)
+                else _solved(np.asarray(block), y)
             )
         out = np.clip(out, self.lower, self.upper)
         return out if np.isfinite(out).all() and self.residual(out) < self.residual(x) else x
@@ -151,7 +152,7 @@ class DenseProblem:
 def sparse_matrix(problem: LCP) -> scipy.sparse.csr_array | None:
     """Return the matrix of an operator with sparse rows, None for other operators."""
     matrix = problem.A.rows().matrix() if has(problem.A, HasRows) else None
-    return matrix if scipy.sparse.issparse(matrix) else None
+    return matrix if matrix is not None and is_sparse(matrix) else None
 
 
 def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
@@ -161,7 +162,7 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     """
     if has(problem.A, HasRows):
         whole = problem.A.rows().matrix()
-        return (whole.toarray() if scipy.sparse.issparse(whole) else whole)[np.ix_(rows, rows)]
+        return np.asarray(as_dense(whole)[np.ix_(rows, rows)])
     layout = problem.layout
     unit, image, zero = (layout.zeros(wp.float64) for _ in range(3))
     host, matrix = np.zeros(layout.size), np.empty((len(rows), len(rows)))
@@ -175,12 +176,12 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def power_of_two(value: Any) -> Any:
+def power_of_two(value: np.ndarray | float) -> np.ndarray:
     """Return the nearest power of 2, on a logarithmic scale; 1 for 0."""
     return 2.0 ** np.round(np.log2(np.where(value > 0, value, 1.0)))
 
 
-def unit_rows_and_columns(A: Any) -> tuple[np.ndarray, np.ndarray]:
+def unit_rows_and_columns(A: Matrix) -> tuple[np.ndarray, np.ndarray]:
     """Return R and C > 0, powers of 2, that scale A by rows and columns.
 
     R A C has a largest entry near 1 in each row and in each column, or its diagonal near 1.
@@ -189,7 +190,7 @@ def unit_rows_and_columns(A: Any) -> tuple[np.ndarray, np.ndarray]:
     return power_of_two(1 / rows), power_of_two(1 / columns)
 
 
-def equilibration(A: Any) -> np.ndarray:
+def equilibration(A: Matrix) -> np.ndarray:
     """Return S > 0 that scales A symmetrically.
 
     S A S has a largest entry near 1 in each row and column together (Ruiz's iteration, kept
@@ -221,7 +222,7 @@ def factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
     return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
-def solved_or_none(A: Any, r: np.ndarray) -> np.ndarray | None:
+def solved_or_none(A: SparseMatrix, r: np.ndarray) -> np.ndarray | None:
     """Return A^-1 r of a sparse A, None where a factor is exactly singular."""
     try:
         solution = scipy.sparse.linalg.splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(r)
@@ -235,7 +236,7 @@ def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.solve(A, r)
     except np.linalg.LinAlgError:
-        return np.linalg.lstsq(A, r, rcond=RANK)[0]
+        return np.asarray(np.linalg.lstsq(A, r, rcond=RANK)[0])
 
 
 def semidefinite(A: np.ndarray) -> bool:
@@ -299,7 +300,7 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
         return bool(data.b @ z + gains.sum() < -doubt)
 
 
-def diagonally_dominant(A: Any) -> bool:
+def diagonally_dominant(A: Matrix) -> bool:
     """Return whether A is diagonally dominant, with a positive diagonal.
 
     Every row must also lead to a strictly dominant one. Such a matrix is nonsingular, and a
@@ -329,7 +330,7 @@ def diagonally_dominant(A: Any) -> bool:
     reached = scipy.sparse.csgraph.breadth_first_order(
         (start + backward).tocsr(), n, return_predecessors=False
     )
-    return len(reached) == n + 1
+    return bool(len(reached) == n + 1)
 
 
 def inconsistent(data: DenseProblem) -> bool:
@@ -412,7 +413,7 @@ def incompatible(problem: LCP) -> bool:
     return False
 
 
-def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
+def _refined(transpose: Matrix, z: np.ndarray) -> np.ndarray:
     """Return refined multipliers near z that satisfy the equations of a vertex.
 
     The refined multipliers are 0 where z is. (A'z)_j is 0 where it is 0 at the vertex; the solver
@@ -430,7 +431,7 @@ def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
     return out
 
 
-def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def _units_with_right_side(A: Matrix, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return powers of 2 R, C and beta > 0 that scale [A b].
 
     The rows and columns of R [A b] diag(C, 1 / beta) have largest entries near 1.
@@ -453,12 +454,12 @@ def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return R, C, beta
 
 
-def entries_of_columns(A: Any) -> np.ndarray:
+def entries_of_columns(A: Matrix) -> np.ndarray:
     """Return the number of nonzero entries of each column."""
     return (
         np.bincount(A.indices, minlength=A.shape[1])
-        if scipy.sparse.issparse(A)
-        else np.count_nonzero(A, axis=0)
+        if is_sparse(A)
+        else np.count_nonzero(np.asarray(A), axis=0)
     )
 
 
@@ -563,7 +564,7 @@ class DenseWorkspace(WorkspaceBase):
 
     def read_iterate(self) -> np.ndarray:
         """Return the iterate's unknowns, shape (n,)."""
-        return self.x.numpy()[self.data.rows].copy()
+        return np.asarray(self.x.numpy()[self.data.rows].copy())
 
     def write_iterate(self, values: np.ndarray) -> None:
         """Set the iterate's unknowns, shape (n,), projected onto the bounds."""

@@ -100,7 +100,7 @@ class Descent:
         if self._vain < patience:
             return 0
         self._vain, self._fell, self.runs = 0, math.inf, self.runs + 1
-        return 2 ** (self.runs - 1)
+        return int(2 ** (self.runs - 1))
 
     def creeps(self, fell: float, *, moved: bool) -> bool:
         """Return whether a projected cycle should follow a truncated step.

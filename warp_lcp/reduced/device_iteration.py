@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, no_type_check
+from typing import TYPE_CHECKING, no_type_check
 
 import numpy as np
 import warp as wp
@@ -32,6 +32,7 @@ from warp_lcp.kernels.vectors import CONVERT, add_across
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem.protocol import Scratch
 from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced.descent import CREEP, STALL
@@ -571,7 +572,9 @@ class Beginning:
             return floating == faults == 0.0 and bounds.stays_with(others)
         return bounds.stays and self._finder.none() and not self._faults.numpy()[0]
 
-    def _record(self, launch: Launch, search: Conditional | Callable[[Any], object] | None) -> None:
+    def _record(
+        self, launch: Launch, search: Conditional | Callable[[Scratch | None], object] | None
+    ) -> None:
         """Record the launches, or launch them.
 
         Args:

@@ -18,11 +18,13 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scaled
-from warp_lcp.problem.solve import Step, WorkspaceBase
+from warp_lcp.problem.solve import Step, Workspace, WorkspaceBase
 from warp_lcp.reduced.dense_problem import (
     DenseProblem,
     power_of_two,
@@ -64,7 +66,7 @@ class EquilibratedWorkspace(WorkspaceBase):
         inner: that workspace.
     """
 
-    def __init__(self, problem: LCP, precision: str, make: Callable[[LCP], Any]) -> None:
+    def __init__(self, problem: LCP, precision: str, make: Callable[[LCP], Workspace]) -> None:
         super().__init__(problem, precision)
         layout, bounds = problem.layout, problem.bounds
         self._rows, self._units = layout.zeros(wp.float64), layout.zeros(wp.float64)
@@ -75,7 +77,9 @@ class EquilibratedWorkspace(WorkspaceBase):
             for k in (0, 1)
         ]
         self._sides = sides
-        self._operator: Any = as_operator(self._scaled(), problem.device, problem.A.dtype)
+        operator = as_operator(self._scaled(), problem.device, problem.A.dtype)
+        assert isinstance(operator, (DenseOperator, SparseOperator)), "`_scaled` is a matrix"
+        self._operator = operator
         limits = [bounds.values[k] if side is None else side for k, side in enumerate(sides)]
         self._inner = LCP(self._operator, layout.zeros(wp.float64), *limits)
         self.inner = make(self._inner)
@@ -170,13 +174,16 @@ class EquilibratedWorkspace(WorkspaceBase):
         """Return the status of a solve that makes no progress."""
         return SolveStatus.INFEASIBLE if proved_infeasible(self.problem) else SolveStatus.STAGNATED
 
-    def _scaled(self) -> Any:
+    def _scaled(self) -> Matrix:
         """Compute R and C, and return R A C on the host."""
-        A: Any = self.problem.A
+        A = self.problem.A
+        assert has(A, HasRows), "`suits` has been asked"
         matrix = A.rows().matrix()
+        scaling = self.problem.A
+        d = scaling.scale() if has(scaling, HasScale) else None
         R, C = (
-            (power_of_two(1 / np.sqrt(A.scale())),) * 2
-            if A.symmetric
+            (power_of_two(1 / np.sqrt(d)),) * 2
+            if A.symmetric and d is not None
             else unit_rows_and_columns(matrix)
         )
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -22,6 +22,9 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
 from warp_lcp.reduced.residual_and_active_set import ResidualAndActiveSet
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 IDLE = StoppingCriteria.patience  # iterations of one linear solve without a smaller residual
 
@@ -104,7 +107,7 @@ class FusedGridSystem:
     iterate: MultigridWorkspace
     whole = False
 
-    def __init__(self, problem: LCP, settings: Any) -> None:
+    def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         self._settings = settings
         self.iterate = passes = MultigridWorkspace(
             problem,

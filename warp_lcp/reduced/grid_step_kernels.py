@@ -6,12 +6,12 @@ step.
 """
 
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.kernels import BoundKernel, FusedKernel, KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_passes import ASCEND
 from warp_lcp.multigrid.stencil_level import StencilLevel
 
@@ -55,7 +55,7 @@ MASK = KERNELS["projected_multigrid.mask"]
 UNDO = KERNELS["projected_multigrid.undo"]
 
 
-def measuring(finest: StencilLevel, direction: Any, out: Any) -> BoundKernel:
+def measuring(finest: StencilLevel, direction: DeviceArray, out: DeviceArray) -> BoundKernel:
     """Return the kernel that sums the products of a cycle's correction."""
     return MEASURE.bind(
         finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out

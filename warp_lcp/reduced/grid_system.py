@@ -6,15 +6,15 @@ Conjugate gradients, or GMRES if A is not symmetric.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import CommandBuffer
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.krylov.system import KrylovMethod
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
@@ -35,7 +35,7 @@ class GridSystem(GuardedSystem):
     def __init__(
         self,
         A: HasStencil,
-        real: Any,
+        real: DataType,
         *,
         bounded: bool,
         settings: CycleSettings | None = None,
@@ -52,7 +52,9 @@ class GridSystem(GuardedSystem):
         # One CPU thread, no ghost cells to fill.
         self.fused = self.hierarchy.ends_in_wave and A.symmetric and A.stencil.ghosts is None
         if self.fused:
-            method: Any = FusedConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
+            method: KrylovMethod = FusedConjugateGradient(
+                A.stencil, self.hierarchy, weighted=shifted
+            )
         else:
             method = (ConjugateGradient if A.symmetric else GMRES)(
                 self.hierarchy.finest.stencil.product, self, weight=self._weight

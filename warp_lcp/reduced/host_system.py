@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 import warp as wp
@@ -19,11 +19,15 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.dense_problem import factored
 from warp_lcp.reduced.nested_iteration import nested_iteration
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 # Largest number of unknowns for which LAPACK on the host costs less than kernel launches, for every
 # bandwidth.
@@ -103,7 +107,7 @@ class NarrowMatrix:
         return self.banded.solve(free, r)
 
 
-def suits(A: Any) -> bool:
+def suits(A: Operator) -> TypeGuard[DenseOperator | SparseOperator]:
     """Return whether systems of an operator are solved directly on the host.
 
     The matrix must be small or narrow.
@@ -244,8 +248,8 @@ class HostSystem:
     iterate: HostIterate
     whole = True
 
-    def __init__(self, problem: LCP, settings: Any) -> None:
-        A: Any = problem.A
+    def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
+        A = problem.A
         if not suits(A):
             raise ValueError(
                 f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or "

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import CommandBuffer
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.multigrid.black_box_multigrid import BlackBoxMultigrid
@@ -25,7 +24,7 @@ class LineSystem(GuardedSystem):
     def __init__(
         self,
         A: HasStencil,
-        real: Any,
+        real: DataType,
         *,
         settings: CycleSettings | None = None,
         shifted: bool = False,

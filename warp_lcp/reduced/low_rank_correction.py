@@ -7,12 +7,12 @@ the inverse.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels import BoundKernel, KernelFile, Rows
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
@@ -183,13 +183,15 @@ class WoodburyCorrection:
             1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1)
         )
         # The reduction of the sums on a GPU, with the memory of its entries.
-        self._adding: tuple[Any, Reduction] | None = None
+        self._adding: tuple[BoundKernel, Reduction] | None = None
         self._columns_of_slots = HostArray(n, wp.int32, device)
         self._of_slot = self._columns_of_slots.array
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
         self._spare = self._Z  # memory for potentials that change slots
-        self._bound: dict[int, tuple[Reduction, Any, Any]] = {}  # by the number of slots
+        self._bound: dict[
+            int, tuple[Reduction, BoundKernel, BoundKernel]
+        ] = {}  # by the number of slots
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
@@ -381,7 +383,7 @@ class WoodburyCorrection:
             )
         self._seen[[q for q in range(low.rank) if q not in with_potentials]] = 0.0
 
-    def _bind(self, slots: int) -> tuple[Reduction, Any, Any]:
+    def _bind(self, slots: int) -> tuple[Reduction, BoundKernel, BoundKernel]:
         """Return the launches for a number of slots: sums Z'r, products, z -= Z t."""
         finest, rows, n, across = (
             self._hierarchy.finest,

@@ -5,13 +5,11 @@ For example a liquid that carries rigid bodies.
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import Launch, launch_now
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import rows_of
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.system import KrylovSystem
@@ -35,7 +33,7 @@ class CoupledGridSystem(KrylovSystem):
         A: SumOperator,
         grid: HasStencil,
         low: LowRankOperator,
-        real: Any,
+        real: DataType,
         *,
         settings: CycleSettings | None,
         shifted: bool,

@@ -5,8 +5,9 @@ For example a liquid that carries rigid bodies.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -188,14 +189,14 @@ class CoupledWorkspace(MultigridWorkspace):
         self.correction.begin()
         super()._cycle()
 
-    def problem_key(self) -> tuple[Any, ...]:
+    def problem_key(self) -> tuple[Hashable, ...]:
         """Return the key of launches that depend on the problem's data.
 
         It includes the memory of the columns' entries.
         """
         return (*super().problem_key(), self._low.columns.rows.ptr)
 
-    def program_key(self) -> tuple[Any, ...]:
+    def program_key(self) -> tuple[Hashable, ...]:
         """Return the key of the launches of a truncated cycle, with the correction's."""
         return (*super().program_key(), *self.correction.key)
 

@@ -6,9 +6,9 @@ It has the iterate, its residual with a free set, and a search direction.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol, cast
 
 import warp as wp
 
@@ -19,6 +19,7 @@ from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_passes import CLEAR
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.halo_levels import beside_cuts
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.operators.components import FloatingComponents
@@ -35,6 +36,34 @@ if TYPE_CHECKING:
     from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
 
 AHEAD = 20  # steps that the device may take without the host, which then examines their pace
+
+
+class CycleMethod(Protocol):
+    """Settings of a method that takes monotone cycles.
+
+    Attributes:
+        precision: of iterate and corrections.
+        cycle: how cycles go.
+        monotone_cycles: cycles of a cold start.
+    """
+
+    @property
+    def precision(self) -> str: ...  # noqa: D102
+    @property
+    def cycle(self) -> CycleSettings: ...  # noqa: D102
+    @property
+    def monotone_cycles(self) -> int: ...  # noqa: D102
+
+
+class PatientMethod(CycleMethod, Protocol):
+    """Settings of a method whose steps minimize an energy.
+
+    Attributes:
+        patience: steps without a new least energy before monotone cycles are taken.
+    """
+
+    @property
+    def patience(self) -> int: ...  # noqa: D102
 
 
 class MultigridWorkspace(WorkspaceBase):
@@ -64,6 +93,7 @@ class MultigridWorkspace(WorkspaceBase):
     # Limit of runs of projected cycles: after those, the free set is considered to cycle.
     most_runs: float = math.inf
     cycles_against_creeping = True
+    device_begins = True
     # Whether `WoodburyCorrection.note` has been launched for the current free set.
     free_set_noted = False
 
@@ -71,7 +101,7 @@ class MultigridWorkspace(WorkspaceBase):
         self,
         problem: LCP,
         A: HasStencil,
-        settings: Any,
+        settings: CycleMethod,
         *,
         residual: Callable[..., ResidualAndActiveSet] = ResidualAndActiveSet,
         shifted: bool = False,
@@ -90,20 +120,21 @@ class MultigridWorkspace(WorkspaceBase):
         upper = (
             problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
         )
-        options: dict[str, Any] = {
-            "bounded": self.bounded,
-            "settings": settings.cycle,
-            "bounds": (self._p, upper),
-            "shifted": shifted,
-        }
-        self.hierarchy = make_hierarchy(A.stencil, real, **options)
+        self.hierarchy = make_hierarchy(
+            A.stencil,
+            real,
+            bounded=self.bounded,
+            settings=settings.cycle,
+            bounds=(self._p, upper),
+            shifted=shifted,
+        )
         super().__init__(
             problem,
             precision,
             residual=residual(problem, A, self.hierarchy, rounded=precision is Precision.SINGLE),
         )
         self.flat = Rows.of_fields(problem.layout)
-        self._programs: dict[tuple[Any, ...], CommandBuffer] = {}  # truncated cycles
+        self._programs: dict[tuple[Hashable, ...], CommandBuffer] = {}  # truncated cycles
         self._mask: DeviceArray | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
         # Steps since the best iterate; whether it has memory of its own.
@@ -285,7 +316,9 @@ class MultigridWorkspace(WorkspaceBase):
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
         if self.cycles_left == 0 and self.bounded:
-            due = self.descent.due(self.settings.patience)  # an active set can cycle
+            due = self.descent.due(
+                cast(PatientMethod, self.settings).patience
+            )  # an active set can cycle
             if due:
                 self.begin_cycles(due)
         return self.cycles_left > 0
@@ -420,12 +453,12 @@ class MultigridWorkspace(WorkspaceBase):
             self._advance(classify=True, launch=program.launch)
         return program
 
-    def problem_key(self) -> tuple[Any, ...]:
+    def problem_key(self) -> tuple[Hashable, ...]:
         """Return the key of launches that depend on the problem's data."""
         lower, least, upper, most, code = self.problem.bounds.operands
         return lower.ptr, float(least), upper.ptr, float(most), code.ptr
 
-    def program_key(self) -> tuple[Any, ...]:
+    def program_key(self) -> tuple[Hashable, ...]:
         """Return the key of the launches of a truncated cycle."""
         return self.problem_key()
 
@@ -511,6 +544,7 @@ class MultigridWorkspace(WorkspaceBase):
         if self._mask is None:
             self._mask = self.problem.layout.zeros(wp.uint8)
         kernels.MASK.bind(self.flat, free=free, mask=self._mask).launch()
+        assert self.floating is not None
         self.floating.project(self.hierarchy.finest.b, self._mask)
 
 
@@ -526,7 +560,7 @@ class ColdStart(MultigridWorkspace):
         settings: of the method, with `precision`, `monotone_cycles` and `cycle`.
     """
 
-    def __init__(self, problem: LCP, A: HasStencil, settings: Any) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, settings: CycleMethod) -> None:
         super().__init__(problem, A, settings, shifted=True, ahead=False)
         self._stored = True  # by the method
 

@@ -200,9 +200,9 @@ def _inverse(blocks: np.ndarray) -> np.ndarray:
 
 def _times(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the products of blocks, shape (m, k, k)."""
-    return left * right if left.shape[1] == 1 else left @ right
+    return np.asarray(left * right if left.shape[1] == 1 else left @ right)
 
 
 def _applied(blocks: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the products of blocks with the parts of a field, shape (m, k)."""
-    return blocks[:, :, 0] * x if x.shape[1] == 1 else (blocks @ x[:, :, None])[:, :, 0]
+    return np.asarray(blocks[:, :, 0] * x if x.shape[1] == 1 else (blocks @ x[:, :, None])[:, :, 0])

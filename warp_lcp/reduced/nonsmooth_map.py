@@ -545,7 +545,7 @@ class HostMap:
 
     def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return diag(p d) + diag(q) A."""
-        return np.diag(p * self.d) + q[:, None] * self.data.A
+        return np.asarray(np.diag(p * self.d) + q[:, None] * self.data.A)
 
     def _rows(self, x: np.ndarray, y: np.ndarray, smoothing: float) -> list[np.ndarray]:
         """Return f, p, q and kinks, in memory that the next call overwrites."""

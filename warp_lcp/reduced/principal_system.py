@@ -9,9 +9,9 @@ problem replaces these. Each kind of system is a file.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid.black_box_multigrid import needs_lines
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
@@ -68,7 +68,7 @@ class PrincipalSystem(Protocol):
 
 def principal_system(
     problem: LCP,
-    real: Any,
+    real: DataType,
     *,
     bounded: bool,
     settings: CycleSettings | None = None,

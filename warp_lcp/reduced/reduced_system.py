@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
@@ -12,6 +12,9 @@ from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.correction_system import CorrectionSystem
 from warp_lcp.reduced.fused_grid_system import FusedGridSystem
 from warp_lcp.reduced.host_system import HostSystem
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 
 class ReducedSystem(Protocol):
@@ -85,7 +88,7 @@ class ReducedSystem(Protocol):
         """
 
 
-def reduced_system(problem: LCP, settings: Any) -> ReducedSystem:
+def reduced_system(problem: LCP, settings: MinimumMapNewton) -> ReducedSystem:
     """Return the system for a problem's operator.
 
     Args:

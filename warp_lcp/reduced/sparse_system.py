@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse
@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_lcp.kernels.fields import zeros, zeros_like
 from warp_lcp.kernels.launch_graph import Launch, launch_now
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, KrylovPreconditioner
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
@@ -138,7 +138,7 @@ class SparseSystem(GuardedSystem):
     def __init__(
         self,
         A: SparseOperator,
-        real: Any,
+        real: DataType,
         *,
         shifted: bool = False,
         settings: AlgebraicSettings | None = None,
@@ -197,10 +197,10 @@ class IncompleteFactors:
         real: type of the corrections.
     """
 
-    def __init__(self, A: SparseOperator, real: Any) -> None:
+    def __init__(self, A: SparseOperator, real: DataType) -> None:
         self._A = A
         self.r, self.z, self.weight = (zeros(A.unknowns, real, A.device) for _ in range(3))
-        self._solve: Any = None
+        self._solve: Callable[[np.ndarray], np.ndarray] | None = None
         self._free = np.zeros(0, dtype=np.intp)
 
     def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
@@ -233,7 +233,7 @@ class IncompleteFactors:
         with np.errstate(over="ignore"):  # the method detects that its iterate is not finite
             self.z.assign(z)
 
-    def _factor(self, block: Any) -> Any:
+    def _factor(self, block: scipy.sparse.csr_array) -> Callable[[np.ndarray], np.ndarray] | None:
         """Return a function that applies the factors' inverse.
 
         It is the identity where the factors are singular.
@@ -248,7 +248,9 @@ class IncompleteFactors:
             return np.asarray
 
 
-def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
+def nudged(
+    block: scipy.sparse.csr_array, share: float, *, small: float = 0.0
+) -> scipy.sparse.csr_array:
     """Return a block without exactly singular factors.
 
     SuperLU, given those, writes to stderr, and may crash the process. A strictly diagonally
@@ -281,7 +283,7 @@ class CompleteFactors(IncompleteFactors):
     Diagonals are slightly raised, because a component may be singular.
     """
 
-    def _factor(self, block: Any) -> Any:
+    def _factor(self, block: scipy.sparse.csr_array) -> Callable[[np.ndarray], np.ndarray] | None:
         try:
             return scipy.sparse.linalg.splu(
                 (block + RAISED * scipy.sparse.diags_array(np.abs(block.diagonal()))).tocsc()

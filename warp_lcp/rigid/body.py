@@ -442,9 +442,11 @@ def _held(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, ...]:
     if states is not None and len(states) == len(bodies) and all(map(is_, bodies, states)):
         return states.values, states.mass, states.inverse_inertia, states.center
     each, values = [body.properties for body in bodies], np.array([body.values for body in bodies])
-    return values, *(
-        np.array([getattr(of, name) for of in each])
-        for name in ("mass", "inverse_inertia", "center")
+    return (
+        values,
+        np.array([of.mass for of in each]),
+        np.array([of.inverse_inertia for of in each]),
+        np.array([of.center for of in each]),
     )
 
 

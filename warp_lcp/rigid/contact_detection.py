@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,10 +66,9 @@ class ContactPoints:
             )
             return cls(np.ascontiguousarray(point), np.ascontiguousarray(normal), gap)
         return cls(
-            *(
-                np.concatenate([getattr(points, name) for points in some])
-                for name in ("point", "normal", "gap")
-            )
+            np.concatenate([points.point for points in some]),
+            np.concatenate([points.normal for points in some]),
+            np.concatenate([points.gap for points in some]),
         )
 
 
@@ -317,7 +316,11 @@ class FoundContacts:
 
     @classmethod
     def of(
-        cls, first: Any, second: Any, obstacle: int, points: Sequence[ContactPoints]
+        cls,
+        first: Sequence[int] | np.ndarray,
+        second: Sequence[int] | np.ndarray,
+        obstacle: int,
+        points: Sequence[ContactPoints],
     ) -> FoundContacts:
         """Join the contact points of pairs; first, second: shape (pairs,)."""
         counts = [len(each) for each in points]
@@ -332,12 +335,11 @@ class FoundContacts:
         some = [contacts for contacts in several if len(contacts.first)]
         if len(some) < 2:
             return some[0] if some else several[0]
-        first, second, obstacle = (
-            np.concatenate([getattr(f, name) for f in some])
-            for name in ("first", "second", "obstacle")
-        )
         return cls(
-            first, second, obstacle, ContactPoints.joined([contacts.points for contacts in some])
+            np.concatenate([contacts.first for contacts in some]),
+            np.concatenate([contacts.second for contacts in some]),
+            np.concatenate([contacts.obstacle for contacts in some]),
+            ContactPoints.joined([contacts.points for contacts in some]),
         )
 
 

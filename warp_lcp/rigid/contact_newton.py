@@ -58,7 +58,14 @@ class _Pairs:
 
     def moved(self, step: _Pairs, length: float) -> _Pairs:
         """Return the pairs after a step of a given length."""
-        return _Pairs(*(getattr(self, name) + length * getattr(step, name) for name in vars(self)))
+        return _Pairs(
+            self.x + length * step.x,
+            self.normal + length * step.normal,
+            self.low + length * step.low,
+            self.up + length * step.up,
+            self.below + length * step.below,
+            self.above + length * step.above,
+        )
 
     def products(self, normals: np.ndarray) -> list[np.ndarray]:
         """Return the products of pairs."""

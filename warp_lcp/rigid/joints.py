@@ -243,13 +243,13 @@ class JointRows:
     def joined(cls, several: Sequence[JointRows]) -> JointRows:
         """Return the rows of several joints (at least one) as one object."""
         names = ("first", "second", "one", "other", "error", "wanted", "lower", "upper")
-        arrays = {name: np.concatenate([getattr(rows, name) for rows in several]) for name in names}
+        arrays = {name: np.concatenate([vars(rows)[name] for rows in several]) for name in names}
         return cls(sources=tuple(source for rows in several for source in rows.sources), **arrays)
 
     def where(self, chosen: np.ndarray) -> JointRows:
         """Return selected rows, by a mask."""
         names = ("first", "second", "one", "other", "error", "wanted", "lower", "upper")
-        return JointRows(self.sources, *(getattr(self, name)[chosen] for name in names))
+        return JointRows(self.sources, *(vars(self)[name][chosen] for name in names))
 
     @property
     def equations(self) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import warp as wp
 
@@ -106,7 +106,7 @@ class AcceleratedWorkspace(WorkspaceBase):
         self.settings, zeros = settings, problem.layout.zeros
         self._x_old, self._y_old, self._z, self._y_z = (zeros(wp.float64) for _ in range(4))
         self.lipschitz = settings.lipschitz or 1.0
-        self._version: Any = object()
+        self._version: object = object()
         self._d = zeros(wp.float64)
         self._sums = Sums(rows_of(self.x), len(PROGRESS.sums))
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.fields import Array, checked_device, real_array
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
+from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.pickling import FieldsOnHost
 from warp_lcp.problem.result import SolveStatus
@@ -119,10 +120,10 @@ class BatchResult(FieldsOnHost):
 def enumerate_batch(
     A: Array,
     b: Array,
-    lower: Any = 0.0,
-    upper: Any = np.inf,
+    lower: Values = 0.0,
+    upper: Values = np.inf,
     *,
-    device: Any = None,
+    device: wp.DeviceLike = None,
     out: BatchResult | None = None,
 ) -> BatchResult:
     """Solve many LCPs of at most 4 unknowns in one launch, one per thread.
@@ -233,7 +234,7 @@ def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _on_device(
-    field: Array, shape: tuple[int, ...], dtype: Any, device: wp.Device, name: str
+    field: Array, shape: tuple[int, ...], dtype: DataType, device: wp.Device, name: str
 ) -> DeviceArray:
     """Return a field as a device array; NaN and infinities in host arrays are refused."""
     if tuple(field.shape) != shape:
@@ -248,7 +249,9 @@ def _on_device(
     return wp.array(host, dtype=dtype, device=device)
 
 
-def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str) -> DeviceArray:
+def _bounds(
+    value: Values, m: int, n: int, dtype: DataType, device: wp.Device, name: str
+) -> DeviceArray:
     """Return a bound as an array with one row for all problems, or a row for each."""
     if isinstance(value, wp.array):
         if (

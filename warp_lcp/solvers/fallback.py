@@ -5,29 +5,34 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from types import FunctionType
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import warp as wp
 
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import takes
+from warp_lcp.problem.pickling import Reduced
+from warp_lcp.problem.protocol import Chain, declared, takes
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.solve import (
     FLOOR_MARGIN,
+    OptionalMembers,
     Precision,
     Solver,
     Spare,
     Step,
+    VariationalInequality,
+    Workspace,
+    is_method,
     method_name,
     refusal,
     spare_of,
     takes_floating,
 )
-from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 
 WINDOW = 10  # steps over which the fall of the residual is measured
 FIRST = 20  # steps before which `crawls` is False: residuals of conjugate gradients rise and fall
@@ -38,8 +43,6 @@ WEAK = 30  # iterations of a linear solve that show a weak preconditioner
 GRACE = StoppingCriteria.patience  # steps after a hand-over in which the residual need not fall
 BATCH = 0.1  # factor by which a batch of steps reduces the residual
 # Attributes of a workspace that do not change, and that the outer loop reads.
-LASTING = ("begin_ahead", "scratch", "solution")
-# Failures that no other method can repair.
 PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)
 
 
@@ -56,7 +59,7 @@ class Progress:
             smallest residual.
     """
 
-    def __init__(self, problem: Any, tolerance: float) -> None:
+    def __init__(self, problem: LCP | VariationalInequality, tolerance: float) -> None:
         self.problem, self.tolerance = problem, tolerance
         self.begin()
 
@@ -126,7 +129,7 @@ class StartsAfter(Protocol):
     For example its multigrid hierarchy.
     """
 
-    def init_after(self, problem: Any, before: Any) -> Any:
+    def init_after(self, problem: Any, before: Workspace) -> Workspace:
         """Return a workspace, as `init` does.
 
         Args:
@@ -153,7 +156,10 @@ class FallbackEntry:
     batch: int = 1
 
 
-class Fallback:
+EntryLike: TypeAlias = "Solver | tuple[Solver, Condition] | FallbackEntry"
+
+
+class Fallback(Chain):
     """Chain of methods, each of which takes over as soon as its condition holds.
 
     Before each step the condition of the next method that takes the problem is evaluated. Methods
@@ -181,7 +187,7 @@ class Fallback:
         lemke
     """
 
-    def __init__(self, *entries: Any) -> None:
+    def __init__(self, *entries: EntryLike) -> None:
         if not entries:
             raise ValueError("Fallback: give at least one method")
         object.__setattr__(
@@ -190,7 +196,7 @@ class Fallback:
 
     entries: tuple[FallbackEntry, ...]
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"Fallback is frozen: make a new one to change {name}")
 
     def __eq__(self, other: object) -> bool:
@@ -213,7 +219,7 @@ class Fallback:
             ]
         )
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> Reduced:
         return Fallback, self.entries
 
     def __getattr__(self, name: str) -> Any:
@@ -222,17 +228,22 @@ class Fallback:
             raise AttributeError(name)
         return getattr(self.entries[0].method, name)
 
-    @cached_property
+    @property
+    def first(self) -> Solver:
+        """The method that begins."""
+        return self.entries[0].method
+
+    @property
     def name(self) -> str:
         """Name of the first method."""
-        return method_name(self.entries[0].method)
+        return method_name(self.first)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the methods, in order."""
         return tuple(method_name(entry.method) for entry in self.entries)
 
-    def init(self, problem: Any) -> FallbackWorkspace:
+    def init(self, problem: LCP | VariationalInequality) -> FallbackWorkspace:
         """Return a workspace; later methods create theirs when they take over.
 
         Raises:
@@ -240,7 +251,7 @@ class Fallback:
         """
         return FallbackWorkspace(problem, self.entries, self.entries[0].method.init(problem))
 
-    def spare(self, problem: Any) -> SpareChain | None:
+    def spare(self, problem: LCP) -> SpareChain | None:
         """Return the workspace of an earlier solve, if the first method keeps one."""
         first = self.entries[0].method
         lent = spare_of(first, problem)
@@ -250,7 +261,9 @@ class Fallback:
             else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
         )
 
-    def step(self, problem: Any, work: FallbackWorkspace, x: DeviceArray) -> Step:
+    def step(
+        self, problem: LCP | VariationalInequality, work: FallbackWorkspace, x: DeviceArray
+    ) -> Step:
         """Take a step of the current method, after a hand-over if one is due."""
         return work.step()
 
@@ -272,7 +285,7 @@ class SpareChain:
         self.lent.give_back(result)
 
 
-class FallbackWorkspace:
+class FallbackWorkspace(OptionalMembers):
     """Workspace of a chain for one problem.
 
     Attributes that are not its own are those of the first method's workspace. While that method is
@@ -291,7 +304,12 @@ class FallbackWorkspace:
             solve.
     """
 
-    def __init__(self, problem: Any, entries: tuple[FallbackEntry, ...], first: Any) -> None:
+    def __init__(
+        self,
+        problem: LCP | VariationalInequality,
+        entries: tuple[FallbackEntry, ...],
+        first: Workspace,
+    ) -> None:
         self.problem, self._entries, self._first = problem, entries, first
         self.x, self.residual, self.round_iterate = first.x, first.residual, first.round_iterate
         self.precision = (
@@ -299,10 +317,10 @@ class FallbackWorkspace:
             if isinstance(first.precision, Precision)
             else Precision(first.precision)
         )
-        # Whether the first method's device may take steps without the host.
-        self._may_be_ahead = hasattr(first, "is_ahead")
+        self._optional = first if isinstance(first, OptionalMembers) else OptionalMembers()
+        self.scratch, self.device_begins = self._optional.scratch, self._optional.device_begins
         # Workspaces by position in the chain; None: the method does not take the problem.
-        self._works: dict[int, Any] = {0: first}
+        self._works: dict[int, Workspace | None] = {0: first}
         # By position: whether a method takes such a problem, before it has a workspace.
         self._suited: dict[int, bool] = {}
         self._best: DeviceArray | None = None
@@ -319,10 +337,22 @@ class FallbackWorkspace:
         """Return an attribute of the first method's workspace."""
         if name in ("_first", "__setstate__"):
             raise AttributeError(name)
-        found = getattr(self._first, name)
-        if name in LASTING:
-            self.__dict__[name] = found  # for later look-ups
-        return found
+        return getattr(self._first, name)
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether the first method's device has already taken the next step."""
+        return self._optional.is_ahead
+
+    def solution(self) -> DeviceArray | None:
+        """Return x as the first method's workspace does."""
+        return self._optional.solution()
+
+    def begin_ahead(
+        self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
+    ) -> float | None:
+        """Begin a solve on the device by the first method."""
+        return self._optional.begin_ahead(guess, criteria, steps)
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
@@ -339,6 +369,13 @@ class FallbackWorkspace:
         given = {"floating": floating} if takes_floating(self._first) else {}
         return self._first.start(warm=warm, tolerance=tolerance, **given)
 
+    @property
+    def _current(self) -> Workspace:
+        """Workspace of the current method."""
+        work = self._works[self._place]
+        assert work is not None, "a method that does not take the problem is not chosen"
+        return work
+
     def keep(self) -> None:
         """Store x as the best iterate."""
         self._at_best, self._best_norm = True, self.residual.norm
@@ -346,7 +383,7 @@ class FallbackWorkspace:
             self._first.keep()
             return
         self._store_best()
-        work = self._works[self._place]
+        work = self._current
         if work is not self._first:
             work.keep()
 
@@ -367,7 +404,7 @@ class FallbackWorkspace:
         progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
         # No hand-over while the device has already taken the step.
-        ahead = at_first and self._may_be_ahead and first.is_ahead
+        ahead = at_first and self._optional.is_ahead
         if not ahead and (place := self._due()) is not None:
             self._hand_over(place)
             at_first = False
@@ -429,9 +466,9 @@ class FallbackWorkspace:
         The rounding floor is the residual that rounding errors leave.
         """
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
-        return min(self.residual.norm, self._best_norm) <= floor
+        return bool(min(self.residual.norm, self._best_norm) <= floor)
 
-    def _workspace(self, place: int) -> Any:
+    def _workspace(self, place: int) -> Workspace | None:
         """Return the workspace of a method, None if it does not take the problem."""
         if place not in self._works:
             self._works[place] = self._made(self._entries[place].method)
@@ -442,7 +479,7 @@ class FallbackWorkspace:
             else work
         )
 
-    def _made(self, method: Solver) -> Any:
+    def _made(self, method: Solver) -> Workspace | None:
         """Return a workspace of a method, None if it does not take the problem.
 
         An equal method of the chain shares its workspace.
@@ -457,7 +494,7 @@ class FallbackWorkspace:
         )
         if same is not None:
             return self._works[same]
-        before = self._works[self._place]
+        before = self._current
         try:
             return (
                 method.init_after(self.problem, before)
@@ -488,6 +525,7 @@ class FallbackWorkspace:
             self._begun = wp.clone(self.x)
         self._place, self._since = place, 0
         self._progress.begin()
+        assert work is not None, "`_due` returns methods that take the problem"
         self._begin(work, restart=entry.restart)
 
     def _leave_first(self) -> None:
@@ -511,7 +549,7 @@ class FallbackWorkspace:
         else:
             wp.copy(self._best, self.x)
 
-    def _begin(self, work: Any, *, restart: bool) -> None:
+    def _begin(self, work: Workspace, *, restart: bool) -> None:
         """Start a workspace as the outer loop does, from x or from clip(0, l, u)."""
         residual, box = work.residual, isinstance(self.problem, LCP)
         now = wp.clone(self.x)
@@ -533,27 +571,27 @@ class FallbackWorkspace:
 
     def _advance(self) -> Step:
         """Take a step, or a batch of steps, of a later method; write the iterate to x."""
-        entry, work, first = self._entries[self._place], self._works[self._place], self._first
+        entry, work, first = self._entries[self._place], self._current, self._first
         self._since += 1
         done = self._one_step(entry.method, work) if entry.batch == 1 else self._batch(entry, work)
         if work is not first:
             self._take(work)
         return done
 
-    def _take(self, work: Any) -> None:
+    def _take(self, work: Workspace) -> None:
         """Copy the iterate of the current method to x."""
         wp.copy(self.x, work.x)
         self._first.round_iterate()
         self.residual.current = False
 
-    def _one_step(self, method: Solver, work: Any) -> Step:
+    def _one_step(self, method: Solver, work: Workspace) -> Step:
         work.residual.current = False
         done = method.step(self.problem, work, work.x)
         if not work.residual.current:
             work.residual.evaluate(work.x)
         return done
 
-    def _batch(self, entry: FallbackEntry, work: Any) -> Step:
+    def _batch(self, entry: FallbackEntry, work: Workspace) -> Step:
         """Take steps until the residual has fallen to a tenth.
 
         The step fails with STAGNATED if the residual does not fall for GRACE steps.
@@ -574,7 +612,7 @@ class FallbackWorkspace:
         return replace(done, linear_iterations=linear, interim=sank)
 
 
-def _entry(given: Any, *, first: bool) -> FallbackEntry:
+def _entry(given: EntryLike, *, first: bool) -> FallbackEntry:
     """Return an argument of `Fallback` as an entry."""
     if isinstance(given, FallbackEntry):
         entry = given
@@ -587,7 +625,7 @@ def _entry(given: Any, *, first: bool) -> FallbackEntry:
             f"Fallback: {given!r} must be a pair (method, condition) or an FallbackEntry"
         )
     method = entry.method
-    if isinstance(method, type) or not (hasattr(method, "init") and hasattr(method, "step")):
+    if not is_method(method):
         raise ValueError(
             f"Fallback: {method!r} must be a method with its settings, such as "
             "wl.MinimumMapNewton()"
@@ -609,10 +647,10 @@ def _described(entry: FallbackEntry, *, first: bool) -> str:
     )
 
 
-def _named(method: Any) -> str:
+def _named(method: Solver) -> str:
     """Return a method's name, with the form of A that it works on if that differs."""
-    return method_name(method) + getattr(method, "form", "")
+    return method_name(method) + declared(method).form
 
 
 def _condition(entry: FallbackEntry) -> str:
-    return getattr(entry.when, "__name__", repr(entry.when))
+    return entry.when.__name__ if isinstance(entry.when, FunctionType) else repr(entry.when)

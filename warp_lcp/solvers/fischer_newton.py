@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy.linalg
@@ -15,6 +15,7 @@ import warp as wp
 
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.black_box_multigrid import takes_points
+from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITY, without_far
@@ -157,7 +158,9 @@ class FischerNewton(NewtonSettings):
             return FischerDenseWorkspace(problem, self)
         return FischerWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: Any, x: DeviceArray) -> Step:
+    def step(
+        self, problem: LCP, work: FischerWorkspace | FischerDenseWorkspace, x: DeviceArray
+    ) -> Step:
         """Take a monotone cycle, a gradient step or a Newton step.
 
         Cycles and gradient steps come first, after a cold start.
@@ -166,6 +169,7 @@ class FischerNewton(NewtonSettings):
         """
         if work.cycles_left > 0:
             work.cycles_left -= 1
+            assert isinstance(work, FischerWorkspace)
             return work.monotone_step()
         if work.descents_left > 0:
             work.descents_left -= 1
@@ -182,17 +186,18 @@ class FischerWorkspace(WorkspaceBase):
         if takes_points(problem.A) and self.kink is not Kink.APPROXIMATION:
             self.cold_start = ColdStart(problem, problem.A, settings)
             self.scratch = self.cold_start.scratch
-        shared: dict[str, Any] = (
-            {"x": self.cold_start.x, "residual": self.cold_start.residual}
-            if self.cold_start
-            else {}
+        start = self.cold_start
+        super().__init__(
+            problem,
+            settings.precision,
+            x=start.x if start else None,
+            residual=start.residual if start else None,
         )
-        super().__init__(problem, settings.precision, **shared)
         self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.free = layout.zeros(wp.uint8)
         self._descent = settings.descent(problem)
         map_, share = MapForm(self._descent.map), self._descent.fischer_weight
-        self.system: Any = (
+        self.system = (
             FiniteDifferenceSystem(problem, self.residual, map_, share, scaled=settings.scaled)
             if self.kink is Kink.APPROXIMATION
             else principal_system(
@@ -213,6 +218,12 @@ class FischerWorkspace(WorkspaceBase):
         self._gradient: DescentWorkspace | None = None
         self.cycles_left = self.descents_left = self.steps = 0
         self.target = self._scale = self._merit = self._gone = 0.0
+
+    @property
+    def _hierarchy(self) -> Hierarchy:
+        """Hierarchy of a grid's system."""
+        assert isinstance(self.system, GridSystem)
+        return self.system.hierarchy
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
@@ -269,7 +280,7 @@ class FischerWorkspace(WorkspaceBase):
         if isinstance(self.system, FiniteDifferenceSystem):
             self.system.linearize(x, self.free, size)
         elif fused:
-            self.system.hierarchy.rebuild()
+            self._hierarchy.rebuild()
         else:
             self.system.restrict(self.free, self._shift)
         if self.floating is not None:
@@ -332,7 +343,7 @@ class FischerWorkspace(WorkspaceBase):
         self._scale = 1 / max(self.residual.norm, 1e-300)
         if self._fused:
             self._merit = self.map.step(
-                x, self.system.e, move, self.system.hierarchy.finest, self._scale, self.steps
+                x, self.system.e, move, self._hierarchy.finest, self._scale, self.steps
             )
             return self._merit
         self._merit = self.map.condense(
@@ -413,7 +424,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
         self.units: np.ndarray = np.ones(0)
-        self.cold_start: Any = None
+        self.cold_start: ColdStart | None = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: DescentWorkspace | None = None
 
@@ -440,7 +451,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         self._gradient = None
         self._iterate = self._begun = self.read_iterate() / self.units
 
-    def descend(self, x: Any) -> Step:
+    def descend(self, x: DeviceArray) -> Step:
         """Take one gradient step on the same map."""
         if self._gradient is None:
             self._gradient = DescentWorkspace(self.problem, self._descent, self.residual)
@@ -449,7 +460,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         self._iterate = self._begun = self.read_iterate() / self.units
         return Step("gradient", step.linear_iterations)
 
-    def newton_step(self, x: Any) -> Step:
+    def newton_step(self, x: DeviceArray) -> Step:
         """Take a step of the current stage."""
         self.steps += 1
         if self.stage == 0:
@@ -598,5 +609,5 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     ):
         return np.full(right.shape, np.nan)  # LAPACK's least squares would raise or not return
     if info != 0 or not np.isfinite(factors).all():
-        return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
-    return scipy.linalg.lapack.dgetrs(factors, pivots, right)[0]
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=1e-12)[0])
+    return np.asarray(scipy.linalg.lapack.dgetrs(factors, pivots, right)[0])

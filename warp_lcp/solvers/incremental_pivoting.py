@@ -14,8 +14,9 @@ from scipy.linalg.blas import dger
 from warp_lcp.deadline import time_is_up
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import EPS, Step
+from warp_lcp.problem.solve import Step
 from warp_lcp.reduced.dense_problem import (
     RANK,
     DenseWorkspace,
@@ -215,7 +216,7 @@ class PivotingWorkspace(DenseWorkspace):
         doubtful[self.driven] = True
         rows = np.flatnonzero(doubtful)
         noise[rows] = ZERO * (np.abs(self.data.A[rows]) @ size)
-        return noise
+        return np.asarray(noise)
 
     def _steps(self, dx: np.ndarray, dy: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the step length at which each row blocks ([Book] eqs. 2.26-2.27)."""
@@ -380,7 +381,7 @@ class PrincipalInverse:
                     return z
                 if not fresh:
                     self.refresh()
-        return np.linalg.lstsq(self.block, r, rcond=RANK)[0]
+        return np.asarray(np.linalg.lstsq(self.block, r, rcond=RANK)[0])
 
     def refresh(self) -> None:
         """Recompute the inverse, O(k^3)."""
@@ -395,7 +396,7 @@ class PrincipalInverse:
     def _refined(self, r: np.ndarray) -> np.ndarray:
         H = self._inverse[: self.count, : self.count]
         z = H @ r
-        return z + H @ (r - self.block @ z)
+        return np.asarray(z + H @ (r - self.block @ z))
 
     def _meets(self, z: np.ndarray, r: np.ndarray) -> bool:
         error = np.abs(r - self.block @ z).max()

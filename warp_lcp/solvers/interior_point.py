@@ -14,16 +14,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.kernels import FusedKernel, KernelFile, PrecomputedProduct
 from warp_lcp.kernels.fields import zeros_like
+from warp_lcp.kernels.layout import KernelStencil
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.multigrid.black_box_multigrid import takes_points
+from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
@@ -117,7 +119,9 @@ class InteriorPoint(NewtonSettings):
             )
         return InteriorPointWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: Any, x: DeviceArray) -> Step:
+    def step(
+        self, problem: LCP, work: InteriorPointWorkspace | EquilibratedWorkspace, x: DeviceArray
+    ) -> Step:
         """Take a monotone cycle after a cold start, then path-following steps."""
         if isinstance(work, EquilibratedWorkspace):
             return work.step(self.step)
@@ -212,7 +216,7 @@ class InteriorPointWorkspace(WorkspaceBase):
             super().__init__(problem, settings.precision, x=cycles.x, residual=cycles.residual)
         else:
             super().__init__(problem, settings.precision)
-        self.system: Any = principal_system(
+        self.system = principal_system(
             problem,
             self.precision.correction,
             bounded=False,
@@ -246,6 +250,12 @@ class InteriorPointWorkspace(WorkspaceBase):
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = False
         self.mu = self.target = self.size = 0.0
+
+    @property
+    def _hierarchy(self) -> Hierarchy:
+        """Hierarchy of a grid's system."""
+        assert isinstance(self.system, GridSystem)
+        return self.system.hierarchy
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
@@ -365,11 +375,11 @@ class InteriorPointWorkspace(WorkspaceBase):
 
         The pass that moves x also condenses the system of the next step.
         """
-        s, finest = self.settings, self.system.hierarchy.finest
+        s, finest = self.settings, self._hierarchy.finest
         if not self.condensed:
             self.condensed = True
             self._advance(x, 0.0, 0.0)
-        self.system.hierarchy.rebuild()
+        self._hierarchy.rebuild()
         iterations = self.system.solve(s.predictor_eta * self._norm(1), s.max_linear_iterations)[0]
         tau = self._center(*self._ratios(0.0, 0.0))
         self._correct(tau, y=None, D=finest.stencil.d)
@@ -405,7 +415,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         return PathDirection(self._predicted, self.system.e, self.size, second, joined, tau)
 
     @property
-    def _stencil(self) -> Any:
+    def _stencil(self) -> KernelStencil:
         r = self.residual
         return (
             self.problem.A.stencil  # type: ignore[attr-defined]
@@ -442,7 +452,7 @@ class InteriorPointWorkspace(WorkspaceBase):
                 UPPER=upper,
                 FUSED=True,
             )
-        system = self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0)
+        system = self._condensing(x, self._hierarchy.finest.stencil.d, 0.0)
         condensing = CONDENSE.bind(
             rows,
             self._pairs,

@@ -6,7 +6,7 @@ On bimatrix games it starts as Lemke and Howson's method.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy.linalg
@@ -18,9 +18,11 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.banded_matrix import BandedFactors
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
+from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import EPS, Step
+from warp_lcp.problem.solve import Step
 from warp_lcp.reduced.dense_problem import (
     DenseProblem,
     DenseWorkspace,
@@ -55,10 +57,10 @@ class LemkeForm:
         pairs: which rows are s = u - l - z, indices.
     """
 
-    M: Any
+    M: Matrix
     q: np.ndarray
     base: np.ndarray
-    map: Any
+    map: Matrix
     pairs: np.ndarray
 
     @classmethod
@@ -144,7 +146,7 @@ class LemkeForm:
 
     def solution(self, z: np.ndarray) -> np.ndarray:
         """Return x, shape (n,), for z of shape (m,)."""
-        return self.base + self.map @ z
+        return np.asarray(self.base + self.map @ z)
 
 
 # Largest bandwidth that counts as narrow, and number of unknowns up to which a dense inverse costs
@@ -255,7 +257,7 @@ class Basis:
         self.inverse: np.ndarray = np.asfortranarray(np.eye(m))
         self.age = 0
 
-    def _start(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
+    def _start(self, M: Matrix, q: np.ndarray, d: np.ndarray) -> None:
         """Set M, q and d; w is basic."""
         m = len(q)
         self.M, self.q, self.d, self.m = M, q, d, m
@@ -309,7 +311,7 @@ class Basis:
         self.values = self._solve(self.q)
 
     def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
-        return self.inverse[rows]
+        return np.asarray(self.inverse[rows])
 
     def _column(self) -> np.ndarray:
         """Return the column of the entering variable."""
@@ -323,7 +325,7 @@ class Basis:
 
     def _solve(self, r: np.ndarray) -> np.ndarray:
         z = self.inverse @ r
-        return z + self.inverse @ (r - self.matrix @ z)
+        return np.asarray(z + self.inverse @ (r - self.matrix @ z))
 
     def _direction(self) -> np.ndarray:
         """Return the entering column in the current basis, B^-1 c.
@@ -386,7 +388,7 @@ class BandedBasis(Basis):
     The variables are in the order of their pairs.
     """
 
-    def __init__(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
+    def __init__(self, M: Matrix, q: np.ndarray, d: np.ndarray) -> None:
         self._start(M, q, d)
         self.factors = BandedFactors(M, d)
         # The pair both of whose variables are nonbasic, once z0 is basic.

@@ -13,7 +13,7 @@ from typing import ClassVar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve import Step
+from warp_lcp.problem.solve import OptionalMembers, Step
 from warp_lcp.reduced.reduced_system import ReducedSystem, reduced_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.settings import Count, CountOrZero
@@ -98,7 +98,7 @@ class MinimumMapNewton(NewtonSettings):
         return work.step()
 
 
-class NewtonWorkspace:
+class NewtonWorkspace(OptionalMembers):
     """Workspace of the method for one problem.
 
     It holds the reduced system, and the residuals of the last steps.
@@ -118,11 +118,15 @@ class NewtonWorkspace:
         self.problem, self.settings, self._first, self.system = problem, settings, system, system
         self.iterate = iterate = system.iterate
         self.x, self.residual, self.precision = iterate.x, iterate.residual, iterate.precision
-        self.scratch = getattr(iterate, "scratch", None)
+        self.scratch = iterate.scratch
         self.keep, self.restore = iterate.keep, iterate.restore
-        self.round_iterate, self.solution = iterate.round_iterate, iterate.solution
+        self.round_iterate = iterate.round_iterate
         # A memory of 1 is Armijo's monotone search.
         self.norms = deque[float](maxlen=settings.memory if settings.safeguard else 1)
+
+    def solution(self) -> DeviceArray:
+        """Return x in its precision and stored shape: the same array after each solve."""
+        return self.iterate.solution()
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None

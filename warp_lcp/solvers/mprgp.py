@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import zeros_like
-from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -25,7 +25,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Precision, PrecisionName, Step, WorkspaceBase
+from warp_lcp.problem.solve import Precision, PrecisionName, Step, Workspace, WorkspaceBase
 from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.reduced.active_set_kernels import projected_move
 from warp_lcp.reduced.descent import Descent
@@ -95,12 +95,12 @@ class MPRGP(Settings):
         """
         return self._checked(problem, None)
 
-    def init_after(self, problem: LCP, before: Any) -> MPRGPWorkspace:
+    def init_after(self, problem: LCP, before: Workspace) -> MPRGPWorkspace:
         """Return a workspace with the preconditioner of the method before.
 
         Only a sparse matrix's is reused. Raises as `init`.
         """
-        system = getattr(before, "system", None)
+        system = before.system if isinstance(before, HasSystem) else None
         return self._checked(problem, system if isinstance(system, SparseSystem) else None)
 
     def _checked(self, problem: LCP, system: SparseSystem | None) -> MPRGPWorkspace:
@@ -253,6 +253,13 @@ class SplitResidual(NaturalResidual):
         """Return a.b."""
         self.sums.dot(a, b, 0)
         return float(self.sums.scalars.numpy()[0])
+
+
+@runtime_checkable
+class HasSystem(Protocol):
+    """A workspace with equations on the free unknowns."""
+
+    system: object
 
 
 class MPRGPWorkspace(WorkspaceBase):
@@ -528,7 +535,9 @@ class MPRGPWorkspace(WorkspaceBase):
             A.apply(direction.reshape(shape), self._q.reshape(shape))
 
 
-def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:
+def _preconditioner(
+    problem: LCP, real: DataType, cycle: CycleSettings, system: Any
+) -> tuple[Any, Any]:
     """Return the principal system and its preconditioner."""
     # A dense matrix's own system is solved directly, which would be an active-set method.
     if system is None and isinstance(problem.A, DenseOperator):

@@ -94,7 +94,8 @@ class NNCGWorkspace(SweepWorkspace):
         self._constant = problem.bounds.operands  # where bounds do not depend on x
         if affine is not None:
             sides = zip(affine.constant, affine.index, (-np.inf, np.inf), strict=True)
-            self._constant[0], self._constant[2] = (_where_constant(*side) for side in sides)
+            lower, upper = (_where_constant(*side) for side in sides)
+            self._constant = self._constant._replace(lower=lower, upper=upper)
         self._sums = Sums(rows_of(self.x), slots=2)
 
     def start(self, *, warm: bool, tolerance: float) -> None:

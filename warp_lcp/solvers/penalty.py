@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import warp as wp
 
@@ -114,13 +114,14 @@ class PenaltyWorkspace(WorkspaceBase):
         if takes_points(problem.A):
             self.cold_start = ColdStart(problem, problem.A, settings)
             self.scratch = self.cold_start.scratch
-        shared: dict[str, Any] = (
-            {"x": self.cold_start.x, "residual": self.cold_start.residual}
-            if self.cold_start
-            else {}
+        start = self.cold_start
+        super().__init__(
+            problem,
+            settings.precision,
+            x=start.x if start else None,
+            residual=start.residual if start else None,
         )
-        super().__init__(problem, settings.precision, **shared)
-        self.system: Any = principal_system(
+        self.system = principal_system(
             problem,
             self.precision.correction,
             bounded=False,

@@ -6,7 +6,7 @@ It is Newton's method on the minimum map with full steps.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -80,7 +80,7 @@ class PrimalDualActiveSet(NewtonSettings):
     def as_newton(self) -> MinimumMapNewton:
         """Return the MinimumMapNewton method for operators that are not dense."""
         return MinimumMapNewton(
-            **{f.name: getattr(self, f.name) for f in fields(self) if f.name != "stop_if_singular"}
+            **{name: value for name, value in vars(self).items() if name != "stop_if_singular"}
         )
 
     def init(self, problem: LCP) -> ActiveSetWorkspace:

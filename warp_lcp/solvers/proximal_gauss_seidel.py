@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.kernels import KernelFile, Rows
+from warp_lcp.kernels import BoundKernel, KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction, rows_of
@@ -192,7 +192,7 @@ class ContactWorkspace:
         )
         return ContactFields(rows, b, e, laws_, contact, one, other, self._w, self.x.flatten())
 
-    def _gathering(self) -> Any:
+    def _gathering(self) -> BoundKernel:
         """Return the kernel that computes w = J'r body by body."""
         p, fields = self.problem, self._fields
         both = np.stack([p.first[self.order], p.second[self.order]], axis=1).ravel()
@@ -201,7 +201,8 @@ class ContactWorkspace:
         first, listed = (
             wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in (starts, sides)
         )
-        return self._passes.gather.bind(self._rows(0, p.bodies), fields, starts=first, sides=listed)
+        gather: StencilKernel = self._passes.gather
+        return gather.bind(self._rows(0, p.bodies), fields, starts=first, sides=listed)
 
     def _rows(self, begin: int, end: int) -> Rows:
         """Return the contacts, or bodies, begin <= s < end."""

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
 from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.data_types import Matrix, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
+from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix
-from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Solver, Step, WorkspaceBase
+from warp_lcp.problem.solve import FLOOR_MARGIN, Solver, Step, Workspace, WorkspaceBase
 from warp_lcp.reduced.dense_problem import proved_infeasible
 from warp_lcp.settings import Settings
 from warp_lcp.solvers.fallback import Fallback, fails
@@ -99,17 +103,20 @@ class ProximalWorkspace(WorkspaceBase):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Read the current A, b and bounds."""
         p, self._tolerance, self._eps = self.problem, tolerance, CENTER
-        A: Any = p.A
+        A = p.A
+        assert has(A, HasRows)
         self._matrix, self._b = A.rows().matrix(), p.b.numpy().copy()
         known = A.scale() if has(A, HasScale) else None
         self._D: np.ndarray = scale_of_matrix(self._matrix) if known is None else known
-        if scipy.sparse.issparse(self._matrix) and len(self._D) <= SMALL:
+        if is_sparse(self._matrix) and len(self._D) <= SMALL:
             self._matrix = self._matrix.toarray()
-        self._operator: Any = as_operator(self._regularized(), p.device)
+        operator = as_operator(self._regularized(), p.device)
+        assert isinstance(operator, (DenseOperator, SparseOperator)), "it is a matrix"
+        self._operator = operator
         self._lower, self._upper = p.lower.numpy().copy(), p.upper.numpy().copy()
         self._inner = LCP(self._operator, self._b, self._lower, self._upper)
-        self._method = self._given or _inner_method(scipy.sparse.issparse(self._matrix))
-        self._work: Any = self._method.init(self._inner)
+        self._method = self._given or _inner_method(is_sparse(self._matrix))
+        self._work: Workspace = self._method.init(self._inner)
         self._smallest, self._idle, self._steps, self._near, self._least = (
             self.residual.norm,
             0,
@@ -180,9 +187,9 @@ class ProximalWorkspace(WorkspaceBase):
             return SolveStatus.INFEASIBLE
         return SolveStatus.STAGNATED if solved else SolveStatus.NON_DESCENT
 
-    def _regularized(self) -> Any:
+    def _regularized(self) -> Matrix:
         """Return A + eps D."""
-        if not scipy.sparse.issparse(self._matrix):
+        if not is_sparse(self._matrix):
             return self._matrix + np.diag(self._eps * self._D)
         entries, i = self._matrix.tocoo(), np.arange(len(self._D))
         places = np.r_[entries.row, i], np.r_[entries.col, i]

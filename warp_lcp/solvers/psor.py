@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
+
+import numpy as np
 
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
@@ -174,7 +176,7 @@ def grid_omega(problem: LCP, *, singular: bool) -> float:
         return BOOK
 
 
-def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
+def advised_omega(problem: LCP, steps: int = 60, free: np.ndarray | None = None) -> float:
     """Estimate the best relaxation factor omega (Young).
 
     omega = 2 / (1 + sqrt(1 - rho^2)).

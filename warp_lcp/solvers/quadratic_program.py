@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
 from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
@@ -149,7 +150,7 @@ def is_convex_program(problem: LCP) -> bool:
     return is_convex(DenseProblem.read(problem, keep_sparse=True).scaled()[0].A)
 
 
-def is_convex(A: Any) -> bool:
+def is_convex(A: Matrix) -> bool:
     """Return whether a symmetric matrix is positive semi-definite.
 
     Its entries are near 1; it may be dense or sparse. The factors of the slightly shifted matrix

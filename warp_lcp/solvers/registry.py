@@ -12,9 +12,11 @@ class that ends with NEGATIVE_CURVATURE where A is surely no P- and no semi-defi
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.protocol import declared, families
+from warp_lcp.problem.solve import Solver
 from warp_lcp.settings import nearest
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
@@ -98,7 +100,7 @@ METHODS = Methods(
 )
 
 
-def method_of(method: Any, name: str = "method") -> Any:
+def method_of(method: str | Solver, name: str = "method") -> Solver:
     """Return the method of a name in METHODS, with its default settings.
 
     A method instance is returned unchanged.
@@ -118,7 +120,8 @@ def method_of(method: Any, name: str = "method") -> Any:
             f"{name} = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings "
             f"or None{meant}"
         )
-    return METHODS[method]()
+    made: Solver = METHODS[method]()
+    return made
 
 
 def grid_methods() -> tuple[str, ...]:
@@ -129,6 +132,6 @@ def grid_methods() -> tuple[str, ...]:
     grids = [
         (name, method)
         for name, method in METHODS.items()
-        if "grid" in families(method) and not hasattr(method, "most_unknowns")
+        if "grid" in families(method) and declared(method).most_unknowns is None
     ]
-    return tuple(name for name, method in grids if "precision" in method.__dataclass_fields__)
+    return tuple(name for name, method in grids if "precision" in signature(method).parameters)

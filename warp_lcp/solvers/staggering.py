@@ -6,10 +6,10 @@ Each block has its own method.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, ClassVar
 
 import numpy as np
 import scipy.sparse
@@ -19,8 +19,10 @@ from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import rows_of
+from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
+from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasBlocks, HasRows, check_taken, described, has, version_of
 from warp_lcp.problem.result import SolveResult
@@ -31,7 +33,9 @@ from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.sweeps.sweep import Contraction
 
 SHARE = 0.3  # of the whole tolerance, beyond which a block need not be solved
-Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
+Blocks = Annotated[
+    Sequence[Sequence[int] | np.ndarray] | np.ndarray, "for each block a list of indices"
+]
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 SELECT = KERNELS["partition.select"]
 
@@ -194,7 +198,7 @@ class StaggeredRound:
         block.couple()
         block.problem.bounds.refresh()
         wp.copy(work.x, block.problem.layout.load(block.guess(), wp.float64))
-        return work.residual.evaluate(work.x)
+        return float(work.residual.evaluate(work.x))
 
 
 def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
@@ -218,7 +222,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
         ValueError: an index is out of range, an unknown is missing or in two blocks, or a block is
             empty.
     """
-    if isinstance(blocks, str) or not hasattr(blocks, "__iter__"):
+    if isinstance(blocks, str) or not isinstance(blocks, Iterable):
         raise ValueError(
             f"blocks = {blocks!r}: expected a number of unknowns, or for each block a list of "
             "indices"
@@ -292,7 +296,8 @@ class MatrixBlock:
 
     def refresh(self) -> None:
         """Read A's entries again where they have changed."""
-        A, version = cast(Any, self.problem.A), version_of(self._whole.A)
+        A, version = self.problem.A, version_of(self._whole.A)
+        assert isinstance(A, (DenseOperator, SparseOperator))
         if isinstance(A, SparseOperator) and version == self._version:
             return
         self._version = version
@@ -317,7 +322,7 @@ class MatrixBlock:
         values[self._rows] = result.x.numpy()
         self._x.assign(values)
 
-    def _entries(self) -> tuple[Any, Any]:
+    def _entries(self) -> tuple[Matrix, Matrix]:
         """Return A_BB, and the block's rows of A with 0 in its place."""
         A, rows = self._whole.A, self._rows
         assert has(A, HasRows)

@@ -5,11 +5,11 @@ The blocks are solved exactly, one after the other.
 """
 
 import functools
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.types import DataType
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
 from warp_lcp.sweeps.sweep_kernels import INFINITE, ZERO, scalar_solution
@@ -37,7 +37,7 @@ class BlockLists:
 
 
 @functools.cache
-def block_sweep_kernel(a_type: Any, m: int) -> Any:
+def block_sweep_kernel(a_type: DataType, m: int) -> wp.Kernel:
     """Return the kernel for entries of type a_type and blocks of at most m unknowns.
 
     A block is the boxed problem of A_BB and c = b_B + A_BC x_C; its unknowns have the states

@@ -5,7 +5,7 @@ Step lengths and relaxation factors follow from them.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import scipy.linalg
@@ -17,7 +17,9 @@ from warp_lcp.problem.lcp import LCP
 SEED = 20151
 
 
-def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, float]:
+def scaled_spectrum(
+    problem: LCP, steps: int, free: np.ndarray | None = None
+) -> tuple[float, float]:
     """Estimate the least and the greatest eigenvalue of D^-1/2 A D^-1/2.
 
     D is the diagonal of A. Where A is not symmetric, the values are those of its symmetric part.
@@ -77,7 +79,9 @@ def positive_diagonal(problem: LCP) -> np.ndarray:
     return np.where(d > 0, d, 1.0)
 
 
-def _lanczos(product: Any, v: np.ndarray, steps: int) -> tuple[float, float]:
+def _lanczos(
+    product: Callable[[np.ndarray], np.ndarray], v: np.ndarray, steps: int
+) -> tuple[float, float]:
     """Return the extreme Ritz values of a symmetric map after some Lanczos steps.
 
     Plain three-term recurrence without reorthogonalization: ghost eigenvalues do not change the

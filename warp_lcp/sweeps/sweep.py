@@ -6,7 +6,7 @@ By the operator itself, or row by row where it gives access to rows.
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -15,7 +15,7 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, rows_of
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem.affine_bounds import affine_side
+from warp_lcp.problem.affine_bounds import AffineSide, affine_side
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
 from warp_lcp.problem.residual import NaturalResidual
@@ -65,7 +65,7 @@ class OperatorSweep(Sweep):
         self._A.relax(x, p.b, p.lower, p.upper, self.omega, forward=forward, **self._options)
 
 
-def bound_operands(problem: LCP) -> list[Any]:
+def bound_operands(problem: LCP) -> list[AffineSide]:
     """Return the lower and the upper bounds for kernels that evaluate them at x."""
     affine = problem.bounds.affine
     return affine.operands if affine else [affine_side(problem.lower), affine_side(problem.upper)]
@@ -147,7 +147,7 @@ class Diagonal:
 
     def values(self) -> np.ndarray:
         """Return the diagonal, a stored field on the host, float64."""
-        return self.field().numpy().astype(np.float64) * self._residual.unit
+        return np.asarray(self.field().numpy().astype(np.float64) * self._residual.unit)
 
     def field(self) -> DeviceArray:
         """Return the diagonal / unit, a stored field.

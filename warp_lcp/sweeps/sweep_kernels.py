@@ -7,12 +7,12 @@ The scalar problem of one unknown, rows in any order, Jacobi's method, and the s
 import functools
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.types import DataType
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
 
@@ -74,7 +74,7 @@ def scalar_solution(
 
 
 @functools.cache
-def row_kernels(a_type: Any) -> SimpleNamespace:
+def row_kernels(a_type: DataType) -> SimpleNamespace:
     """Return the kernels of row sweeps for entries of type a_type.
 
     `sweep` uses a given order, `greedy` the largest residual.
@@ -169,7 +169,7 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
 
 
 @functools.cache
-def jacobi_kernel(d_type: Any) -> Any:
+def jacobi_kernel(d_type: DataType) -> wp.Kernel:
     """Return the kernel of Jacobi's method for a diagonal of type d_type."""
 
     @forward_kernel(module=f"warp_lcp.jacobi.{d_type.__name__}")

@@ -6,7 +6,6 @@ The newton world handles their contacts and joints.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import newton
 import numpy as np
@@ -36,7 +35,7 @@ class WorldBodies(RigidBodies):
     """
 
     def __init__(
-        self, model: Any, origin: np.ndarray, shapes: Mapping[int, Geometry], *, first: int
+        self, model: newton.Model, origin: np.ndarray, shapes: Mapping[int, Geometry], *, first: int
     ) -> None:
         self.indices, self.dimension = np.array(list(shapes), dtype=int), 3
         self._origin, self._geometries = origin, list(shapes.values())
@@ -54,7 +53,7 @@ class WorldBodies(RigidBodies):
         self._before: np.ndarray | None = None
         self.force, self.impulses = (np.zeros((len(self.bodies), 6)) for _ in range(2))
 
-    def refresh(self, model: Any) -> None:
+    def refresh(self, model: newton.Model) -> None:
         """Update masses and inertias from the model.
 
         Bodies without mass, and kinematic ones, do not respond to impulses.
@@ -179,7 +178,7 @@ class WorldBodies(RigidBodies):
         self._before = None
         self.bodies.restore(np.asarray(state["bodies"]))
 
-    def _properties(self, model: Any) -> list[tuple[int, MassProperties]]:
+    def _properties(self, model: newton.Model) -> list[tuple[int, MassProperties]]:
         """Return mass, center and inertia of each body as placed in the model.
 
         Those of a unit ball for bodies without mass.

@@ -38,7 +38,7 @@ def pose_of(transform: np.ndarray) -> Pose:
     return Pose(rotation_of(transform[3:]), np.asarray(transform[:3], dtype=np.float64))
 
 
-def geometries(model: Any, origin: np.ndarray) -> dict[int, list[Geometry]]:
+def geometries(model: newton.Model, origin: np.ndarray) -> dict[int, list[Geometry]]:
     """Return the colliding shapes of each body as placed in the model; -1: the world.
 
     Args:
@@ -137,7 +137,7 @@ def _geometry(row: Mapping[str, Any], source: Any, name: str) -> Geometry:
     )
 
 
-def _mesh(mesh: Any, name: str, scale: np.ndarray | float = 1.0) -> TriangleMesh:
+def _mesh(mesh: newton.Mesh, name: str, scale: np.ndarray | float = 1.0) -> TriangleMesh:
     vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale
     return TriangleMesh(
         surface=close_surface(vertices, np.asarray(mesh.indices).reshape(-1, 3), name),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import newton
 import numpy as np
@@ -18,6 +17,7 @@ from warp_lcp.extras.newton.shapes import geometries, reaches_into, united
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 from warp_lcp.fluids.scene import COUPLED_METHODS
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.material.particle_assembly import placed_solids
 from warp_lcp.material.particle_log import Row
 from warp_lcp.scene.scene_file import SceneSource, load_scene
@@ -25,7 +25,10 @@ from warp_lcp.scene.shapes import SolidProperties, SphereTable, shaped
 from warp_lcp.simulation import StepFailed
 
 RETRIES = 6  # halvings of the time step after a failure
-DEFAULTS: dict[str, Any] = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}}
+DEFAULTS: dict[str, dict[str, object]] = {
+    "scene": {"simulator": "fluids"},
+    "time": {"duration": 1.0},
+}
 WHOLE = 1e-9  # relative to a step: rounding
 # Relative to cells, radians, and the velocity that gravity adds in a step: smaller differences of
 # the bodies' states do not matter.
@@ -67,7 +70,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
 
     def __init__(
         self,
-        model: Any,
+        model: newton.Model,
         scene: SceneSource,
         *,
         origin: Sequence[float] = (0.0, 0.0, 0.0),
@@ -92,8 +95,8 @@ class SolverLiquid(SolverBase, CouplingInterface):
     @classmethod
     def coupled(
         cls,
-        model: Any,
-        rigid: Callable[[Any], SolverBase],
+        model: newton.Model,
+        rigid: Callable[[newton.Model], SolverBase],
         scene: SceneSource,
         *,
         origin: Sequence[float] = (0.0, 0.0, 0.0),
@@ -126,13 +129,13 @@ class SolverLiquid(SolverBase, CouplingInterface):
 
     def step(
         self,
-        state_in: Any,
-        state_out: Any,
-        control: Any,
-        contacts: Any,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control,
+        contacts: newton.Contacts,
         dt: float,
         *,
-        observables: Any = None,
+        observables: object = None,
     ) -> None:
         """Advance liquid and bodies by dt [s], in as many substeps as CFL requires.
 
@@ -191,7 +194,12 @@ class SolverLiquid(SolverBase, CouplingInterface):
         if flags & changes.MODEL_PROPERTIES:
             self.simulation.gravity[:] = self._gravity()
 
-    def reset(self, state: Any, world_mask: Any = None, flags: Any = None) -> None:
+    def reset(
+        self,
+        state: newton.State,
+        world_mask: DeviceArray | None = None,
+        flags: newton.StateFlags | None = None,
+    ) -> None:
         """Reset the liquid to its initial state, unless no world is reset.
 
         The next state sets the bodies.
@@ -206,7 +214,12 @@ class SolverLiquid(SolverBase, CouplingInterface):
         self._coupled, self._restarts = True, enabled
 
     def coupling_notify_input_state_update(
-        self, state: Any, flags: Any, *, iteration_restart: bool = False, dt: float = 0.0
+        self,
+        state: newton.State,
+        flags: newton.StateFlags,
+        *,
+        iteration_restart: bool = False,
+        dt: float = 0.0,
     ) -> None:
         """Note that bodies have new poses, and whether the coupler repeats the step."""
         self._begins |= bool(int(flags) & POSED)
@@ -214,13 +227,13 @@ class SolverLiquid(SolverBase, CouplingInterface):
 
     def coupling_harvest_proxy_wrenches(
         self,
-        body_local_to_proxy_global: Any,
-        out_body_f: Any,
+        body_local_to_proxy_global: DeviceArray,
+        out_body_f: DeviceArray,
         *,
-        body_qd_before: Any,
-        state: Any,
-        state_out: Any,
-        contacts: Any,
+        body_qd_before: DeviceArray,
+        state: newton.State,
+        state_out: newton.State,
+        contacts: newton.Contacts,
         dt: float,
     ) -> None:
         """Return the liquid's impulses of the step as forces.
