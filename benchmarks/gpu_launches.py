@@ -23,7 +23,7 @@ from benchmarks.machine_counts import issued, mean_of
 from benchmarks.machine_memory import ProcessMemory, constants_of, packed
 
 WARPS = 16  # warps of a launch that are executed
-FAILURES = (NotImplementedError, KeyError, RuntimeError)
+FAILURES = (NotImplementedError, LookupError, RuntimeError, AssertionError)
 
 
 class LaunchCounter:

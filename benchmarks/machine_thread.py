@@ -387,7 +387,7 @@ class Lane:
         chosen = o[1] if self._predicate(o[3]) else o[2]
         # Upper halves of infinite doubles are printed like this.
         halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}
-        negative, _, absolute, plain = self._signs(chosen)
+        negative, _, absolute, _, plain = operand_of(chosen)
         if chosen in halves:
             bits = halves[chosen]
         elif plain.startswith("R"):
@@ -756,11 +756,12 @@ class Lane:
         if i.name.startswith("ATOM") and place:
             (self._put_long if wide else self._put)(o[place - 1], old)
             self._await(o[place - 1], address, size // 4)
-        operand = take(values[0])
-        if i.modifiers[:1] == ("CAS",) or "CAS" in m or "CAST" in m:
-            new = take(values[1]) if old == operand else old
+        if m & {"CAS", "CAST"}:
+            new = take(values[1]) if old == take(values[0]) else old
+        elif m >= {"POPC", "INC"}:  # counts the threads that execute it
+            new = old + 1
         else:
-            new = _changed(old, operand, m, i)
+            new = _changed(old, take(values[0]), m, i)
         stored = (new & (ALL if wide else LOW)).to_bytes(size, "little")
         if shared:
             self.memory.shared.update((address + k, byte) for k, byte in enumerate(stored))

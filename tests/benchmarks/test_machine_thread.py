@@ -122,6 +122,13 @@ def test_atomics_of_shared_memory() -> None:
     assert (second.registers["R5"], second.registers["R7"]) == (3, 6)
 
 
+def test_counting_threads() -> None:
+    memory = memory_of(np.zeros(COUNT, np.uint32))
+    for _ in range(3):
+        lane = lane_of(memory, "ATOMS.POPC.INC.32 RZ, [R6]", "LDS R7, [R6]")
+    assert lane.registers["R7"] == 3
+
+
 def test_atomics_of_a_warp_take_turns() -> None:
     memory = memory_of(np.zeros(COUNT, np.uint32))
     code = code_of(
