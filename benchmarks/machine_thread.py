@@ -28,6 +28,8 @@ NO_VALUE = "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CC
 IGNORED = frozenset(NO_VALUE.split())
 LINE = 128  # bytes of a line of the cache
 COMPARED: dict[str, Callable[[float, float], bool]] = {  # a second letter U: true for NaN
+    "MIN": lambda a, b: a < b or b != b,  # of two numbers, the one that is not NaN
+    "MAX": lambda a, b: a > b or b != b,
     "LT": lambda a, b: a < b,
     "EQ": lambda a, b: a == b,
     "LE": lambda a, b: a <= b,
@@ -631,11 +633,10 @@ class Lane:
         self._set(o[0], not usual)
 
     def _do_mufu(self, m: set[str], o: list[str], i: Instruction) -> None:
-        if "RCP64H" in m:
-            high = self._int(o[1])
-            self._put(
-                o[0], _long_bits(1 / _double(high << 32) if high & 0x7FFFFFFF else math.inf) >> 32
-            )
+        if m & {"RCP64H", "RSQ64H"}:  # of the upper half of a number in float64
+            high = np.float64(_double(self._int(o[1]) << 32))
+            found = 1 / (high if "RCP64H" in m else np.sqrt(high))
+            self._put(o[0], _long_bits(found) >> 32)
             return
         value = np.float64(self._real(o[1]))
         of: dict[str, Callable[[Any], Any]] = {
@@ -714,6 +715,10 @@ class Lane:
             if m & {"U16", "S16"}
             else 4
         )
+
+    def _do_qspc(self, m: set[str], o: list[str], i: Instruction) -> None:
+        """Set a predicate where a generic address is one of shared memory: none is."""
+        self._set(o[0], False)
 
     def _do_load(self, m: set[str], o: list[str], i: Instruction) -> None:
         address, size = (

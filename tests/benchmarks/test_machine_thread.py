@@ -142,6 +142,37 @@ def test_atomics_of_a_warp_take_turns() -> None:
     assert (found.instructions, found.atomics, found.stores) == (5, 1, 1)
 
 
+@pytest.mark.parametrize("value", [4.0, 0.3, 1e30, 0.0])
+def test_starts_of_divisions_and_roots(value: float) -> None:
+    high = struct.unpack("<II", struct.pack("<d", value))[1]
+    lane = lane_of(
+        memory_of(np.zeros(COUNT, np.int32)),
+        f"MOV R5, {high:#x}",
+        "MUFU.RCP64H R7, R5",
+        "MUFU.RSQ64H R9, R5",
+    )
+    with np.errstate(divide="ignore"):
+        both = {"R7": 1 / np.float64(value), "R9": 1 / np.sqrt(np.float64(value))}
+    for register, expected in both.items():
+        found = struct.unpack("<d", struct.pack("<II", 0, lane.registers[register]))[0]
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("a", [1.0, 2.0, float("nan")])
+@pytest.mark.parametrize("b", [1.5, float("nan")])
+@pytest.mark.parametrize(("kind", "of"), [("MAX", np.fmax), ("MIN", np.fmin)])
+def test_larger_and_smaller_of_two(kind: str, of: np.ufunc, a: float, b: float) -> None:
+    lines = []
+    for register, value in ((4, a), (6, b)):
+        low, high = struct.unpack("<II", struct.pack("<d", value))
+        lines += [f"MOV R{register}, {low:#x}", f"MOV R{register + 1}, {high:#x}"]
+    lines += [f"DSETP.{kind}.AND P0, P1, R4, R6, PT"]
+    lines += ["FSEL R8, R4, R6, P0", "FSEL R9, R5, R7, P0"]
+    lane = lane_of(memory_of(np.zeros(COUNT, np.int32)), *lines)
+    found = struct.unpack("<d", struct.pack("<II", lane.registers["R8"], lane.registers["R9"]))[0]
+    assert found == of(a, b) or (np.isnan(found) and np.isnan(of(a, b)))
+
+
 def test_waits_are_those_for_new_lines() -> None:
     lane = lane_of(
         memory_of(np.arange(256, dtype=np.uint32)),
