@@ -47,7 +47,7 @@ COMPARED: dict[str, Callable[[float, float], bool]] = {  # a second letter U: tr
 }
 
 
-class Step(NamedTuple):
+class DecodedInstruction(NamedTuple):
     """Instruction with the method that executes it.
 
     Attributes:
@@ -67,7 +67,7 @@ class Step(NamedTuple):
     after: int
 
 
-Program = dict[int, Step]
+Program = dict[int, DecodedInstruction]
 
 
 def _signed(value: int, bits: int = 32) -> int:
@@ -197,7 +197,7 @@ def decoded(code: dict[int, Instruction]) -> Program:
         plain = one.name[1:] if one.name[0] == "U" else one.name
         alias = "nothing" if one.name in IGNORED else ALIASES.get(plain, plain)
         execute = getattr(Lane, f"_do_{alias.lower()}", Lane._fail)
-        program[at] = Step(
+        program[at] = DecodedInstruction(
             one, execute, set(one.modifiers), list(one.operands), named(one), following.get(at, at)
         )
     return program
