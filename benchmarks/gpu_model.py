@@ -353,7 +353,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
 
     def invoking(name: str) -> Callable[[Any, Any, Any, bool], None]:
         def invoke(kernel: Any, hooks: Any, params: Any, adjoint: bool) -> None:
-            if active and not active[-1].stages:
+            if counter is not None and active and not active[-1].stages:
                 last = active[-1]
                 counter.count(last.key, kernel, params, last.cells)
             invokes[name](kernel, hooks, params, adjoint)
@@ -376,10 +376,12 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
     found.stages = found.across = 0
     emulated_cuda.meter.clear()
     counting = [mock.patch.object(context, name, invoking(name)) for name in invokes]
-    for patch in counting if counter else ():
-        patch.start()
+    for one in counting if counter is not None else ():
+        one.start()
     work()
-    for patch in reversed([*patches, *(counting if counter else ())]):
+    for one in counting if counter is not None else ():
+        one.stop()
+    for patch in reversed(patches):
         patch.stop()
     found.readbacks = emulated_cuda.meter["readbacks"]
     return found

@@ -3,6 +3,7 @@
 import ctypes
 import struct
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,5 +206,10 @@ def test_process_memory() -> None:
 
 
 def test_parameters_are_aligned() -> None:
-    params = [ctypes.c_uint32(1), ctypes.c_double(2.0), ctypes.c_uint8(3), ctypes.c_int32(4)]
+    params: list[Any] = [
+        ctypes.c_uint32(1),
+        ctypes.c_double(2.0),
+        ctypes.c_uint8(3),
+        ctypes.c_int32(4),
+    ]
     assert packed(params) == struct.pack("<I4xdB3xi", 1, 2.0, 3, 4)
