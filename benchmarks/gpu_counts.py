@@ -5,7 +5,8 @@ The counts are made on the host. The kernels over the finest grid are recorded i
 memory that the solve has left (`benchmarks/machine_counts.py`). A kernel takes as long as the
 slowest of: its instructions at one a clock and scheduler; those in float64 at their rate;
 wavefronts of the L1 cache at one a clock; the bytes of its fields at `SHARE` of the bandwidth; and
-a latency of memory for each plane of a thread, as often as the multiprocessors are filled.
+a latency of memory for each plane of a thread, as often as the multiprocessors are filled. Launches
+of steps are counted in another way (`benchmarks/gpu_launches.py`).
 """
 
 from typing import TYPE_CHECKING
@@ -33,8 +34,8 @@ import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine_code import Kernel, assemble, tools_missing
-from benchmarks.machine_counts import Issued, issued, mean_of
-from benchmarks.machine_thread import Memory, constants_of
+from benchmarks.machine_counts import Issued, issued
+from benchmarks.machine_memory import Memory, constants_of
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.kernels import StencilKernel, layout
 from warp_lcp.kernels.stencil_kernel import BoundKernel
@@ -86,7 +87,7 @@ class InstructionCount:
         name: of the kernel, with types.
         issued: of a warp.
         cells: of a thread, of the finer level of a transfer.
-        planes: consecutive planes of these cells.
+        waits: how often a thread waits for memory, one wait after another.
         registers: of a thread.
         bytes: of a cell, of the fields that are read and of those that are written.
         spilled: bytes of registers that a thread keeps in memory.
@@ -94,8 +95,8 @@ class InstructionCount:
 
     name: str
     issued: Issued
-    cells: int
-    planes: int
+    cells: float
+    waits: int
     registers: int
     bytes: float
     spilled: int = 0
@@ -125,7 +126,7 @@ class InstructionCount:
             "float64": self.issued.float64 * warps / gpu.float64 / clocks,
             "L1": self.issued.wavefronts * warps / clocks,
             "bytes": self.bytes * cells / (SHARE * gpu.bandwidth * 1e6),
-            "latency": turns * self.planes * LATENCY / (gpu.clock * 1e6),
+            "latency": turns * self.waits * LATENCY / (gpu.clock * 1e6),
         }
 
 
@@ -231,7 +232,7 @@ def cells_of(bound: BoundKernel) -> int:
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
-def count(name: str, one: Heard, given: Tables, folder: Path, warps: int = 1) -> InstructionCount:
+def count(name: str, one: Heard, given: Tables, folder: Path) -> InstructionCount:
     """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
     Args:
@@ -239,7 +240,6 @@ def count(name: str, one: Heard, given: Tables, folder: Path, warps: int = 1) ->
         one: the pass.
         given: its arguments.
         folder: what is compiled lies there.
-        warps: more than one: the mean of so many, all over the launch, some of them without work.
 
     Raises:
         NotImplementedError: it has an instruction that `benchmarks.machine_thread` does not know.
@@ -264,18 +264,7 @@ def count(name: str, one: Heard, given: Tables, folder: Path, warps: int = 1) ->
     memory = Memory((int(a.ptr), a.numpy().copy()) for a in arrays)
     blocks = -(-math.prod(dim) // BLOCK)
     constants = constants_of(parameters, BLOCK, blocks)
-    if warps > 1:
-        every = -(-math.prod(dim) // WARP)  # warps of the launch
-        firsts = [every * (2 * i + 1) // (2 * warps) * WARP for i in range(min(warps, every))]
-        groups = [range(first, min(first + WARP, math.prod(dim))) for first in firsts]
-    else:
-        groups = [taken]
-    found = mean_of(
-        [
-            issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in group])
-            for group in groups
-        ]
-    )
+    found = issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in taken])
     planes, size = min(rows.slab, rows.planes), one.bound.rows.size
     ratio = max(one.bound.rows.other_size // size, 1) if size else 1
     finer = 8 if ratio > 4 else 1  # a thread takes an aggregate of the finer level

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from benchmarks import emulated_cuda, gpu_counts  # must precede the package
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files.tables import Tables
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.launch_graph import Launch
 from warp_lcp.kernels.layout import BoundOperands
@@ -31,7 +31,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 import argparse
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -39,8 +39,10 @@ from unittest import mock
 
 import numpy as np
 import warp as wp
+from warp._src import context
 
 import warp_lcp as wl
+from benchmarks.gpu_launches import LaunchCounter
 from warp_lcp.benchmarks.kernels import Heard
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.kernels import StencilKernel
@@ -64,10 +66,11 @@ GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
 }
 # Float64 instructions a byte of the kernels that have many, see `benchmarks.two_floats`.
 FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}
-WARPS = 24  # of a launch that are counted where their work differs
-STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
+STEPS, HEARD = 10, 5  # of a scene: until it moves, and those that are heard
+SCENES = {"liquid": "dam-break", "sand": "column-collapse"}
 CLUSTERS = ("H100 SXM", "H200")  # that have clusters of blocks
 SIZES = (128, 256, 512, 1024)
+STEP_SIZES = (64, 128, 256)
 
 
 @dataclass
@@ -143,11 +146,15 @@ class Work:
         )
         return moved / (SHARE * gpu.bandwidth * 1e6)
 
-    def longest(
+    def kernels(
         self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount], times: int
     ) -> str:
-        """Return a table of the ten kernels that take longest, of one of some `times`."""
-        rows: dict[str, list[TableValue]] = {}
+        """Return a table of the kernels by their share of one of some `times` [us].
+
+        Each limit is given for the largest launch of a kernel.
+        """
+        names = ("issue", "float64", "L1", "bytes", "latency")
+        rows: dict[str, KernelRow] = {}
         for size, graph, key, cells, name in zip(
             self.bytes, self.graph, self.keys, self.cells, self.names, strict=True
         ):
@@ -155,25 +162,23 @@ class Work:
             limits = {"bytes": size / (SHARE * gpu.bandwidth * 1e3)}
             if one is not None:
                 limits = {limit: 1e3 * ms for limit, ms in one.limits(gpu, round(cells)).items()}
-            limit = max(limits, key=lambda name: limits[name])
-            floor = RECORDED if graph else LAUNCHED
-            row = rows.setdefault(key or name, [0, 0.0, 0.0, limit, "", 0.0, 0.0])
-            row[0] += 1
-            row[1] += max(floor, limits[limit])
-            if limits[limit] >= row[2]:
-                row[2:4] = limits[limit], limit
-            if one is not None:
-                threads = one.issued.instructions / one.cells, one.issued.wavefronts / one.cells
-                row[4], row[5], row[6] = str(one.registers), *threads
-        lines = [
-            f"| `{name}` | {n / times:.0f} | {total / times:.0f} | {longest:.1f}, {limit} | "
-            f"{issued:.0f} | {wavefronts:.0f} | {registers} |"
-            for name, (n, total, longest, limit, registers, issued, wavefronts) in sorted(
-                rows.items(), key=lambda row: -row[1][1]
-            )[:10]
-        ]
-        head = "| kernel | launches | us | largest without floor, limit | issued a cell | L1 |"
-        return "\n".join([f"{head} registers |", "|---|---|---|---|---|---|---|", *lines])
+            row = rows.setdefault(key or name, KernelRow(one))
+            row.launches += 1
+            row.time += max(RECORDED if graph else LAUNCHED, *limits.values())
+            if max(limits.values()) >= max(row.limits.values(), default=0.0):
+                row.limits, row.cells = limits, cells
+        lines = []
+        for name, row in sorted(rows.items(), key=lambda item: -item[1].time):
+            limit = max(row.limits, key=lambda name: row.limits[name])
+            above = row.limits[limit] > RECORDED
+            columns = [f"{row.launches / times:.1f}", f"{row.time / times:.0f}"]
+            columns += [limit if above else f"launch ({limit})"]
+            columns += [f"{row.limits[n]:.1f}" if n in row.limits else "" for n in names]
+            columns += row.of_a_cell()
+            lines.append(f"| `{name}` | {' | '.join(columns)} |")
+        head = ["kernel", "launches", "us", "limit", *names, "issued a cell", "L1 a cell"]
+        head += ["bytes a cell", "waits", "registers"]
+        return "\n".join([f"| {' | '.join(head)} |", "|---" * len(head) + "|", *lines])
 
     def uncounted(self, counts: dict[str, gpu_counts.InstructionCount]) -> float:
         """Return the share of the bytes that belongs to uncounted kernels."""
@@ -216,6 +221,25 @@ class Work:
         return "\n".join(["| kernel | launches | share of the bytes |", "|---|---|---|", *rows])
 
 
+@dataclass
+class KernelRow:
+    """Row of the table of kernels: launches, their time [us], limits of the largest [us]."""
+
+    count: gpu_counts.InstructionCount | None
+    launches: int = 0
+    time: float = 0.0
+    limits: dict[str, float] = field(default_factory=dict)
+    cells: float = 0.0
+
+    def of_a_cell(self) -> list[str]:
+        """Return instructions, wavefronts and bytes a cell, and waits and registers of a thread."""
+        one = self.count
+        if one is None:
+            return [""] * 5
+        counted = (one.a_cell, one.issued.wavefronts / one.cells, one.bytes)
+        return [*(f"{value:.1f}" for value in counted), str(one.waits), str(one.registers)]
+
+
 class Launched(NamedTuple):
     """Work of a launch: bytes, barriers, cells, and the names of the pass and its kernel."""
 
@@ -232,11 +256,13 @@ def name_of(kernel: wp.Kernel) -> str:
     return f"{kernel.module.name.removeprefix('warp_lcp.')}:{kernel.key}"
 
 
-def heard(make: Callable[[], Callable[[], object]]) -> Work:
+def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | None = None) -> Work:
     """Return the launches of a call.
 
-    `make` returns the call. It is recorded as well, because later runs replay what the first run
-    has set up.
+    Args:
+        make: returns the call. It is recorded as well, because later runs replay what the first run
+            has set up.
+        counter: it counts the first launch of each kernel; None: none is counted.
     """
     given: dict[int, tuple[BoundKernel, Heard]] = {}
     tags: dict[int, tuple[object, Launched]] = {}
@@ -246,7 +272,9 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         PersistentKernel.launch,
     )
     plain, replay = wp.launch, wp.Launch.launch
+    invokes = {name: getattr(context, name) for name in ("invoke", "invoke_cpu_blocks")}
     current: list[Launched] = []
+    active: list[Launched] = []
     found = Work()
 
     def binding(
@@ -303,8 +331,15 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         # Of a Warp kernel without a declaration.
         arrays = [a for a in inputs if isinstance(a, wp.array)]
         moved = float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays))
-        launched = (current[-1] if current else Launched(moved, 0))._replace(name=name_of(kernel))
+        name = name_of(kernel)
+        launched = (
+            current[-1]._replace(name=name)
+            if current
+            else Launched(moved, 0, name, float(np.prod(dim)), name)
+        )
+        active.append(launched)
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
+        active.pop()
         if record_cmd:
             tags[id(made)] = made, launched
         else:
@@ -312,8 +347,10 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         return made
 
     def replaying(command: wp.Launch, *args: object) -> None:
-        replay(command, *args)
         _, launched = tags.get(id(command), (None, Launched(0.0, 0)))
+        active.append(launched)
+        replay(command, *args)
+        active.pop()
         note(launched, graph=True)
 
     def note(launched: Launched, *, graph: bool) -> None:
@@ -324,6 +361,15 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         found.cells.append(launched.cells)
         found.stages += launched.stages
         found.across += launched.across
+
+    def invoking(name: str) -> Callable[[object, object, list[object], bool], None]:
+        def invoke(kernel: object, hooks: object, params: list[object], adjoint: bool) -> None:
+            if counter is not None and active and not active[-1].stages:
+                last = active[-1]
+                counter.count(last.key, kernel, params, last.cells)
+            invokes[name](kernel, hooks, params, adjoint)
+
+        return invoke
 
     patches = (
         mock.patch.object(StencilKernel, "bind_arguments", binding),
@@ -340,7 +386,12 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
         kept.clear()
     found.stages = found.across = 0
     emulated_cuda.meter.clear()
+    counting = [mock.patch.object(context, name, invoking(name)) for name in invokes]
+    for one in counting if counter is not None else ():
+        one.start()
     work()
+    for one in counting if counter is not None else ():
+        one.stop()
     for patch in reversed(patches):
         patch.stop()
     found.readbacks = emulated_cuda.meter["readbacks"]
@@ -373,9 +424,9 @@ def solve(n: int, *, clusters: bool = False) -> tuple[Work, int]:
     return work, found[-1].iterations
 
 
-def step(n: int) -> Work:
-    """Return the work of some steps of the dam break."""
-    scene = load_scene("dam-break", [f"domain.resolution={n}"])
+def step(n: int, name: str = "dam-break", counter: LaunchCounter | None = None) -> Work:
+    """Return the work of some steps of a scene, with n cells along x."""
+    scene = load_scene(name, [f"domain.resolution={n}"])
 
     def make() -> Callable[[], object]:
         simulation = simulators()[scene.scene.simulator].create(
@@ -385,7 +436,7 @@ def step(n: int) -> Work:
             simulation.step(simulation.stable_dt())
         return lambda: [simulation.step(simulation.stable_dt()) for _ in range(HEARD)]
 
-    return heard(make)
+    return heard(make, counter)
 
 
 def table(small: Work, large: Work, n: int, times: int = 1) -> str:
@@ -447,17 +498,21 @@ def counted(
         yield one
 
 
-def counts_of(work: Work) -> dict[str, gpu_counts.InstructionCount]:
-    """Count the passes of some work where they were launched: on boxes, lists, rows with gaps."""
-    found = dict[str, gpu_counts.InstructionCount]()
-    with tempfile.TemporaryDirectory() as folder:
-        for key in sorted({key for key in work.keys if key in work.bounds}):
-            one = work.bounds[key]
-            try:
-                found[key] = gpu_counts.count(key, one, one.bound.given, Path(folder), WARPS)
-            except (NotImplementedError, KeyError, RuntimeError) as error:
-                print(f"{key}: {error!r}")
-    return found
+def print_steps(sizes: Iterable[int]) -> None:
+    """Print what holds a step of the scenes, and a table of its kernels."""
+    for kind, name in SCENES.items():
+        for n in sizes:
+            with tempfile.TemporaryDirectory() as folder:
+                counter = LaunchCounter(Path(folder))
+                work = step(n, name, counter)
+            print(f"\n## A step of {name} ({kind}), {n} cells along x\n")
+            for gpu_name, gpu in gpu_counts.GPUS.items():
+                terms = {k: 1e3 * ms / HEARD for k, ms in work.terms(gpu, counter.counts).items()}
+                said = ", ".join(f"{k} {us:.0f}" for k, us in terms.items() if us >= 0.5)
+                print(f"{gpu_name}: {sum(terms.values()):.0f} us: {said}\n")
+            print(work.kernels(gpu_counts.GPUS["H200"], counter.counts, HEARD), flush=True)
+            for key, why in counter.failures.items():
+                print(f"\nnot counted: {key}: {why}")
 
 
 def main() -> None:
@@ -486,17 +541,16 @@ def main() -> None:
         help="of --sass: whole solves, too, each launch by its slowest limit",
     )
     parser.add_argument(
-        "--steps", action="store_true", help="of --sass: a step of the dam break instead of passes"
+        "--steps",
+        action="store_true",
+        help="of --sass: steps of a liquid and of sand instead of passes",
     )
     told = "without --sass: solves as on GPUs with clusters of blocks (capability 9.0 on)"
     parser.add_argument("--clusters", action="store_true", help=told)
     given = parser.parse_args()
     if given.sass and given.steps:
-        n = given.step_cells or given.cells
-        work = step(n)
-        counts = counts_of(work)
-        print(f"Longest kernels of a step of the dam break, {n} cells along x, on an H200 [us]\n")
-        print(work.longest(gpu_counts.GPUS["H200"], counts, HEARD))
+        print("Steps: counted for sm_90; times of a step [us] on an H200, as predicted")
+        print_steps([given.step_cells] if given.step_cells else STEP_SIZES)
         return
     if given.sass:
         print(

@@ -12,10 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from benchmarks.machine_code import Instruction
-from benchmarks.machine_thread import Lane, Memory
+from benchmarks.machine_memory import Memory
+from benchmarks.machine_thread import Lane, decoded
 
 FLOAT64 = frozenset(("DADD", "DMUL", "DFMA", "DSETP", "DMNMX"))
 ATOMIC = frozenset(("RED", "REDG", "ATOM", "ATOMG"))
+LOCAL = frozenset(("LDL", "STL"))
 
 
 @dataclass
@@ -29,6 +31,8 @@ class Issued:
         stores: to global memory.
         wavefronts: passes through the L1 cache, of at most 128 bytes and one line each.
         atomics: of the instructions, atomic ones on global memory.
+        local: of the instructions, those that load or store registers kept in memory.
+        waits: how often a thread waits for memory, one wait after another.
         read: addresses in global memory that are loaded.
         written: those that are stored.
     """
@@ -39,6 +43,8 @@ class Issued:
     stores: int = 0
     wavefronts: int = 0
     atomics: int = 0
+    local: int = 0
+    waits: int = 0
     read: frozenset[int] = frozenset()
     written: frozenset[int] = frozenset()
 
@@ -58,15 +64,18 @@ def issued(
     """
     most: Counter[int] = Counter()
     groups: dict[tuple[int, int, bool], list[tuple[int, int]]] = defaultdict(list)
+    waits, program = 0, decoded(code)
     for thread, block in threads:
-        lane = Lane(code, constants, memory, thread, block)
+        lane = Lane(code, constants, memory, thread, block, program=program)
         lane.run()
+        waits = max(waits, lane.waits)
         for at, count in lane.count.items():
             most[at] = max(most[at], count)
         for at, turn, address, size, is_load in lane.accesses:
             groups[at, turn, is_load].append((address, size))
     of = lambda names: sum(n for at, n in most.items() if code[at].name in names)  # noqa: E731
-    found = Issued(sum(most.values()), float64=of(FLOAT64), atomics=of(ATOMIC))
+    found = Issued(sum(most.values()), waits=waits)
+    found.float64, found.atomics, found.local = of(FLOAT64), of(ATOMIC), of(LOCAL)
     reached: dict[bool, set[int]] = {True: set(), False: set()}
     for (_, _, is_load), accesses in groups.items():
         reached[is_load] |= {address for address, _ in accesses}
@@ -93,6 +102,8 @@ def mean_of(found: Sequence[Issued]) -> Issued:
         mean(lambda one: one.stores),
         mean(lambda one: one.wavefronts),
         mean(lambda one: one.atomics),
+        mean(lambda one: one.local),
+        mean(lambda one: one.waits),
         frozenset[int]().union(*(one.read for one in found)),
         frozenset[int]().union(*(one.written for one in found)),
     )

@@ -1,31 +1,35 @@
 """Emulator of a GPU thread's machine code (SASS of sm_90) on the host.
 
-It works on copies of the device's memory. Shuffles, votes and atomics, which need other threads, do
-nothing.
+It works on copies of the device's memory. Atomics take effect in the order in which threads are
+executed. Shuffles and votes, which need other threads, do nothing.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import re
 import struct
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.machine_code import Instruction
+from benchmarks.machine_memory import Memory
 
-PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
 MOST = 200_000  # most instructions of a lane
 PREDICATE = re.compile(r"U?P(\d|T)$")
 NO_VALUE = "NOP BSSY BSYNC WARPSYNC BREAK BMOV YIELD DEPBAR BAR MEMBAR ERRBAR CCTL"
-ATOMIC = "RED REDG ATOMG ATOM"
-IGNORED = frozenset(f"{NO_VALUE} {ATOMIC}".split())
+IGNORED = frozenset(NO_VALUE.split())
+LINE = 128  # bytes of a line of the cache
 COMPARED: dict[str, Callable[[float, float], bool]] = {  # a second letter U: true for NaN
+    "MIN": lambda a, b: a < b or b != b,  # of two numbers, the one that is not NaN
+    "MAX": lambda a, b: a > b or b != b,
     "LT": lambda a, b: a < b,
     "EQ": lambda a, b: a == b,
     "LE": lambda a, b: a <= b,
@@ -43,46 +47,27 @@ COMPARED: dict[str, Callable[[float, float], bool]] = {  # a second letter U: tr
 }
 
 
-class Memory:
-    """Copies of arrays at their addresses.
+class DecodedInstruction(NamedTuple):
+    """Instruction with the method that executes it.
 
-    Writes are kept apart and override the copies.
+    Attributes:
+        instruction: itself.
+        execute: method of `Lane`; it returns the next address if it jumps.
+        modifiers: of the operation.
+        operands: of the instruction.
+        names: registers that it names.
+        after: address of the instruction after it.
     """
 
-    def __init__(self, arrays: Iterable[tuple[int, np.ndarray]]) -> None:
-        self._spans = sorted(
-            ((at, np.ascontiguousarray(a).view(np.uint8).reshape(-1)) for at, a in arrays),
-            key=lambda span: span[0],
-        )
-        self.written: dict[int, int] = {}
-        self.shared: dict[int, int] = {}
+    instruction: Instruction
+    execute: Callable[[Lane, set[str], list[str], Instruction], int | None]
+    modifiers: set[str]
+    operands: list[str]
+    names: frozenset[str]
+    after: int
 
-    def read(self, at: int, count: int) -> bytes:
-        """Return bytes of memory.
 
-        Bytes up to 64 KiB outside of an array are 0: guarded loads read them and drop the values.
-
-        Raises:
-            KeyError: there is no array near the address.
-        """
-        for begin, data in self._spans:
-            if begin <= at and at + count <= begin + len(data):
-                found = bytearray(data[at - begin : at - begin + count].tobytes())
-                break
-        else:
-            if not any(
-                begin - 65536 <= at < begin + len(data) + 65536 for begin, data in self._spans
-            ):
-                raise KeyError(f"no memory at {at:#x}")
-            found = bytearray(count)
-        for k in range(count):
-            if at + k in self.written:
-                found[k] = self.written[at + k]
-        return bytes(found)
-
-    def write(self, at: int, data: bytes) -> None:
-        """Write bytes."""
-        self.written.update((at + k, byte) for k, byte in enumerate(data))
+Program = dict[int, DecodedInstruction]
 
 
 def _signed(value: int, bits: int = 32) -> int:
@@ -98,8 +83,7 @@ def _double(bits: int) -> float:
 
 
 def _bits(value: float) -> int:
-    with np.errstate(all="ignore"):
-        return int(np.float32(value).view(np.uint32))
+    return int(np.float32(value).view(np.uint32))
 
 
 def _long_bits(value: float) -> int:
@@ -108,6 +92,115 @@ def _long_bits(value: float) -> int:
 
 def _half_bits(value: float) -> int:
     return int(np.float16(value).view(np.uint16))
+
+
+def _changed(old: int, operand: int, m: set[str], i: Instruction) -> int:
+    """Return what an atomic instruction makes of the bits of a value in memory."""
+    if m & {"F64", "F32"}:
+        real, bits = (_double, _long_bits) if "F64" in m else (_float, _bits)
+        if "ADD" in m:
+            return bits(real(old) + real(operand))
+        raise NotImplementedError(i.text)
+    size = 64 if "64" in m else 32
+    number = (lambda v: _signed(v, size)) if m & {"S32", "S64"} else (lambda v: v)
+    of: dict[str, Callable[[], int]] = {
+        "ADD": lambda: old + operand,
+        "MIN": lambda: min(old, operand, key=number),
+        "MAX": lambda: max(old, operand, key=number),
+        "AND": lambda: old & operand,
+        "OR": lambda: old | operand,
+        "XOR": lambda: old ^ operand,
+        "EXCH": lambda: operand,
+    }
+    for name, change in of.items():
+        if name in m:
+            return change()
+    raise NotImplementedError(i.text)
+
+
+def named(instruction: Instruction) -> frozenset[str]:
+    """Return the registers that an instruction names; of 64 bits both halves."""
+    found = set[str]()
+    for operand in instruction.operands:
+        for number in re.findall(r"(?<![A-Z])R(\d+)", operand):
+            found |= {f"R{number}", f"R{int(number) + 1}"} if ".64" in operand else {f"R{number}"}
+    if instruction.name[:1] == "D":  # numbers in float64 are pairs of registers
+        found |= {f"R{int(name[1:]) + 1}" for name in found}
+    return frozenset(found)
+
+
+@functools.cache
+def operand_of(text: str) -> tuple[bool, bool, bool, str, str]:
+    """Split an operand: negated, inverted, absolute, its kind, and the rest.
+
+    Kinds are register, constant (memory), bits, number, and special (infinite or not a number).
+    """
+    negative = text.startswith("-") and not re.match(r"-0x|-[\d.]|-INF|-QNAN", text)
+    text = text[1:] if negative else text
+    inverted = text.startswith("~")
+    text = text[1:] if inverted else text
+    plain = text.strip("|")
+    kinds = {
+        r"c\[": "constant",
+        r"[+-]?(INF|QNAN)": "special",
+        "-?0x": "bits",
+        r"[+-]?\d": "number",
+    }
+    kind = next((kind for form, kind in kinds.items() if re.match(form, plain)), "register")
+    return negative, inverted, text.startswith("|"), kind, plain
+
+
+@functools.cache
+def constant_at(operand: str) -> tuple[int, tuple[str, ...]]:
+    """Return the offset of an operand in constant memory, and registers to add to it."""
+    found = re.match(r"c\[0x[0-9a-f]+\]\s*\[(.+?)\]$", operand)
+    assert found, operand
+    parts = [part.strip() for part in found[1].split("+")]
+    numbers = [int(part, 16) for part in parts if part.startswith("0x")]
+    return sum(numbers), tuple(part for part in parts if not part.startswith("0x"))
+
+
+@functools.cache
+def pair_of(register: str) -> tuple[str, str]:
+    """Return the names of the two registers of 64 bits; empty names for the register zero."""
+    if register.startswith(("RZ", "URZ")):
+        return "", ""
+    found = re.match(r"(U?R)(\d+)", register)
+    assert found, register
+    return f"{found[1]}{found[2]}", f"{found[1]}{int(found[2]) + 1}"
+
+
+@functools.cache
+def address_of(operand: str) -> tuple[int, tuple[tuple[str, str, int], ...]]:
+    """Split an address: its number, and terms of a kind, a register and a factor."""
+    found = re.search(r"\[([^\[\]]*)\]$", operand)
+    assert found, operand
+    number, terms = 0, []
+    for part in (p.strip() for p in found[1].split("+")):
+        if re.match(r"-?0x", part):
+            number += int(part, 16)
+        elif part.endswith(".64") or (part.startswith("UR") and "desc" in operand):
+            terms.append(("long", part.replace(".64", ""), 1))
+        elif scaled := re.search(r"\.X(\d+)$", part):
+            terms.append(("scaled", part, int(scaled[1])))
+        else:
+            terms.append(("signed", part, 1))
+    return number, tuple(terms)
+
+
+def decoded(code: dict[int, Instruction]) -> Program:
+    """Return the steps of a kernel by address."""
+    following = dict(itertools.pairwise(sorted(code)))
+    program: Program = {}
+    for at, one in code.items():
+        # The uniform datapath has the same operations.
+        plain = one.name[1:] if one.name[0] == "U" else one.name
+        alias = "nothing" if one.name in IGNORED else ALIASES.get(plain, plain)
+        execute = getattr(Lane, f"_do_{alias.lower()}", Lane._fail)
+        program[at] = DecodedInstruction(
+            one, execute, set(one.modifiers), list(one.operands), named(one), following.get(at, at)
+        )
+    return program
 
 
 @dataclass
@@ -124,126 +217,106 @@ class Lane:
         default_factory=lambda: defaultdict(bool, PT=True, UPT=True)
     )
     count: Counter[int] = field(default_factory=Counter)  # executions by address of the instruction
+    waits: int = 0  # for loads of lines that the thread has not loaded before
+    pending: set[str] = field(default_factory=set)  # registers of loads that none has waited for
+    lines: set[int] = field(default_factory=set)  # lines of memory that have been loaded
+    far: bool = False  # whether a pending load reads a line for the first time
     # Each access: instruction, how often it was executed before, address, bytes, whether it is a
     # load.
     accesses: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
     local: dict[int, int] = field(default_factory=dict)  # local memory, by address
     at: int = 0
 
+    program: Program | None = None  # the code, decoded; None: decoded at the start
+
     def run(self) -> None:
         """Execute the kernel until it ends."""
-        order = sorted(self.code)
-        following = dict(itertools.pairwise(order))
-        at = order[0]
-        for _ in range(MOST):
-            instruction = self.code[at]
-            self.count[at] += 1
-            target: int | None = None
-            if (
-                instruction.guard is None
-                or self._predicate(instruction.guard[0]) != instruction.guard[1]
-            ):
-                if instruction.name == "EXIT":
-                    return
-                self.at = at
-                target = self._step(instruction)
-            at = following[at] if target is None else target
+        program = self.program or decoded(self.code)
+        at, count, predicates = min(self.code), self.count, self.predicates
+        with np.errstate(all="ignore"):
+            for _ in range(MOST):
+                instruction, execute, modifiers, operands, names, after = program[at]
+                count[at] += 1
+                target: int | None = None
+                guard = instruction.guard
+                if guard is None or predicates[guard[0]] != guard[1]:
+                    if instruction.name == "EXIT":
+                        return
+                    if self.pending and not self.pending.isdisjoint(names):
+                        self.waits += self.far
+                        self.far = False
+                        self.pending.clear()
+                    self.at = at
+                    target = execute(self, modifiers, operands, instruction)
+                at = after if target is None else target
         raise RuntimeError(f"a lane executes more than {MOST} instructions")
 
-    def _step(self, instruction: Instruction) -> int | None:
-        """Execute an instruction; return the target of a jump."""
-        name, operands = instruction.name, list(instruction.operands)
-        if name in IGNORED:
-            return None
-        if name == "BRA":
-            return (
-                int(operands[-1], 16)
-                if len(operands) == 1 or self._predicate(operands[0])
-                else None
-            )
-        if name == "CALL":
-            return int(operands[-1], 16)
-        if name == "RET":
-            register, offset = operands[0].split()
-            return (self._long(register) + int(offset, 16)) & LOW
-        plain = name[1:] if name[0] == "U" else name  # the uniform datapath has the same operations
-        execute = getattr(self, f"_do_{ALIASES.get(plain, plain).lower()}", None)
-        if execute is None:
-            raise NotImplementedError(instruction.text)
-        with np.errstate(all="ignore"):
-            execute(set(instruction.modifiers), operands, instruction)
-        return None
+    # Jumps: they return the next address.
+
+    def _do_bra(self, m: set[str], o: list[str], i: Instruction) -> int | None:
+        return int(o[-1], 16) if len(o) == 1 or self._predicate(o[0]) else None
+
+    def _do_call(self, m: set[str], o: list[str], i: Instruction) -> int:
+        return int(o[-1], 16)
+
+    def _do_ret(self, m: set[str], o: list[str], i: Instruction) -> int:
+        register, offset = o[0].split()
+        return (self._long(register) + int(offset, 16)) & LOW
+
+    def _do_nothing(self, m: set[str], o: list[str], i: Instruction) -> None:
+        pass
+
+    def _fail(self, m: set[str], o: list[str], i: Instruction) -> None:
+        raise NotImplementedError(i.text)
 
     # Operands.
 
     def _register(self, name: str) -> int:
-        plain = name.split(".", maxsplit=1)[0]
+        plain = name.partition(".")[0]
         return 0 if plain in ("RZ", "URZ", "SRZ") else self.registers[plain]
 
     def _constant(self, operand: str, size: int) -> int:
-        found = re.match(r"c\[0x[0-9a-f]+\]\s*\[(.+?)\]$", operand)
-        assert found, operand
-        parts = [part.strip() for part in found[1].split("+")]
-        offset = sum(
-            int(part, 16) if part.startswith("0x") else self._register(part) for part in parts
-        )
+        offset, registers = constant_at(operand)
+        offset += sum(self._register(name) for name in registers)
         return int.from_bytes(self.constants[offset : offset + size], "little")
 
-    @staticmethod
-    def _signs(operand: str) -> tuple[bool, bool, bool, str]:
-        """Split an operand: negated, inverted, absolute, and the rest."""
-        negative = operand.startswith("-") and not re.match(r"-0x|-[\d.]|-INF|-QNAN", operand)
-        operand = operand[1:] if negative else operand
-        inverted = operand.startswith("~")
-        operand = operand[1:] if inverted else operand
-        return negative, inverted, operand.startswith("|"), operand.strip("|")
-
     def _int(self, operand: str) -> int:
-        negative, inverted, _, plain = self._signs(operand)
-        if plain.startswith("c["):
-            value = self._constant(plain, 4)
-        elif re.match(r"-?0x", plain):
-            value = int(plain, 16) & LOW
-        elif re.match(r"-?\d", plain):
-            value = int(float(plain)) & LOW
-        else:
+        value = self.registers.get(operand)  # a plain register, written before
+        if value is not None:
+            return value
+        negative, inverted, _, kind, plain = operand_of(operand)
+        if kind == "register":
             value = self._register(plain) >> (16 if ".H1" in plain else 0)
+        elif kind == "constant":
+            value = self._constant(plain, 4)
+        else:
+            value = (int(plain, 16) if kind == "bits" else int(float(plain))) & LOW
         value = ~value & LOW if inverted else value
         return -value & LOW if negative else value
 
     def _long(self, operand: str) -> int:
-        negative, _, _, plain = self._signs(operand)
-        if plain.startswith("c["):
-            value = self._constant(plain, 8)
-        elif plain.startswith(("RZ", "URZ")):
-            value = 0
-        elif plain.startswith("0x"):
-            value = int(plain, 16)
+        negative, _, _, kind, plain = operand_of(operand)
+        if kind == "register":
+            low, high = pair_of(plain)
+            value = self.registers[low] | self.registers[high] << 32 if low else 0
         else:
-            found = re.match(r"(U?R)(\d+)", plain)
-            assert found, operand
-            value = (
-                self.registers[f"{found[1]}{found[2]}"]
-                | self.registers[f"{found[1]}{int(found[2]) + 1}"] << 32
-            )
+            value = self._constant(plain, 8) if kind == "constant" else int(plain, 16)
         return -value & ALL if negative else value
 
     def _real(self, operand: str, *, double: bool = False) -> float:
-        negative, _, absolute, plain = self._signs(operand)
-        if plain.startswith("c["):
+        negative, _, absolute, kind, plain = operand_of(operand)
+        if kind == "register":
+            value = _double(self._long(plain)) if double else _float(self._register(plain))
+        elif kind == "constant":
             value = (
                 _double(self._constant(plain, 8)) if double else _float(self._constant(plain, 4))
             )
-        elif re.match(r"[+-]?(INF|QNAN)", plain):
+        elif kind == "special":
             value = (
                 (-math.inf if plain.startswith("-") else math.inf) if "INF" in plain else math.nan
             )
-        elif re.match(r"-?0x", plain):
-            value = _float(int(plain, 16))
-        elif re.match(r"[+-]?\d", plain):
-            value = float(plain)
         else:
-            value = _double(self._long(plain)) if double else _float(self._register(plain))
+            value = _float(int(plain, 16)) if kind == "bits" else float(plain)
         value = abs(value) if absolute else value
         return -value if negative else value
 
@@ -258,36 +331,28 @@ class Lane:
         )
 
     def _put(self, register: str, value: int) -> None:
-        plain = register.split(".", maxsplit=1)[0]
+        plain = register.partition(".")[0]
         if plain not in ("RZ", "URZ"):
             self.registers[plain] = value & LOW
 
     def _put_long(self, register: str, value: int) -> None:
-        plain = register.split(".", maxsplit=1)[0]
-        if plain not in ("RZ", "URZ"):
-            kind, number = re.fullmatch(r"(U?R)(\d+)", plain).groups()  # type: ignore[union-attr]
-            self.registers[plain], self.registers[f"{kind}{int(number) + 1}"] = (
-                value & LOW,
-                value >> 32 & LOW,
-            )
+        low, high = pair_of(register)
+        if low:
+            self.registers[low], self.registers[high] = value & LOW, value >> 32 & LOW
 
     def _set(self, predicate: str, value: object) -> None:
         if predicate not in ("PT", "UPT"):
             self.predicates[predicate] = bool(value)
 
     def _address(self, operand: str) -> int:
-        found = re.search(r"\[([^\[\]]*)\]$", operand)
-        assert found, operand
-        address = 0
-        for part in (p.strip() for p in found[1].split("+")):
-            if re.match(r"-?0x", part):
-                address += int(part, 16)
-            elif part.endswith(".64") or (part.startswith("UR") and "desc" in operand):
-                address += self._long(part.replace(".64", ""))
-            elif scaled := re.search(r"\.X(\d+)$", part):
-                address += self._register(part) * int(scaled[1])
+        address, terms = address_of(operand)
+        for kind, name, factor in terms:
+            if kind == "long":
+                address += self._long(name)
+            elif kind == "scaled":
+                address += self._register(name) * factor
             else:
-                address += _signed(self._register(part))
+                address += _signed(self._register(name))
         return address & ALL
 
     @staticmethod
@@ -324,7 +389,7 @@ class Lane:
         chosen = o[1] if self._predicate(o[3]) else o[2]
         # Upper halves of infinite doubles are printed like this.
         halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}
-        negative, _, absolute, plain = self._signs(chosen)
+        negative, _, absolute, _, plain = operand_of(chosen)
         if chosen in halves:
             bits = halves[chosen]
         elif plain.startswith("R"):
@@ -568,11 +633,10 @@ class Lane:
         self._set(o[0], not usual)
 
     def _do_mufu(self, m: set[str], o: list[str], i: Instruction) -> None:
-        if "RCP64H" in m:
-            high = self._int(o[1])
-            self._put(
-                o[0], _long_bits(1 / _double(high << 32) if high & 0x7FFFFFFF else math.inf) >> 32
-            )
+        if m & {"RCP64H", "RSQ64H"}:  # of the upper half of a number in float64
+            high = np.float64(_double(self._int(o[1]) << 32))
+            found = 1 / (high if "RCP64H" in m else np.sqrt(high))
+            self._put(o[0], _long_bits(found) >> 32)
             return
         value = np.float64(self._real(o[1]))
         of: dict[str, Callable[[np.float64], np.float64]] = {
@@ -652,6 +716,10 @@ class Lane:
             else 4
         )
 
+    def _do_qspc(self, m: set[str], o: list[str], i: Instruction) -> None:
+        """Set a predicate where a generic address is one of shared memory: none is."""
+        self._set(o[0], False)
+
     def _do_load(self, m: set[str], o: list[str], i: Instruction) -> None:
         address, size = (
             self._address(next(operand for operand in o[1:] if "[" in operand)),
@@ -663,12 +731,47 @@ class Lane:
         else:
             data = self.memory.read(address, size)
             self.accesses.append((self.at, self.count[self.at], address, size, True))
+            self._await(o[0], address, max(size // 4, 1))
         value = int.from_bytes(data, "little")
         if size < 4:
             self._put(o[0], _signed(value, 8 * size) if m & {"S8", "S16"} else value)
         elif (register := o[0].split(".")[0]) != "RZ":
             for k in range(0, size, 4):
                 self.registers[f"R{int(register[1:]) + k // 4}"] = value >> 8 * k & LOW
+
+    def _await(self, register: str, address: int, count: int) -> None:
+        """Note that registers hold what is loaded only after a wait."""
+        if found := re.match(r"R(\d+)", register):
+            self.pending |= {f"R{int(found[1]) + k}" for k in range(count)}
+            self.far = self.far or address // LINE not in self.lines
+            self.lines.add(address // LINE)
+
+    def _do_atomic(self, m: set[str], o: list[str], i: Instruction) -> None:
+        """Change memory; the value before goes to a register, but for reductions."""
+        shared, wide = i.name == "ATOMS", "64" in m or "F64" in m
+        place = next(n for n, operand in enumerate(o) if "[" in operand)
+        address, size, values = self._address(o[place]), 8 if wide else 4, o[place + 1 :]
+        take = self._long if wide else self._int
+        if shared:
+            data = bytes(self.memory.shared.get(address + k, 0) for k in range(size))
+        else:
+            data = self.memory.read(address, size)
+            self.accesses.append((self.at, self.count[self.at], address, size, False))
+        old = int.from_bytes(data, "little")
+        if i.name.startswith("ATOM") and place:
+            (self._put_long if wide else self._put)(o[place - 1], old)
+            self._await(o[place - 1], address, size // 4)
+        if m & {"CAS", "CAST"}:
+            new = take(values[1]) if old == take(values[0]) else old
+        elif m >= {"POPC", "INC"}:  # counts the threads that execute it
+            new = old + 1
+        else:
+            new = _changed(old, take(values[0]), m, i)
+        stored = (new & (ALL if wide else LOW)).to_bytes(size, "little")
+        if shared:
+            self.memory.shared.update((address + k, byte) for k, byte in enumerate(stored))
+        else:
+            self.memory.write(address, stored)
 
     def _do_store(self, m: set[str], o: list[str], i: Instruction) -> None:
         address, size, register = (
@@ -691,6 +794,11 @@ class Lane:
 
 
 ALIASES = {
+    "RED": "atomic",
+    "REDG": "atomic",
+    "ATOM": "atomic",
+    "ATOMG": "atomic",
+    "ATOMS": "atomic",
     "S2UR": "S2R",
     "LDG": "load",
     "LD": "load",
@@ -703,11 +811,3 @@ ALIASES = {
     "IMNMX": "VIMNMX",
     "IMOV": "MOV",
 }
-
-
-def constants_of(parameters: bytes, block: int, blocks: int) -> bytes:
-    """Return a kernel's constant memory.
-
-    It holds the size of a block, the number of blocks, and the parameters.
-    """
-    return struct.pack("<6I", block, 1, 1, blocks, 1, 1).ljust(PARAMETERS, b"\0") + parameters

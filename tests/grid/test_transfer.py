@@ -297,6 +297,27 @@ def test_gathering_is_confined_to_the_window() -> None:
         assert (b == 0.0).all()
 
 
+@pytest.mark.parametrize("affine", [True, False])
+@pytest.mark.parametrize("dimension", GRIDS)
+def test_planes_that_a_thread_takes_together_have_the_same_bits(
+    dimension: str, affine: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On CUDA, and in its emulation; the CPU takes planes one by one."""
+    p = sorted_cloud(GRIDS[dimension], affine=affine)
+    inner = p.grid.window((1, 2, 2), (2 if p.grid.dimension == 2 else 6, 5, 6))
+    found = []
+    for least in (1 << 40, 0):
+        monkeypatch.setattr("warp_lcp.grid.staggered.MANY_CELLS", least)
+        for window in (p.grid.everywhere, inner):
+            density = wp.zeros(p.grid.shape, dtype=wp.float32, device="cpu")
+            particle_density(p.grid, p, window, 8, density)
+            fields = transfer(p, p.offsets, window=window)
+            found.append([field.tobytes() for field in (*fields, density.numpy())])
+    assert found[0] == found[2]
+    assert found[1] == found[3]
+    assert found[0] != found[1]
+
+
 @pytest.mark.cuda
 def test_a_gpu_gathers_the_same_bits_every_time() -> None:
     p = sorted_cloud(StaggeredGrid((8, 7, 6), 0.125, 3, "cuda:0"), affine=True)

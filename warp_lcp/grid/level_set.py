@@ -243,6 +243,7 @@ def particle_density(
         window.run(
             kernels.GATHER,
             grid.placement,
+            grouped=True,
             position=position,
             offsets=particles.offsets,
             density=density,

@@ -45,6 +45,9 @@ CLEAR: dict[type, StencilKernel] = {
 COPY = KERNELS["warp_lcp.grid.copy_box.copy"]
 FieldT = typing.TypeVar("FieldT")
 SEGMENT = 8  # cells of a row that are visited together in an active window
+# Planes that a thread takes together on CUDA, and the least cells of a window where it does: fewer
+# threads would not fill a GPU.
+GROUPED_PLANES, MANY_CELLS = 4, 1 << 18
 
 
 @wp.struct
@@ -185,6 +188,7 @@ class Window(Identified):
         passed: StencilKernel,
         *structs: "DataclassInstance",
         whole: bool = False,
+        grouped: bool = False,
         launch: Launch | None = None,
         **given: object,
     ) -> None:
@@ -194,10 +198,13 @@ class Window(Identified):
             passed: the pass, with fields of a `box`.
             structs: with fields and numbers, see `StencilKernel.bind`.
             whole: a thread takes a whole row, for counts of a row.
+            grouped: a thread takes `GROUPED_PLANES` planes together on CUDA, if the window is
+                large; of kernels with `plane_group` of `particles.h`.
             launch: the launch function of a launch graph.
             given: fields and numbers by name.
         """
-        passed.bind_arguments(self._whole if whole else self._shared, structs, given).launch(launch)
+        rows = self._grouped if grouped else self._whole if whole else self._shared
+        passed.bind_arguments(rows, structs, given).launch(launch)
 
     def rows_of_sums(self, planes: int) -> Rows:
         """Return the rows of a pass that sums.
@@ -207,6 +214,15 @@ class Window(Identified):
         if self.near is None and self.device.is_cuda:
             return Rows.box(self.low, self.high, self.device, slab=planes)
         return self._whole
+
+    @property
+    def _grouped(self) -> Rows:
+        """Rows of a pass whose threads take planes together on CUDA."""
+        (planes, rows), width = self.rows, self.high[2] - self.low[2]
+        if not self.device.is_cuda or self.near is not None or planes * rows * width < MANY_CELLS:
+            return self._shared
+        made = self.rows_of_sums(GROUPED_PLANES)
+        return replace(made, single=made.summed)
 
     @cached_property
     def _shared(self) -> Rows:

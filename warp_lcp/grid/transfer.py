@@ -121,6 +121,7 @@ def particles_to_faces(
             window.run(
                 passes.gather_weights,
                 grid.placement,
+                grouped=True,
                 position=position,
                 velocity=velocity,
                 gradient=gradient,

@@ -68,6 +68,37 @@ auto weight = [&](int axis, T x, int cell) {
     const T outer = d < (T)1.5 ? (T)1.5 - d : (T)0;
     return d < (T)0.5 ? (T)0.75 - d * d : (T)0.5 * outer * outer;
 };
+#ifdef __CUDA_ARCH__
+if (L.slab > 1) {
+#include "particles.h:plane_group"
+    const int reach = planes == 2 ? 1 : 0;
+    const int z0 = k - reach > 0 ? k - reach : 0, most = k + group - 1 + reach,
+              z1 = most < nz ? most : nz - 1;
+    for (int i = first; i < last; ++i) {
+        const int x0 = i > 0 ? i - 1 : 0, x1 = i + 1 < nx ? i + 1 : i, y0 = j > 0 ? j - 1 : 0,
+                  y1 = j + 1 < ny ? j + 1 : j;
+        T total[GROUP] = {};
+        for (int c = z0; c <= z1; ++c)
+            for (int b = y0; b <= y1; ++b) {
+                const long long row = c * s1 + b * s2;
+                const int beyond = offsets[row + x1 + 1];
+                for (long long p = offsets[row + x0]; p < beyond; ++p) {
+                    const T z = position[3 * p + 2];
+                    const T share =
+                        weight(0, position[3 * p], i) * weight(1, position[3 * p + 1], j);
+                    _Pragma("unroll") for (int g = 0; g < GROUP; ++g) {
+                        if (g < group && c >= k + g - reach && c <= k + g + reach)
+                            total[g] += share * (planes == 2 ? weight(2, z, k + g) : (T)1);
+                    }
+                }
+            }
+        _Pragma("unroll") for (int g = 0; g < GROUP; ++g) {
+            if (g < group) density[i + g * s1] = each * total[g];
+        }
+    }
+    continue;
+}
+#endif
 for (int i = first; i < last; ++i) {
     const int x0 = i > 0 ? i - 1 : 0, x1 = i + 1 < nx ? i + 1 : i, y0 = j > 0 ? j - 1 : 0,
               y1 = j + 1 < ny ? j + 1 : j;

@@ -52,6 +52,12 @@ auto weigh = [&](T x, int count, T* w) {
     return c;
 };
 
+// snippet plane_group: Planes that a thread takes together on CUDA, `group` of at most GROUP. The
+// thread loads each particle around them once. Each sum is added up in the same order as alone.
+enum { GROUP = 4 };
+if (P.more) continue;
+const int group = L.planes - P.k < L.slab ? L.planes - P.k : L.slab;
+
 // snippet add: Add to an element that other threads may change on CUDA. A product is rounded before
 // it is added on CUDA, and fused on the CPU.
 auto add = [](auto& element, auto value) {

@@ -135,6 +135,54 @@ const T* velocity = (const T*)given.velocity.data;
 const T* gradient = (const T*)given.gradient.data;
 #include "particles.h:nodes"
 const int nx = given.field.shape[2], ny = given.field.shape[1], nz = given.field.shape[0];
+#ifdef __CUDA_ARCH__
+if (L.slab > 1) {
+#include "particles.h:plane_group"
+    // as below, for all planes of the group
+    const auto above = [&](int k) { return planes == 1 || axis == 2 || k + 1 >= nz ? k : k + 1; };
+    const auto below = [&](int k) { return planes == 1 ? k : k > 0 ? k - 1 : 0; };
+    const int z0 = below(k), z1 = above(k + group - 1);
+    for (int i = first; i < last; ++i) {
+        const int x0 = i > 0 ? i - 1 : 0, x1 = axis == 0 || i + 1 >= nx ? i : i + 1;
+        const int y0 = j > 0 ? j - 1 : 0, y1 = axis == 1 || j + 1 >= ny ? j : j + 1;
+        T momentum[GROUP] = {}, sum[GROUP] = {};
+        for (int c = z0; c <= z1; ++c)
+            for (int b = y0; b <= y1; ++b) {
+                const long long row = c * s1 + b * s2;
+                const int beyond = offsets[row + x1 + 1];
+                for (long long p = offsets[row + x0]; p < beyond; ++p) {
+                    int pi, pj, pk;
+                    T fx, fy, fz;
+                    nodes(p, pi, pj, pk, fx, fy, fz);
+                    const int di = i - pi, dj = j - pj;
+                    if ((di | dj) & ~1) continue;
+                    const T share = (di ? fx : 1 - fx) * (dj ? fy : 1 - fy);
+                    T flat = velocity[3 * p + axis], slope = 0;
+                    if (gradient) {
+                        flat += dx * (gradient[3 * p] * ((T)di - fx) +
+                                      gradient[3 * p + 1] * ((T)dj - fy));
+                        if (planes == 2) slope = dx * gradient[3 * p + 2];
+                    }
+                    _Pragma("unroll") for (int g = 0; g < GROUP; ++g) {
+                        const int dk = planes == 2 ? k + g - pk : 0;
+                        if (g >= group || dk & ~1 || c < below(k + g) || c > above(k + g)) continue;
+                        const T w = share * (planes == 1 ? (T)1 : dk ? fz : 1 - fz);
+                        T v = flat;
+                        if (gradient && planes == 2) v += slope * ((T)dk - fz);
+                        momentum[g] += w * v;
+                        sum[g] += w;
+                    }
+                }
+            }
+        _Pragma("unroll") for (int g = 0; g < GROUP; ++g) {
+            if (g >= group) continue;
+            weight[i + g * s1] = sum[g];
+            field[i + g * s1] = sum[g] > (T)TINY_WEIGHT ? momentum[g] / sum[g] : (T)0;
+        }
+    }
+    continue;
+}
+#endif
 for (int i = first; i < last; ++i) {
     // A particle in cell c reaches nodes c and c + 1 along the face's own axis, and c - 1 to c + 1
     // along the others.
