@@ -166,6 +166,12 @@ BOTTLE = {
     "solver": {"precision": "double"},
     "output": {"forces": True},
 }
+HARD = {"kind": "sinusoid", "period": 0.1, "amplitude": [0.06, 0.0]}
+# Several density corrections in a step.
+SHAKEN_HARD = BOTTLE | {
+    "solid": walled([0.31, 0.11], [0.63, 0.4], lid=True, motion=HARD),
+    "cfl": 4.0,
+}
 TUB = {
     "solid": walled([0.31, 0.1, 0.1], [0.63, 0.4, 0.4]),
     "liquid": [box([0.31, 0.1, 0.1], [0.63, 0.33, 0.4])],
@@ -243,6 +249,7 @@ SCENES = {
     | {"solid": RAFTS, "pressure": {"model": "unilateral"}, "solver": {"precision": "double"}},
     "cup": FLAT | CUP,
     "bottle": FLAT | BOTTLE,
+    "bottle shaken hard": FLAT | SHAKEN_HARD,
     "tub": DEEP | TUB,
     "sunken sheet": FLAT | SUNKEN,
     "thick cup": FLAT | CUP | THICK_CUP,

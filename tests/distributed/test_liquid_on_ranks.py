@@ -78,6 +78,7 @@ CLOSE = {
     # Liquid nearly at rest: its kinetic energy is the square of such differences.
     "cup": 1e-5,
     "bottle": 1e-5,
+    "bottle shaken hard": 1e-5,
     "tub": 1e-5,
 }
 
@@ -139,6 +140,7 @@ ONE_RANK = (
     "banded",
     "cup",
     "bottle",
+    "bottle shaken hard",
     "tub",
     "sunken sheet",
     "thick cup",
