@@ -126,15 +126,15 @@ def try_methods(problem: wl.LCP, advice: Recommendation, device: str) -> dict[st
     solved = [trial.best for trial in trials.values() if trial.solved]
     slowest = max(NEAR * min(solved, default=0.0), BRIEF)
     kept = {DEFAULT, advice.name}
-    again = [
+    repeated = [
         name
         for name, trial in trials.items()
         if trial.solved and (trial.best <= slowest or name in kept)
     ]
-    for name in again:
+    for name in repeated:
         trials[name].seconds.clear()  # the first trial may have loaded kernels
     for _ in range(ROUNDS):
-        for name in again:
+        for name in repeated:
             sample(trials[name], solvers[name], device)
     return trials
 
@@ -204,23 +204,23 @@ def rule_row(number: int, records: Sequence[BenchmarkRecord]) -> list[str]:
     The columns are problems, solved, time over the best, the best methods, the gain of the
     alternatives, and the default.
     """
-    own = [r for r in records if r.facts["rule"] == number]
+    own_records = [r for r in records if r.facts["rule"] == number]
     method = RULES[number - 1].method
-    if not own:
+    if not own_records:
         return [str(number), f"`{method}`", "0", *[""] * 5]
-    ratios = [x for r in own if (x := over_best(r, method)) is not None]
-    failed = [r for r in own if over_best(r, method) is None]
+    ratios = [x for r in own_records if (x := over_best(r, method)) is not None]
+    failed = [r for r in own_records if over_best(r, method) is None]
     fastest = Counter(
-        min(found, key=lambda name: found[name]) for r in own if (found := solved_by(r))
+        min(found, key=lambda name: found[name]) for r in own_records if (found := solved_by(r))
     )
     added = Counter(
         next((a for a in r.facts["alternatives"] if a in solved_by(r)), "none") for r in failed
     )
-    default = sum(r.facts["status"][DEFAULT] == wl.SolveStatus.CONVERGED.name for r in own)
+    default = sum(r.facts["status"][DEFAULT] == wl.SolveStatus.CONVERGED.name for r in own_records)
     return [
         str(number),
         f"`{method}`",
-        str(len(own)),
+        str(len(own_records)),
         str(len(ratios)),
         f"{statistics.median(ratios):.2f} ({max(ratios):.1f})" if ratios else "",
         ", ".join(f"`{name}` {n}" for name, n in fastest.most_common(3)),
@@ -261,14 +261,14 @@ def kind_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """Return a row for each kind of problem."""
     rows = []
     for kind in dict.fromkeys(r.facts["kind"] for r in records):
-        own = [r for r in records if r.facts["kind"] == kind]
-        ratios = [x for r in own if (x := over_best(r, DEFAULT)) is not None]
-        rules = Counter(r.facts["rule"] for r in own)
-        right = sum(is_right(r, DEFAULT) for r in own)
+        own_records = [r for r in records if r.facts["kind"] == kind]
+        ratios = [x for r in own_records if (x := over_best(r, DEFAULT)) is not None]
+        rules = Counter(r.facts["rule"] for r in own_records)
+        right = sum(is_right(r, DEFAULT) for r in own_records)
         cells = [
             kind,
             ", ".join(map(str, sorted(rules))),
-            str(len(own)),
+            str(len(own_records)),
             str(len(ratios)),
             str(right),
         ]
@@ -291,16 +291,17 @@ def budget_table(records: Sequence[BenchmarkRecord]) -> RecordTable:
     """
     rows = []
     for budget in (*(f"{steps} steps" for steps in BUDGETS), "memory of a sweep"):
-        own = [r for r in records if budget in r.facts["budgets"]]
+        own_records = [r for r in records if budget in r.facts["budgets"]]
         most = int(budget.split()[0]) if budget.endswith("steps") else None
         within = [
             [n for n in solved_by(r) if most is None or r.facts["iterations"][n] <= most]
-            for r in own
+            for r in own_records
         ]
         hits = sum(
-            r.facts["budgets"][budget] in names for r, names in zip(own, within, strict=True)
+            r.facts["budgets"][budget] in names
+            for r, names in zip(own_records, within, strict=True)
         )
-        rows.append([budget, str(len(own)), str(hits), str(sum(map(bool, within)))])
+        rows.append([budget, str(len(own_records)), str(hits), str(sum(map(bool, within)))])
     remark = (
         "Solved: the method that `wl.recommend` names for the budget has solved the problem "
         "within its steps."

@@ -123,18 +123,20 @@ def steps_of_spheres(options: Options) -> tuple[list[BenchmarkRecord], RecordTab
 
 
 def _reported(
-    found: dict[str, dict[str, list[float]]],
+    figures_of: dict[str, dict[str, list[float]]],
 ) -> tuple[list[BenchmarkRecord], RecordTable]:
     units = {"seconds": "s", "solve_seconds": "s", "overlap": "m"}
     records, rows = [], []
-    for method, figures in found.items():
+    for method, figures in figures_of.items():
         record = BenchmarkRecord(
             f"{SPHERES} spheres in a box: {method}",
             {n: Figure.of(v, units.get(n, "")) for n, v in figures.items()},
             {"method": method},
         )
         records.append(record)
-        shares = [np.divide(figures[n], found[METHODS[0]][n]) for n in ("seconds", "solve_seconds")]
+        shares = [
+            np.divide(figures[n], figures_of[METHODS[0]][n]) for n in ("seconds", "solve_seconds")
+        ]
         names = ("contacts", "seconds", "solve_seconds", "iterations", "residual", "overlap")
         ranges = [
             f"{np.median(share):.3g} ({share.min():.3g} to {share.max():.3g})" for share in shares

@@ -253,7 +253,7 @@ def _tables(solves: list[BenchmarkRecord]) -> list[RecordTable]:
     ]
     tables = []
     for name in SCENES:
-        here = [r for r in solves if r.facts["scene"] == name]
+        scene_records = [r for r in solves if r.facts["scene"] == name]
         rows = [
             [
                 r.facts["method"],
@@ -261,7 +261,7 @@ def _tables(solves: list[BenchmarkRecord]) -> list[RecordTable]:
                 r.facts["status"],
                 *("" if (v := r.value(k)) is None else f"{v:.3g}" for k in keys),
             ]
-            for r in here
+            for r in scene_records
         ]
         remark = (
             "Residuals are relative to that at x = 0 in each model's own problem; the cone "

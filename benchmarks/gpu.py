@@ -75,15 +75,15 @@ class GpuVerdict:
         self.tables: list[RecordTable] = []
         self.steps = 10 if rehearsal else gpu_cases.STEPS
 
-    def claim(self, name: str, found: Callable[[], str | None]) -> None:
+    def claim(self, name: str, check: Callable[[], str | None]) -> None:
         """Run one check and record its outcome.
 
-        `found` returns the text to report. It raises AssertionError if the check fails, and returns
+        `check` returns the text to report. It raises AssertionError if the check fails, and returns
         None if the check cannot be made.
         """
         start = time.perf_counter()
         try:
-            text, holds = found(), True
+            text, holds = check(), True
         except AssertionError as error:
             text, holds = str(error), False
         except Exception as error:  # any failure of an unknown machine is a result
@@ -122,21 +122,21 @@ class GpuVerdict:
         path = self.out / "cpu.npz"
         command = [sys.executable, "-m", "benchmarks.gpu_cases", str(path), "cpu", str(self.steps)]
         subprocess.run(command, cwd=ROOT, check=True, timeout=900, stdout=subprocess.DEVNULL)
-        found, wrong, worst = gpu_cases.everything(self.device, self.steps), [], 0.0
+        results, wrong, worst = gpu_cases.everything(self.device, self.steps), [], 0.0
         with np.load(path) as expected:
-            wrong += [f"{name} only here" for name in found.keys() - expected.keys()]
+            wrong += [f"{name} only here" for name in results.keys() - expected.keys()]
             for name, x in expected.items():
-                if name not in found:
+                if name not in results:
                     wrong.append(f"{name} not here")
                     continue
                 scale, bound = np.abs(x).max() or 1.0, ALIKE if "steps" in name else CLOSE
-                off = float(np.abs(found[name] - x).max() / scale)
+                off = float(np.abs(results[name] - x).max() / scale)
                 worst = max(worst, off / bound)
                 if not off <= bound:
                     wrong.append(f"{name} is off by {off:.1e}")
         assert not wrong, "; ".join(sorted(wrong))
         assert worst > 0.0, "every bit is the CPU's: this was no other device"
-        return f"{len(found)} cases, at most {worst:.1g} of what is allowed"
+        return f"{len(results)} cases, at most {worst:.1g} of what is allowed"
 
     def each_kernel(self) -> str:
         """Compare each kernel's results on the device with those on the CPU.
@@ -153,13 +153,13 @@ class GpuVerdict:
         done = subprocess.run(
             command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=900
         )
-        said = (done.stdout.splitlines() or [""])[-1]
+        last_line = (done.stdout.splitlines() or [""])[-1]
         assert done.returncode == 0, (
-            said
+            last_line
             if done.returncode == WRONG
             else f"ended with {done.returncode}: {done.stderr[-500:]}"
         )
-        return said
+        return last_line
 
     def residuals(self) -> str:
         """Evaluate residuals of a splash in NumPy, without code of the solvers."""
@@ -311,7 +311,7 @@ class GpuVerdict:
         rows, steps = [], []
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
             problem, method = splash(n).lcp("walls", device=self.device), wl.ProjectedMultigrid()
-            workspace, taken = method.init(problem), []
+            workspace, seconds = method.init(problem), []
             for _ in range(4):  # the first one loads kernels and captures graphs
                 wp.synchronize()
                 start = time.perf_counter()
@@ -319,11 +319,11 @@ class GpuVerdict:
                     problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace
                 )
                 wp.synchronize()
-                taken.append(time.perf_counter() - start)
+                seconds.append(time.perf_counter() - start)
             rows.append(
                 [
                     f"{n}^3",
-                    f"{1e3 * min(taken[1:]):.1f}",
+                    f"{1e3 * min(seconds[1:]):.1f}",
                     str(result.iterations),
                     result.status.name,
                 ]
@@ -342,7 +342,7 @@ class GpuVerdict:
             RecordTable("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps)
         )
         cells = ("16", "16") if self.rehearsal else ("128", "64")
-        said = subprocess.run(
+        report = subprocess.run(
             [
                 sys.executable,
                 "-m",
@@ -358,7 +358,7 @@ class GpuVerdict:
             text=True,
             timeout=600,
         ).stdout
-        (self.out / "model.md").write_text(said)
+        (self.out / "model.md").write_text(report)
         return ", ".join(
             [
                 *(f"{cells} {ms} ms" for cells, ms, *_ in rows),
@@ -443,17 +443,19 @@ def main() -> int:
     )
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))
-    given = parser.parse_args()
-    if not given.rehearse and not wp.is_cuda_available():
+    options = parser.parse_args()
+    if not options.rehearse and not wp.is_cuda_available():
         print("no CUDA device: use `--rehearse` for a rehearsal on the CPU", file=sys.stderr)
         return 2
-    given.out.mkdir(parents=True, exist_ok=True)
+    options.out.mkdir(parents=True, exist_ok=True)
     verdict = GpuVerdict(
-        "cpu" if given.rehearse else given.device, rehearsal=given.rehearse, out=given.out.resolve()
+        "cpu" if options.rehearse else options.device,
+        rehearsal=options.rehearse,
+        out=options.out.resolve(),
     )
     verdict.all()
     verdict.write()
-    print(f"{given.out}/verdict.md and verdict.json")
+    print(f"{options.out}/verdict.md and verdict.json")
     return int(any(not c.holds for c in verdict.claims))
 
 

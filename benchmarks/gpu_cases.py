@@ -49,7 +49,7 @@ def obstacle(shape: tuple[int, ...], device: str, *, periodic: bool = False) -> 
 def methods(device: str) -> Arrays:
     """Return x of every method, on small grids and matrices."""
     rng = np.random.default_rng(3)
-    found = {}
+    solutions = {}
     B = rng.standard_normal((30, 30))
     dense = B @ B.T + np.eye(30)
     banded = scipy.sparse.diags_array(
@@ -72,13 +72,13 @@ def methods(device: str) -> Arrays:
             else:
                 problem = wl.LCP(wl.GridPoisson(cells, device=device), field)
             result = wl.solve(problem, cls(), stopping=STOPPING)
-            found[f"{name}, {family}: {result.status.name}"] = result.x.numpy()
-    return found
+            solutions[f"{name}, {family}: {result.status.name}"] = result.x.numpy()
+    return solutions
 
 
 def shapes(device: str) -> Arrays:
     """Return x of the default method on odd, thin and periodic grids."""
-    found = {}
+    solutions = {}
     for periodic in (False, True):
         for shape in SHAPES:
             result = wl.solve(
@@ -87,19 +87,21 @@ def shapes(device: str) -> Arrays:
                 stopping=STOPPING,
             )
             kind = "periodic " if periodic else ""
-            found[f"{kind}{' x '.join(map(str, shape))}: {result.status.name}"] = result.x.numpy()
-    return found
+            solutions[f"{kind}{' x '.join(map(str, shape))}: {result.status.name}"] = (
+                result.x.numpy()
+            )
+    return solutions
 
 
 def large(device: str, n: int = 48) -> Arrays:
     """Return x of a splash, large enough for all paths of a device."""
-    found = {}
+    solutions = {}
     for method in (wl.ProjectedMultigrid(), wl.MinimumMapNewton(), wl.InteriorPoint(), wl.MPRGP()):
         result = wl.solve(
             splash(n).lcp("walls", device=device), method, stopping=wl.StoppingCriteria(rtol=1e-7)
         )
-        found[f"{type(method).__name__}, {n}^3: {result.status.name}"] = result.x.numpy()
-    return found
+        solutions[f"{type(method).__name__}, {n}^3: {result.status.name}"] = result.x.numpy()
+    return solutions
 
 
 def simulation(name: str, device: str, cells: int = 0) -> ParticleSimulation:
@@ -123,14 +125,14 @@ def moments(device: str, steps: int = STEPS) -> Arrays:
 
     They are those after some steps.
     """
-    found = {}
+    values = {}
     for name in SCENES:
         *_, last = states(name, device, steps)
         x, v = last["position"].astype(np.float64), last["velocity"].astype(np.float64)
-        found[f"{name}, {steps} steps"] = np.array(
+        values[f"{name}, {steps} steps"] = np.array(
             [len(x), *x.mean(axis=0), *x.std(axis=0), np.linalg.norm(v, axis=1).mean()]
         )
-    return found
+    return values
 
 
 def everything(device: str, steps: int = STEPS) -> Arrays:

@@ -166,15 +166,15 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
         declared: StencilKernel,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
-        given: Tables,
+        kernel_args: Tables,
         stencil: PaddedStencil | None = None,
         bounds: BoundOperands | None = None,
     ) -> BoundKernel:
-        bound = bind(declared, rows, structs, given, stencil, bounds)
+        bound = bind(declared, rows, structs, kernel_args, stencil, bounds)
         fields = {
-            name: bound.given[name]
+            name: bound.kernel_args[name]
             for name in declared.arrays
-            if isinstance(bound.given[name], wp.array)
+            if isinstance(bound.kernel_args[name], wp.array)
         }
         if stencil is not None:
             fields |= {"d": stencil.d} | {
@@ -185,7 +185,7 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        heard.append((Heard(bound, fields), bound.given))
+        heard.append((Heard(bound, fields), bound.kernel_args))
         return bound
 
     blocks = math.prod(SHAPE) // 8  # of the next level, too, but not of those in one launch
@@ -213,14 +213,14 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
         A = wl.GridPoisson(cells, device="cpu")
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
         A.stencil.product(x, wp.zeros_like(x))
-    found: dict[str, tuple[Heard, Tables]] = {}
+    by_name: dict[str, tuple[Heard, Tables]] = {}
     for one, given in heard:
         rows, declared = one.bound.rows, one.bound.form.declared
         if max(rows.size, rows.other_size) == A.layout.size and not (
             declared.box or declared.listed
         ):
-            found.setdefault(one.name + kinds(given), (one, given))
-    return found
+            by_name.setdefault(one.name + kinds(given), (one, given))
+    return by_name
 
 
 def cells_of(bound: BoundKernel) -> int:
@@ -232,13 +232,13 @@ def cells_of(bound: BoundKernel) -> int:
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
-def count(name: str, one: Heard, given: Tables, folder: Path) -> InstructionCount:
+def count(name: str, one: Heard, kernel_args: Tables, folder: Path) -> InstructionCount:
     """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
     Args:
         name: of the count.
         one: the pass.
-        given: its arguments.
+        kernel_args: its arguments.
         folder: what is compiled lies there.
 
     Raises:
@@ -253,23 +253,23 @@ def count(name: str, one: Heard, given: Tables, folder: Path) -> InstructionCoun
     parameters = bounds + bytes(layout.native_of(rows)) + one.bound.arguments
     # Threads of a row within the second slab.
     first = (min(1, slabs - 1) * lines + lines // 2) * chunks
-    taken = range(first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim))[
-        : min(WARP, chunks)
-    ]
+    chunk_range = range(
+        first + chunks // 2 // WARP * WARP if chunks > 1024 else first, math.prod(dim)
+    )[: min(WARP, chunks)]
     arrays = [
         a
-        for a in (*one.fields.values(), *given.values(), rows.spans)
+        for a in (*one.fields.values(), *kernel_args.values(), rows.spans)
         if isinstance(a, wp.array) and a.size
     ]
     memory = Memory((int(a.ptr), a.numpy().copy()) for a in arrays)
     blocks = -(-math.prod(dim) // BLOCK)
     constants = constants_of(parameters, BLOCK, blocks)
-    found = issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in taken])
+    found = issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in chunk_range])
     planes, size = min(rows.slab, rows.planes), one.bound.rows.size
     ratio = max(one.bound.rows.other_size // size, 1) if size else 1
     finer = 8 if ratio > 4 else 1  # a thread takes an aggregate of the finer level
     cells = planes * (max(rows.grain, 1)) * finer
-    whole = cells_of(one.bound)
+    cell_count = cells_of(one.bound)
     apart = {*form.declared.by_row, *form.declared.whole, "out"}
     fields = {
         int(a.ptr): a.size * wp.types.type_size_in_bytes(a.dtype)
@@ -283,7 +283,7 @@ def count(name: str, one: Heard, given: Tables, folder: Path) -> InstructionCoun
         if any(begin <= address < begin + size for address in reached)
     )
     return InstructionCount(
-        name, found, cells, planes, kernel.registers, moved / whole, kernel.spilled
+        name, found, cells, planes, kernel.registers, moved / cell_count, kernel.spilled
     )
 
 
@@ -315,7 +315,7 @@ def counts(words: tuple[str, ...] = AREAS) -> Iterator[InstructionCount]:
                     print(f"{name}: {error!r}")
 
 
-def table(found: Iterable[InstructionCount], n: int) -> Iterator[str]:
+def table(counts: Iterable[InstructionCount], n: int) -> Iterator[str]:
     """Yield the lines of a table of kernels, with times over n^3 cells."""
     times = " | ".join(f"{name} ms | limit" for name in GPUS)
     yield (
@@ -323,7 +323,7 @@ def table(found: Iterable[InstructionCount], n: int) -> Iterator[str]:
         f"{times} |"
     )
     yield "|---" * (8 + 2 * len(GPUS)) + "|"
-    for one in found:
+    for one in counts:
         i, c = one.issued, one.cells
         cells = [f"{v / c:.1f}" for v in (i.instructions, i.loads, i.stores, i.wavefronts)]
         cells += [f"{one.bytes:.1f}", str(one.registers), str(one.resident(GPUS["H200"]))]

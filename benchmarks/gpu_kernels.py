@@ -104,12 +104,12 @@ def among(name, patterns):
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def arrays_in(given):
+def arrays_in(arguments):
     """Yield the arrays of parameters, element types and sizes in bytes.
 
     Arrays in structs count as well.
     """
-    for value, kind in given:
+    for value, kind in arguments:
         if isinstance(value, array_t):
             shape, strides = value.shape[: value.ndim], value.strides[: value.ndim]
             size = wp.types.type_size_in_bytes(kind.dtype) + sum(
@@ -163,16 +163,16 @@ class Copies:
         given: parameters, with their types (updated: addresses become those of the copies).
     """
 
-    def __init__(self, device, given):
+    def __init__(self, device, arguments):
         self.device, self.arrays, spans = device, {}, []
-        self._collect(given)
+        self._collect(arguments)
         for address, size, _ in sorted(self.arrays, key=lambda found: found[:2]):
             if not spans or address >= spans[-1][1]:
                 spans.append([address, address])
             spans[-1][1] = max(spans[-1][1], address + size)
         self.blocks = [(begin, self._copied(begin, end - begin)) for begin, end in spans]
         self.before = [copy.copy() for _, copy in self.blocks]
-        self._move(given)
+        self._move(arguments)
 
     def there(self):
         """Return the present contents of the device's arrays."""
@@ -183,19 +183,19 @@ class Copies:
 
         Arrays of structs hold addresses and are left out.
         """
-        found = []
+        views = []
         for address, size, dtype in self.arrays:
             if not isinstance(dtype, codegen.Struct):
                 at, begin = max(
                     (i, begin) for i, (begin, _) in enumerate(self.blocks) if begin <= address
                 )
                 kind = np.dtype(wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
-                found.append(
+                views.append(
                     blocks[at][address - begin : address - begin + size].view(
                         np.uint8 if kind.kind == "b" else kind
                     )
                 )
-        return found
+        return views
 
     def _read(self, address, size):
         return wp.array(ptr=address, dtype=wp.uint8, shape=size, device=self.device).numpy().copy()
@@ -212,8 +212,8 @@ class Copies:
                 self.arrays[a.data, size, dtype] = None
                 self._collect(members(self._read(a.data, size), a, dtype))
 
-    def _move(self, given):
-        for a, dtype, size in arrays_in(given):
+    def _move(self, arguments):
+        for a, dtype, size in arrays_in(arguments):
             at = next(
                 (
                     (begin, copy)
@@ -257,8 +257,8 @@ class KernelCheck:
             t.from_buffer_copy(ctypes.string_at(at, ctypes.sizeof(t)))
             for t, at in zip(types, addresses, strict=False)
         )
-        given = list(zip(values, kinds, strict=True))
-        form = name, tuple(bool(a.data) for a, *_ in arrays_in(given))
+        arguments = list(zip(values, kinds, strict=True))
+        form = name, tuple(bool(a.data) for a, *_ in arrays_in(arguments))
         sized = (*form, tuple(bounds.shape))
         known = self.compared[form] == SIZES or sized in self.compared or self.tried[sized] == TRIES
         if known or self.busy or context.runtime.captures:
@@ -268,7 +268,7 @@ class KernelCheck:
             return run()
         self.tried[sized] += 1
         self.busy = True
-        copies = Copies(self.device, given)
+        copies = Copies(self.device, arguments)
         self._launch_here(kernel, name, bounds, values)
         done = run()
         if self._compare(name, bounds.size, copies):

@@ -125,7 +125,10 @@ class Work:
 
         The time of a launch belongs to its slowest limit.
         """
-        found = {"barriers": self.barriers / 1e3, "readbacks": READBACK * self.readbacks / 1e3}
+        milliseconds = {
+            "barriers": self.barriers / 1e3,
+            "readbacks": READBACK * self.readbacks / 1e3,
+        }
         for size, graph, key, cells in zip(
             self.bytes, self.graph, self.keys, self.cells, strict=True
         ):
@@ -134,8 +137,8 @@ class Work:
             limits = by_bytes if one is None else one.limits(gpu, round(cells))
             limits["launches"] = (RECORDED if graph else LAUNCHED) / 1e3
             limit = max(limits, key=lambda name: limits[name])
-            found[limit] = found.get(limit, 0.0) + limits[limit]
-        return found
+            milliseconds[limit] = milliseconds.get(limit, 0.0) + limits[limit]
+        return milliseconds
 
     def floor(self, gpu: gpu_counts.Gpu, counts: dict[str, gpu_counts.InstructionCount]) -> float:
         """Return the time [ms] of the bytes alone."""
@@ -264,7 +267,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
             has set up.
         counter: it counts the first launch of each kernel; None: none is counted.
     """
-    given: dict[int, tuple[BoundKernel, Heard]] = {}
+    by_bound: dict[int, tuple[BoundKernel, Heard]] = {}
     tags: dict[int, tuple[object, Launched]] = {}
     bind, launch_bound, launch_sequence = (
         StencilKernel.bind_arguments,
@@ -275,7 +278,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
     invokes = {name: getattr(context, name) for name in ("invoke", "invoke_cpu_blocks")}
     current: list[Launched] = []
     active: list[Launched] = []
-    found = Work()
+    recorded = Work()
 
     def binding(
         declared: StencilKernel,
@@ -286,7 +289,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
         bounds: BoundOperands | None = None,
     ) -> BoundKernel:
         bound = bind(declared, rows, structs, arguments, stencil, bounds)
-        taken = {name: bound.given[name] for name in declared.arrays}
+        taken = {name: bound.kernel_args[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
             fields |= {"d": stencil.d} | {
@@ -297,18 +300,18 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        given[id(bound)] = bound, Heard(bound, fields)
+        by_bound[id(bound)] = bound, Heard(bound, fields)
         return bound
 
     def launching(bound: BoundKernel, *args: Launch) -> None:
-        known = given.get(id(bound))
+        known = by_bound.get(id(bound))
         launched = Launched(0.0, 0)
         if known:
             one = known[1]
             moved = float(sum(one.reads.values()) + sum(one.writes.values()))
-            key = gpu_counts.key(one.name + gpu_counts.kinds(bound.given))
+            key = gpu_counts.key(one.name + gpu_counts.kinds(bound.kernel_args))
             launched = Launched(moved, 0, key, gpu_counts.cells_of(bound))
-            found.bounds[key] = one
+            recorded.bounds[key] = one
         current.append(launched)
         launch_bound(bound, *args)
         current.pop()
@@ -354,13 +357,13 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
         note(launched, graph=True)
 
     def note(launched: Launched, *, graph: bool) -> None:
-        found.bytes.append(launched.bytes)
-        found.graph.append(graph)
-        found.names.append(launched.name)
-        found.keys.append(launched.key)
-        found.cells.append(launched.cells)
-        found.stages += launched.stages
-        found.across += launched.across
+        recorded.bytes.append(launched.bytes)
+        recorded.graph.append(graph)
+        recorded.names.append(launched.name)
+        recorded.keys.append(launched.key)
+        recorded.cells.append(launched.cells)
+        recorded.stages += launched.stages
+        recorded.across += launched.across
 
     def invoking(name: str) -> Callable[[object, object, list[object], bool], None]:
         def invoke(kernel: object, hooks: object, params: list[object], adjoint: bool) -> None:
@@ -382,9 +385,9 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
         patch.start()
     work = make()
     work()
-    for kept in (found.bytes, found.graph, found.names, found.keys, found.cells):
+    for kept in (recorded.bytes, recorded.graph, recorded.names, recorded.keys, recorded.cells):
         kept.clear()
-    found.stages = found.across = 0
+    recorded.stages = recorded.across = 0
     emulated_cuda.meter.clear()
     counting = [mock.patch.object(context, name, invoking(name)) for name in invokes]
     for one in counting if counter is not None else ():
@@ -394,8 +397,8 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
         one.stop()
     for patch in reversed(patches):
         patch.stop()
-    found.readbacks = emulated_cuda.meter["readbacks"]
-    return found
+    recorded.readbacks = emulated_cuda.meter["readbacks"]
+    return recorded
 
 
 def solve(n: int, *, clusters: bool = False) -> tuple[Work, int]:
@@ -411,17 +414,17 @@ def solve(n: int, *, clusters: bool = False) -> tuple[Work, int]:
     if clusters:
         cycle = replace(cycle, one_launch_cuda=cycle.one_launch_cluster)
     problem, method = splash(n).lcp("walls", device="cpu"), wl.ProjectedMultigrid(cycle=cycle)
-    found = list[wl.SolveResult]()
+    results = list[wl.SolveResult]()
 
     def make() -> Callable[[], object]:
         workspace = method.init(problem)
-        return lambda: found.append(
+        return lambda: results.append(
             wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace)
         )
 
     work = heard(make)
-    assert found[-1], found[-1].status
-    return work, found[-1].iterations
+    assert results[-1], results[-1].status
+    return work, results[-1].iterations
 
 
 def step(n: int, name: str = "dam-break", counter: LaunchCounter | None = None) -> Work:
@@ -547,21 +550,21 @@ def main() -> None:
     )
     told = "without --sass: solves as on GPUs with clusters of blocks (capability 9.0 on)"
     parser.add_argument("--clusters", action="store_true", help=told)
-    given = parser.parse_args()
-    if given.sass and given.steps:
+    options = parser.parse_args()
+    if options.sass and options.steps:
         print("Steps: counted for sm_90; times of a step [us] on an H200, as predicted")
-        print_steps([given.step_cells] if given.step_cells else STEP_SIZES)
+        print_steps([options.step_cells] if options.step_cells else STEP_SIZES)
         return
-    if given.sass:
+    if options.sass:
         print(
-            f"Passes over {given.size}^3 cells, a cell each: counted for sm_90, times as "
+            f"Passes over {options.size}^3 cells, a cell each: counted for sm_90, times as "
             "predicted\n"
         )
         counts = dict[str, gpu_counts.InstructionCount]()
-        for line in gpu_counts.table(counted(counts), given.size):
+        for line in gpu_counts.table(counted(counts), options.size):
             print(line, flush=True)
-        if given.solves:
-            n = given.cells
+        if options.solves:
+            n = options.cells
             works = dict[bool, tuple[Work, Work]]()
             for clusters in (True, False):
                 (small, _), (large, iterations) = (solve(m, clusters=clusters) for m in (n // 2, n))
@@ -576,8 +579,8 @@ def main() -> None:
                 "counted."
             )
         return
-    n, cells = given.cells, given.step_cells or given.cells
-    (small, _), (large, iterations) = (solve(m, clusters=given.clusters) for m in (n // 2, n))
+    n, cells = options.cells, options.step_cells or options.cells
+    (small, _), (large, iterations) = (solve(m, clusters=options.clusters) for m in (n // 2, n))
     print(
         f"A cold solve to 1e-6 [ms]: {iterations} iterations, {large.readbacks} readbacks, "
         f"{large.stages} stages of small levels\n"

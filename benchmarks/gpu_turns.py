@@ -225,33 +225,33 @@ class Turns:
             yield f"Left out, for the time was over: {', '.join(self.left_out)}."
 
 
-def shown(found: Answer) -> str:
+def shown(figures: Answer) -> str:
     """Return the text of a piece of work's results, for the page."""
-    if "ms" not in found:
-        return str(found.get("error", ""))
-    if "iterations" not in found:
-        return f"{found['ms']:.3g}"
-    status = "" if found["status"] == "CONVERGED" else f", {found['status']}"
-    return f"{found['ms']:.3g} in {found['iterations']}{status}"
+    if "ms" not in figures:
+        return str(figures.get("error", ""))
+    if "iterations" not in figures:
+        return f"{figures['ms']:.3g}"
+    status = "" if figures["status"] == "CONVERGED" else f", {figures['status']}"
+    return f"{figures['ms']:.3g} in {figures['iterations']}{status}"
 
 
-def run(given: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Time all pieces of work, interleaved; return the exit status."""
-    begun, sizes = time.monotonic(), SMALL if given.rehearse else Sizes()
-    given.out.mkdir(parents=True, exist_ok=True)
-    device = "cpu" if given.rehearse else given.device
+    start_time, sizes = time.monotonic(), SMALL if options.rehearse else Sizes()
+    options.out.mkdir(parents=True, exist_ok=True)
+    device = "cpu" if options.rehearse else options.device
     trees = {"this tree": (ROOT, "1"), "this tree, a cell a thread": (ROOT, "0")}
-    if given.base is not None:
-        trees["other tree"] = given.base.resolve(), "1"
+    if options.base is not None:
+        trees["other tree"] = options.base.resolve(), "1"
     workers = {
-        name: TreeWorker(tree, quads, rehearse=given.rehearse, device=device)
+        name: TreeWorker(tree, quads, rehearse=options.rehearse, device=device)
         for name, (tree, quads) in trees.items()
     }
-    turns = Turns(given.out, list(workers))
+    turns = Turns(options.out, list(workers))
     try:
-        wanted = [piece for piece in pieces(sizes) if given.only in f"{piece[0]}: {piece[1]}"]
+        wanted = [piece for piece in pieces(sizes) if options.only in f"{piece[0]}: {piece[1]}"]
         for turn, piece in enumerate(wanted):
-            if time.monotonic() - begun > given.seconds:
+            if time.monotonic() - start_time > options.seconds:
                 turns.left_out.append(" ".join(map(str, piece)))
                 continue
             order = list(workers)
@@ -262,16 +262,18 @@ def run(given: argparse.Namespace) -> int:
         for one in workers.values():
             one.end()
     turns.write()
-    print(f"{given.out}/turns.md and turns.json ({time.monotonic() - begun:.0f} s)", flush=True)
-    return verdict(given) if given.verdict else 0
+    print(
+        f"{options.out}/turns.md and turns.json ({time.monotonic() - start_time:.0f} s)", flush=True
+    )
+    return verdict(options) if options.verdict else 0
 
 
-def verdict(given: argparse.Namespace) -> int:
+def verdict(options: argparse.Namespace) -> int:
     """Run `benchmarks.gpu`; return its exit status, 124 after a timeout."""
-    command = [sys.executable, "-m", "benchmarks.gpu", "--out", str(given.out)]
-    command += ["--rehearse"] if given.rehearse else ["--device", given.device]
+    command = [sys.executable, "-m", "benchmarks.gpu", "--out", str(options.out)]
+    command += ["--rehearse"] if options.rehearse else ["--device", options.device]
     try:
-        done = subprocess.run(command, cwd=ROOT, check=False, timeout=given.verdict)
+        done = subprocess.run(command, cwd=ROOT, check=False, timeout=options.verdict)
     except subprocess.TimeoutExpired:
         return 124
     return done.returncode

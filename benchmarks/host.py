@@ -203,18 +203,18 @@ class StepRecorder:
         The last repetition leaves the same memory as the first call.
         """
 
-        def do(team: ThreadPool, asked: Arguments) -> None:
-            if asked.mode != RUN:
-                return plain(team, asked)
+        def do(team: ThreadPool, request: Arguments) -> None:
+            if request.mode != RUN:
+                return plain(team, request)
             before = [
                 (begin, ctypes.string_at(begin, end - begin)) for begin, end in self._memory()
             ]
             assert self._table is not None, "set by `run`"
-            seconds = [self._timed(plain, team, asked)]
+            seconds = [self._timed(plain, team, request)]
             for _ in range(self._replays if not self._table.words[UNFINISHED] else 0):
                 for begin, content in before:
                     ctypes.memmove(begin, content, len(content))
-                seconds.append(self._timed(plain, team, asked))
+                seconds.append(self._timed(plain, team, request))
             self.native[self._timer.current] += min(seconds)
             return None
 
@@ -334,7 +334,7 @@ def _records(
     ]
 
 
-def results(found: dict[str, list[BenchmarkRecord]], *machines: BenchmarkRecord) -> Results:
+def results(by_scene: dict[str, list[BenchmarkRecord]], *machines: BenchmarkRecord) -> Results:
     """Return records, a table and a chart of each scene."""
     remark = (
         f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds. "
@@ -344,15 +344,17 @@ def results(found: dict[str, list[BenchmarkRecord]], *machines: BenchmarkRecord)
         f"Native: the native calls of one step alone, least of {REPLAYS + 1} each. The rest: means "
         "of a step."
     )
-    records = [*machines, *(record for of_scene in found.values() for record in of_scene)]
+    records = [*machines, *(record for of_scene in by_scene.values() for record in of_scene)]
     tables = [
         RecordTable(
             label, ["stage", "host [ms]", "share [%]", "native [ms]", *COUNTS], _rows(own), remark
         )
-        for label, own in found.items()
+        for label, own in by_scene.items()
     ]
     bars = {
-        own.name: own.figures["host"].value for of_scene in found.values() for own in of_scene[1:]
+        own.name: own.figures["host"].value
+        for of_scene in by_scene.values()
+        for own in of_scene[1:]
     }
     return Results(records, tables, [Bars("stages", "Host time of a step by stage", "ms", bars)])
 

@@ -165,7 +165,7 @@ def _measure_form(n: int, form: str, options: Options) -> list[BenchmarkRecord]:
             },
             PEER_ROUNDS * options.repeat,
         )
-        own = [8 * a.size / t for t in apart["copy"]]
+        own_copy = [8 * a.size / t for t in apart["copy"]]
     copying = [
         8 * a.size / median(taken)
         for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)
@@ -174,7 +174,7 @@ def _measure_form(n: int, form: str, options: Options) -> list[BenchmarkRecord]:
     for key, one in passes.items():
         role = "set-up" if key.startswith(SET_UP) else "serial" if key.startswith(SERIAL) else "hot"
         with_peers = one is product and bool(peers)
-        taken, copied = (apart["product"], own) if with_peers else (times[key], copying)
+        taken, copied = (apart["product"], own_copy) if with_peers else (times[key], copying)
         figures = _figures(taken, n, one.bytes / n**3, copied)
         if with_peers:
             figures |= {f"over {peer}": ratios(apart[peer], apart["product"]) for peer in peers}
@@ -188,7 +188,7 @@ def _measure_form(n: int, form: str, options: Options) -> list[BenchmarkRecord]:
             BenchmarkRecord(f"{n}^3 {form}: {PRODUCT if one is product else key}", figures, facts)
         )
     for peer in peers:
-        figures = _figures(apart[peer], n, 8 if "constant" in peer else 9, own)
+        figures = _figures(apart[peer], n, 8 if "constant" in peer else 9, own_copy)
         records.append(
             BenchmarkRecord(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"})
         )
@@ -237,10 +237,10 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         *structs: DataclassInstance,
         stencil: PaddedStencil | None = None,
         bounds: BoundOperands | None = None,
-        **given: object,
+        **kernel_args: object,
     ) -> BoundKernel:
-        bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)
-        taken = {name: bound.given[name] for name in declared.arrays}
+        bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **kernel_args)
+        taken = {name: bound.kernel_args[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
             fields |= {"d": stencil.d} | {
@@ -336,13 +336,13 @@ def _table(n: int, records: list[BenchmarkRecord]) -> RecordTable:
     ]
     rows = []
     for r in records:
-        of = r.figures.get("of_copy")
+        of_copy = r.figures.get("of_copy")
         share = (
             ["", ""]
-            if of is None
+            if of_copy is None
             else [
-                f"{100 * of.value:.0f}",
-                f"{100 * (of.low or 0):.0f} to {100 * (of.high or 0):.0f}",
+                f"{100 * of_copy.value:.0f}",
+                f"{100 * (of_copy.low or 0):.0f} to {100 * (of_copy.high or 0):.0f}",
             ]
         )
         numbers = [

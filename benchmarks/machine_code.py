@@ -59,7 +59,7 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
     ptxas, cuobjdump, nvdisasm = (tool(name) for name in ("ptxas", "cuobjdump", "nvdisasm"))
     assert ptxas and cuobjdump and nvdisasm, tools_missing()
     text = ptx.rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas rejects
-    made = subprocess.run(
+    process = subprocess.run(
         [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", cubin],
         input=text,
         capture_output=True,
@@ -83,7 +83,7 @@ def assemble(ptx: str, cubin: Path, arch: str = "sm_90") -> list[Kernel]:
         elif name and (found := LINE.match(line)):
             codes[name][int(found[1], 16)] = parsed(found[2])
     kernels = []
-    for part in re.split(r"Compiling entry function '", made.stderr)[1:]:
+    for part in re.split(r"Compiling entry function '", process.stderr)[1:]:
         name = part.partition("'")[0]
         registers, spilled = (
             re.search(r"Used (\d+) registers", part),

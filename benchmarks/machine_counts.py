@@ -74,26 +74,26 @@ def issued(
         for at, turn, address, size, is_load in lane.accesses:
             groups[at, turn, is_load].append((address, size))
     of = lambda names: sum(n for at, n in most.items() if code[at].name in names)  # noqa: E731
-    found = Issued(sum(most.values()), waits=waits)
-    found.float64, found.atomics, found.local = of(FLOAT64), of(ATOMIC), of(LOCAL)
+    counts = Issued(sum(most.values()), waits=waits)
+    counts.float64, counts.atomics, counts.local = of(FLOAT64), of(ATOMIC), of(LOCAL)
     reached: dict[bool, set[int]] = {True: set(), False: set()}
     for (_, _, is_load), accesses in groups.items():
         reached[is_load] |= {address for address, _ in accesses}
         lines = {
             byte // 128 for address, size in accesses for byte in (address, address + size - 1)
         }
-        found.loads += is_load
-        found.stores += not is_load
-        found.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
-    found.read, found.written = frozenset(reached[True]), frozenset(reached[False])
-    return found
+        counts.loads += is_load
+        counts.stores += not is_load
+        counts.wavefronts += max(len(lines), -(-sum(size for _, size in accesses) // 128))
+    counts.read, counts.written = frozenset(reached[True]), frozenset(reached[False])
+    return counts
 
 
-def mean_of(found: Sequence[Issued]) -> Issued:
+def mean_of(issues: Sequence[Issued]) -> Issued:
     """Return the mean of what some warps issue, rounded, with all addresses that they reach."""
 
     def mean(of: Callable[[Issued], int]) -> int:
-        return round(sum(of(one) for one in found) / len(found))
+        return round(sum(of(one) for one in issues) / len(issues))
 
     return Issued(
         mean(lambda one: one.instructions),
@@ -104,6 +104,6 @@ def mean_of(found: Sequence[Issued]) -> Issued:
         mean(lambda one: one.atomics),
         mean(lambda one: one.local),
         mean(lambda one: one.waits),
-        frozenset[int]().union(*(one.read for one in found)),
-        frozenset[int]().union(*(one.written for one in found)),
+        frozenset[int]().union(*(one.read for one in issues)),
+        frozenset[int]().union(*(one.written for one in issues)),
     )

@@ -386,18 +386,18 @@ class Lane:
         self._put(o[0], self._int(o[1] if self._predicate(o[3]) else o[2]))
 
     def _do_fsel(self, m: set[str], o: list[str], i: Instruction) -> None:
-        chosen = o[1] if self._predicate(o[3]) else o[2]
+        operand = o[1] if self._predicate(o[3]) else o[2]
         # Upper halves of infinite doubles are printed like this.
         halves = {"+QNAN": 0x7FF00000, "-QNAN": 0xFFF00000, "QNAN": 0x7FF00000}
-        negative, _, absolute, _, plain = operand_of(chosen)
-        if chosen in halves:
-            bits = halves[chosen]
+        negative, _, absolute, _, plain = operand_of(operand)
+        if operand in halves:
+            bits = halves[operand]
         elif plain.startswith("R"):
             bits = self._register(plain) & (0x7FFFFFFF if absolute else LOW) ^ (
                 0x80000000 if negative else 0
             )
         else:
-            bits = _bits(self._real(chosen))
+            bits = _bits(self._real(operand))
         self._put(o[0], bits)
 
     def _do_prmt(self, m: set[str], o: list[str], i: Instruction) -> None:
@@ -639,14 +639,14 @@ class Lane:
             self._put(o[0], _long_bits(found) >> 32)
             return
         value = np.float64(self._real(o[1]))
-        of: dict[str, Callable[[np.float64], np.float64]] = {
+        functions: dict[str, Callable[[np.float64], np.float64]] = {
             "RCP": lambda v: 1 / v,
             "RSQ": lambda v: 1 / np.sqrt(v),
             "SQRT": np.sqrt,
             "EX2": np.exp2,
             "LG2": np.log2,
         }
-        self._put(o[0], _bits(of[i.modifiers[0]](value)))
+        self._put(o[0], _bits(functions[i.modifiers[0]](value)))
 
     def _do_f2f(self, m: set[str], o: list[str], i: Instruction) -> None:
         if i.modifiers[-2:] == ("F32", "F64"):

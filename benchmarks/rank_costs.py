@@ -124,7 +124,7 @@ def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
         if owner.ranks.size > 1
         else None
     )
-    return 0 if forest is None else len(forest.made.getGraph()[2])
+    return 0 if forest is None else len(forest.petsc_forest.getGraph()[2])
 
 
 def _item(field: wp.array | np.ndarray) -> int:

@@ -305,8 +305,8 @@ def on_ranks(
     ranks.agree("sizes", tuple(sizes))
     ranks.agree("repeat", repeat)
     devices()  # starts Warp without its native messages
-    here = device_of_rank(ranks, device)
-    for case in shared_cases(min(sizes), ranks, here):
+    own_device = device_of_rank(ranks, device)
+    for case in shared_cases(min(sizes), ranks, own_device):
         case.sample(keep=False)  # loads the kernels
     records, cases, threads = (
         list[BenchmarkRecord](),
@@ -314,7 +314,7 @@ def on_ranks(
         wl.get_threads(),
     )
     for n in sizes:
-        if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, here)):
+        if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, own_device)):
             say(f"rank {ranks.rank}: {n}^3 does not fit into memory")
             records.append(
                 BenchmarkRecord(
@@ -324,21 +324,21 @@ def on_ranks(
             continue
         forget_peak()
         before = resident_bytes()  # includes the arrays of smaller grids
-        shared = shared_cases(n, ranks, here)
+        shared = shared_cases(n, ranks, own_device)
         shared[WALLS].memory(before)
         for case in shared:
             case.sample(keep=False)
             case.counts |= {name: shared[WALLS].counts[name] for name in MEMORY}
-        scene = splash(n) if ranks.is_root and _fits(n**3, here) else None
+        scene = splash(n) if ranks.is_root and _fits(n**3, own_device) else None
         alone = [
-            None if scene is None else Growing(scene, bounds, here)
+            None if scene is None else Growing(scene, bounds, own_device)
             for bounds in BOUNDS
             for _ in range(2)
         ]
         cases += zip(
             shared,
             alone[::2],
-            alone[1::2] if here == "cpu" and ranks.size > 1 else [None] * len(shared),
+            alone[1::2] if own_device == "cpu" and ranks.size > 1 else [None] * len(shared),
             strict=True,
         )
     if not cases:
@@ -385,17 +385,17 @@ def _ratio(a: BenchmarkRecord | None, b: BenchmarkRecord | None, figure: str) ->
     return None if first is None or not second else Figure(first / second)
 
 
-def targets(found: Found, sizes: Sequence[int]) -> RecordTable:
+def targets(records: Found, sizes: Sequence[int]) -> RecordTable:
     """Return the targets at the sizes from 128^3 on."""
     rows = []
     for n in (size for size in sizes if size >= 128):
         counts = [
             v
             for count in RANKS
-            if (n, "walls", count) in found
-            and (v := found[n, "walls", count].value(f"iterations_{TOLD}"))
+            if (n, "walls", count) in records
+            and (v := records[n, "walls", count].value(f"iterations_{TOLD}"))
         ]
-        one, two = found.get((n, "walls", 1)), found.get((n, "walls", 2))
+        one, two = records.get((n, "walls", 1)), records.get((n, "walls", 2))
         spread_ = Figure(max(counts) - min(counts)) if len(counts) == len(RANKS) else None
         single = one.figures.get(f"{TOLD}_over_single") if one else None
         team = two.figures.get(f"{TOLD}_over_team") if two else None
@@ -426,7 +426,7 @@ def targets(found: Found, sizes: Sequence[int]) -> RecordTable:
     return table_of_targets("figure", rows)
 
 
-def _table(found: Found) -> RecordTable:
+def _table(records: Found) -> RecordTable:
     columns = [
         "cells",
         "problem",
@@ -448,9 +448,9 @@ def _table(found: Found) -> RecordTable:
     ]
     rows = []
     for (n, bounds, count), r in sorted(
-        found.items(), key=lambda item: (item[0][0], BOUNDS.index(item[0][1]), item[0][2])
+        records.items(), key=lambda item: (item[0][0], BOUNDS.index(item[0][1]), item[0][2])
     ):
-        gain = _ratio(found.get((n, bounds, 1)), r, TOLD)
+        gain = _ratio(records.get((n, bounds, 1)), r, TOLD)
         row = [
             f"{n}^3",
             bounds,
@@ -492,14 +492,15 @@ def _failures(records: Sequence[BenchmarkRecord]) -> list[str]:
     return lines
 
 
-def _chart(found: Found, sizes: Sequence[int]) -> RecordLines:
+def _chart(records: Found, sizes: Sequence[int]) -> RecordLines:
     """Return the chart of the speedup by ranks."""
     gains: dict[str, tuple[list[float], list[float]]] = {
         "as many times as ranks": (list(RANKS), list(RANKS))
     }
     for n in sizes:
         strong = [
-            (r, _ratio(found.get((n, "walls", 1)), found.get((n, "walls", r)), TOLD)) for r in RANKS
+            (r, _ratio(records.get((n, "walls", 1)), records.get((n, "walls", r)), TOLD))
+            for r in RANKS
         ]
         gains[f"{n}^3"] = [r for r, f in strong if f], [f.value for _, f in strong if f]
     title = f"One grid on more ranks: walls, to 1e-6, {os.cpu_count()} cores"

@@ -187,11 +187,11 @@ def floor(scene: Splash, bounds: str, precision: str, device: str) -> BenchmarkR
     return BenchmarkRecord(f"floor {scene.n}^3 {bounds} {precision}", figures, facts)
 
 
-def fitting(asked: Sequence[int], device: str) -> tuple[list[int], dict[int, str]]:
+def fitting(requested: Sequence[int], device: str) -> tuple[list[int], dict[int, str]]:
     """Return the sizes that fit into free memory, and why the others do not."""
     on_device, on_host = free_memory(device), free_memory("cpu")
     sizes, left_out = list[int](), dict[int, str]()
-    for n in asked:
+    for n in requested:
         solve, scene = SOLVE_BYTES * n**3, SCENE_BYTES * n**3
         needs = (
             {device: (solve, on_device), "cpu": (scene, on_host)}
@@ -337,13 +337,13 @@ def _failures(floors: Sequence[BenchmarkRecord]) -> list[str]:
     """Return failures of mixed precision, and solves with a wrong reported residual."""
     lines = []
     for r in floors:
-        own, reported = r.figures["floor"].value, r.figures["told"].value
-        if r.facts["precision"] == "mixed" and own > REACHED:
-            lines.append(f"{r.name}: ends at {own:.2e}")
+        own_floor, reported = r.figures["floor"].value, r.figures["told"].value
+        if r.facts["precision"] == "mixed" and own_floor > REACHED:
+            lines.append(f"{r.name}: ends at {own_floor:.2e}")
         # At the floor x has few significant digits: rounding errors of two orders of summation
         # differ by a share of the floor itself.
-        if not math.isclose(own, reported, rel_tol=0.5):
-            lines.append(f"{r.name}: the solve tells {reported:.2e}, x has {own:.2e}")
+        if not math.isclose(own_floor, reported, rel_tol=0.5):
+            lines.append(f"{r.name}: the solve tells {reported:.2e}, x has {own_floor:.2e}")
     return lines
 
 
@@ -355,14 +355,14 @@ def _charts(
     """Return the charts of seconds to 1e-6 over the unknowns, and of the floors."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
     for g in growth:
-        here = [
+        own_records = [
             r for r in records if r.facts["bounds"] == g.facts["bounds"] and "to_1e-06" in r.figures
         ]
         fitted = g.value("exponent_to_1e-06")
         label = g.facts["bounds"] + ("" if fitted is None else f", exponent {fitted:.2f}")
         curves[label] = (
-            [r.value("unknowns") or 0.0 for r in here],
-            [r.value("to_1e-06") or 0.0 for r in here],
+            [r.value("unknowns") or 0.0 for r in own_records],
+            [r.value("to_1e-06") or 0.0 for r in own_records],
         )
     ends: dict[str, tuple[list[float], list[float]]] = {}
     for r in floors:

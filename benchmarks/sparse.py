@@ -106,21 +106,21 @@ def _contest(kind: str, n: int, seed: int, options: Options) -> BenchmarkRecord:
     solvers = pyamg_solvers(problem)
     first = {name: solve() for name, solve in solvers.items()}
     best = min(first, key=lambda name: first[name])
-    mine, theirs = [], []
+    own_seconds, peer_seconds = [], []
     for _ in range(options.repeat):
         seconds, result = ours(problem, options.device)
-        mine.append(seconds)
-        theirs.append(solvers[best]())
-    held = float(np.mean(result.x.numpy() <= problem.lower))
+        own_seconds.append(seconds)
+        peer_seconds.append(solvers[best]())
+    at_bound = float(np.mean(result.x.numpy() <= problem.lower))
     figures = {
-        "ours": Figure.of(mine, "s"),
-        "pyamg": Figure.of(theirs, "s"),
-        "ratio": ratios(mine, theirs),
+        "ours": Figure.of(own_seconds, "s"),
+        "pyamg": Figure.of(peer_seconds, "s"),
+        "ratio": ratios(own_seconds, peer_seconds),
     }
     figures |= {
         "iterations": Figure(result.iterations),
         "linear_iterations": Figure(result.linear_iterations),
-        "held": Figure(held),
+        "held": Figure(at_bound),
     }
     facts = {
         "kind": kind,

@@ -318,18 +318,20 @@ def compare_drawn(count: int) -> None:
     """Print residuals of each evaluation at solutions of random problems."""
     rows = []
     for rtol in (1e-6, 1e-8, 1e-10):
-        found: dict[str, list[float]] = {way: [] for way in WAYS}
+        residuals_of: dict[str, list[float]] = {way: [] for way in WAYS}
         for seed in range(count):
             problem = drawn_problem(seed)
             stopping = wl.StoppingCriteria(rtol=rtol)
             result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=stopping)
             assert result, f"seed {seed}: {result.status}"
             unit = result.history[0].residual
-            for way, residuals in found.items():
+            for way, residuals in residuals_of.items():
                 r = evaluated(problem, way, result.x.numpy())
                 residuals.append(float(np.linalg.norm(r.ravel()) / unit))
-        reached = [sum(r <= rtol for r in residuals) for residuals in found.values()]
-        rows.append([f"{rtol:.0e}", *reached, *(max(residuals) for residuals in found.values())])
+        reached = [sum(r <= rtol for r in residuals) for residuals in residuals_of.values()]
+        rows.append(
+            [f"{rtol:.0e}", *reached, *(max(residuals) for residuals in residuals_of.values())]
+        )
     columns = ["rtol", *(f"{way}: reach it" for way in WAYS), *(f"{way}: most" for way in WAYS)]
     table(f"{count} drawn problems, solved with residuals in float64", columns, rows)
 

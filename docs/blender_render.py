@@ -85,27 +85,29 @@ def studio(scene: Any, size: float) -> None:
     scene.collection.objects.link(key)
 
 
-def camera(scene: Any, asked: argparse.Namespace) -> None:
+def camera(scene: Any, options: argparse.Namespace) -> None:
     """Look from one point at another."""
     made = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    made.location = z_up(asked.position)
-    made.rotation_euler = (z_up(asked.look_at) - made.location).to_track_quat("-Z", "Y").to_euler()
-    made.data.angle = math.radians(asked.field_of_view)
+    made.location = z_up(options.position)
+    made.rotation_euler = (
+        (z_up(options.look_at) - made.location).to_track_quat("-Z", "Y").to_euler()
+    )
+    made.data.angle = math.radians(options.field_of_view)
     scene.collection.objects.link(made)
     scene.camera = made
 
 
-def settings(scene: Any, asked: argparse.Namespace) -> None:
+def settings(scene: Any, options: argparse.Namespace) -> None:
     """Choose Cycles, its denoiser, AgX and motion blur."""
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.denoiser = (
-        asked.samples,
+        options.samples,
         True,
         "OPENIMAGEDENOISE",
     )
     scene.cycles.max_bounces = scene.cycles.transmission_bounces = GLASS_BOUNCES
     scene.cycles.sample_clamp_indirect = 10.0
-    scene.render.resolution_x, scene.render.resolution_y = asked.size
+    scene.render.resolution_x, scene.render.resolution_y = options.size
     scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 0.25
     scene.view_settings.view_transform, scene.view_settings.look = (
         "AgX",
@@ -127,11 +129,11 @@ def main() -> None:
     parser.add_argument("--field-of-view", type=float, default=36.0, help="horizontal [degrees]")
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--size", type=int, nargs=2, default=(960, 540))
-    asked = parser.parse_args()
+    options = parser.parse_args()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    bpy.ops.wm.usd_import(filepath=str(asked.usd.resolve()))
-    scene.frame_set(asked.frame)
+    bpy.ops.wm.usd_import(filepath=str(options.usd.resolve()))
+    scene.frame_set(options.frame)
     for number, item in enumerate(item for item in scene.objects if item.type == "MESH"):
         item.data.materials.clear()
         color = BODIES[number % len(BODIES)]
@@ -139,9 +141,9 @@ def main() -> None:
             water() if item.name.startswith("surface") else matte(item.name, color)
         )
     studio(scene, max(max(item.dimensions) for item in scene.objects))
-    camera(scene, asked)
-    settings(scene, asked)
-    scene.render.filepath = str(asked.picture.resolve())
+    camera(scene, options)
+    settings(scene, options)
+    scene.render.filepath = str(options.picture.resolve())
     bpy.ops.render.render(write_still=True)
 
 

@@ -91,13 +91,13 @@ class CarriedLiquid:
             body = np.where(number < len(self._body), self._body[known], -1)
             at = np.argwhere(body >= 0)
             step = np.eye(3, dtype=int)[2 - axis]
-            under, here, over = (tuple((at + low + n * step).T) for n in (-1, 0, 1))
+            under, face, over = (tuple((at + low + n * step).T) for n in (-1, 0, 1))
             u, wet = velocity[axis].numpy(), kind.numpy() == FLUID
-            below = np.where(wet[under], barriers.below[axis].numpy()[here], 0.0)
-            above = np.where(wet[here], barriers.above[axis].numpy()[here], 0.0)
+            below = np.where(wet[under], barriers.below[axis].numpy()[face], 0.0)
+            above = np.where(wet[face], barriers.above[axis].numpy()[face], 0.0)
             # Velocities of the neighboring faces, since particles may not see this one.
             moved = below * u[under] + above * u[over]
-            place = (np.array(here).T[:, ::-1] + np.array(grid.origin) - 0.5) * grid.spacing
+            place = (np.array(face).T[:, ::-1] + np.array(grid.origin) - 0.5) * grid.spacing
             place[:, axis] -= 0.5 * grid.spacing
             if grid.dimension == 2:
                 place[:, 2] = 0.0

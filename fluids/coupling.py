@@ -100,7 +100,7 @@ class BodyCoupling:
         `take` updates it in place.
         """
         self._low = wl.LowRankOperator.of_blocks(A, self.columns, self._weights())
-        self._gathering.at_once = self.columns.across is not None
+        self._gathering.at_once = self.columns.comm is not None
         return wl.SumOperator(A, self._low)
 
     def take(self, kind: wp.array) -> None:

@@ -79,7 +79,11 @@ class WallSums:
         self._reserve(0)
 
     def take(
-        self, kernel: wp.Kernel, window: Window, references: np.ndarray, given: Sequence[object]
+        self,
+        kernel: wp.Kernel,
+        window: Window,
+        references: np.ndarray,
+        kernel_args: Sequence[object],
     ) -> np.ndarray:
         """Return the sums of a kernel's entries, shape (solids, 6).
 
@@ -90,31 +94,31 @@ class WallSums:
             kernel: the kernel that finds the entries.
             window: cells that the kernel visits.
             references: a point of each solid [m], shape (solids, 3).
-            given: further arguments.
+            kernel_args: further arguments.
         """
         self._about.assign(references)
-        self._counting.run(kernel, window, list(given), variant=window.near is None)
+        self._counting.run(kernel, window, list(kernel_args), variant=window.near is None)
         total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
         if total == 0:
             return np.zeros((self.solids, 6))
         if total > len(self._owners):
             self._reserve(round(SPARE * total))
-        self._writing.run(kernel, window, list(given), variant=window.near is None)
+        self._writing.run(kernel, window, list(kernel_args), variant=window.near is None)
         owners, values = self._owners.numpy()[:total], self._values.numpy()[:total]
         return np.stack(
             [np.bincount(owners, weights=column, minlength=self.solids) for column in values.T],
             axis=-1,
         )
 
-    def _count(self, kernel: wp.Kernel, window: Window, given: list[object]) -> None:
+    def _count(self, kernel: wp.Kernel, window: Window, kernel_args: list[object]) -> None:
         """Launch a kernel that counts entries, and compute the offsets of the rows."""
         clear(self._counts)
         window.launch_rows(
-            kernel, [self.walls, self._about, self._counts, None, None, None, *given]
+            kernel, [self.walls, self._about, self._counts, None, None, None, *kernel_args]
         )
         scan(self._counts, self._offsets, inclusive=False)
 
-    def _write(self, kernel: wp.Kernel, window: Window, given: list[object]) -> None:
+    def _write(self, kernel: wp.Kernel, window: Window, kernel_args: list[object]) -> None:
         """Launch a kernel that writes its entries."""
         window.launch_rows(
             kernel,
@@ -125,7 +129,7 @@ class WallSums:
                 self._offsets,
                 self._owners,
                 self._values,
-                *given,
+                *kernel_args,
             ],
         )
 

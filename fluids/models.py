@@ -156,7 +156,7 @@ def make_pressure(
         gravity=gravity,
         coupling=coupling,
         phi=surface.phi,
-        lets_go=scene.lets_go,
+        walls_separate=scene.walls_separate,
         weights=weights if scene.short_steps else None,
     )
 

@@ -206,7 +206,8 @@ class PressureProjection:
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID
             cells; None if it lies on the cells' faces.
         coupling: coupling with rigid bodies, whose term is added to A; None without bodies.
-        lets_go: whether a wall is separating; else y = 0 on all cells, and no bounds are stored.
+        walls_separate: whether a wall is separating; else y = 0 on all cells, and no bounds are
+            stored.
         weights: particle weights on the faces of each component; None without support of spray by
             the surface.
         gravity: magnitude of gravity [m/s^2], the limit of that support.
@@ -236,7 +237,7 @@ class PressureProjection:
         max_iterations: int,
         phi: wp.array | None = None,
         coupling: BodyCoupling | None = None,
-        lets_go: bool = True,
+        walls_separate: bool = True,
         weights: Sequence[wp.array] | None = None,
         gravity: float = 0.0,
     ) -> None:
@@ -252,7 +253,7 @@ class PressureProjection:
         self.jump: wp.array | None = None
         self.adhesion = 0.0
         self._passes = pressure_passes(
-            bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go
+            bool(boundary.open), bool(boundary.velocity), phi is not None, walls_separate
         )
         self.kind, self.cells, self.contact = (
             grid.field(wp.int8),
@@ -265,7 +266,9 @@ class PressureProjection:
         self._unknown = self.kind  # FLUID at unknowns
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = (
-            wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
+            wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device)
+            if walls_separate
+            else None
         )
         self._least: wp.array | float = -np.inf if self._lower is None else self._lower
         part = grid.part
@@ -280,7 +283,7 @@ class PressureProjection:
         self._cells.move_to(part.owned)
         self._rhs, self._guess = part.box_like(self._b), part.box_like(self._start).flatten()
         self.automatic = (
-            TimeErrorTolerance(self._rhs.size, grid.device, part.across)
+            TimeErrorTolerance(self._rhs.size, grid.device, part.comm)
             if tolerance == "auto"
             else None
         )

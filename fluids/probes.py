@@ -199,13 +199,17 @@ class Probes:
         )
         row: Row = {}
         for probe, values in zip(self.probes, found, strict=True):
-            shown = {
+            shown_values = {
                 "pressure": values[:1] * scale,
                 "velocity": values[1:4],
                 "level": values[4:5] * simulation.grid.spacing,
             }
             row |= dict(
-                zip(probe.columns(self.dimension), shown[probe.quantity].tolist(), strict=False)
+                zip(
+                    probe.columns(self.dimension),
+                    shown_values[probe.quantity].tolist(),
+                    strict=False,
+                )
             )
         return row
 
@@ -248,7 +252,7 @@ class Probes:
             meets[:, None], np.stack([begin, np.maximum(end, begin + STEP)], axis=1), 0.0
         )
 
-    def _joined(self, mine: np.ndarray, reach: np.ndarray, grid: StaggeredGrid) -> np.ndarray:
+    def _joined(self, own_rows: np.ndarray, reach: np.ndarray, grid: StaggeredGrid) -> np.ndarray:
         """Return the values of all probes, combined from all ranks.
 
         The rank whose box has the point gives pressure and velocity. The ranks along the search
@@ -256,8 +260,8 @@ class Probes:
         """
         cells = np.floor(grid.to_grid(self._points)).astype(np.int64) - 1
         owner = grid.part.owners(np.clip(cells, 0, np.array(grid.domain_counts) - 1))
-        everyone = grid.part.ranks.gather(np.concatenate([mine, reach], axis=1))
-        combined = np.asarray(everyone[owner, np.arange(len(owner)), : mine.shape[1]])
+        everyone = grid.part.ranks.gather(np.concatenate([own_rows, reach], axis=1))
+        combined = np.asarray(everyone[owner, np.arange(len(owner)), : own_rows.shape[1]])
         for probe, values in enumerate(combined):
             ways = [rank for rank in everyone[:, probe] if rank[-1] > rank[-2]]
             for rank in sorted(ways, key=lambda rank: float(rank[-2])):

@@ -198,17 +198,17 @@ class LiquidScene(ParticleScene):
             "liquid": self.liquid,
             "source": self.source,
         }
-        own = [
+        own_settings = [
             (key, n, shape.viscosity)
             for key, shapes in tables.items()
             for n, shape in enumerate(shapes)
         ]
-        own = [given for given in own if given[-1] is not None]
+        own_settings = [given for given in own_settings if given[-1] is not None]
         if self.viscosity is not None:
             message = "cannot be combined with liquids of different viscosities"
             return (
                 [Complaint(("particles", "narrow_band"), None, message)]
-                if own and self.particles.narrow_band is not None
+                if own_settings and self.particles.narrow_band is not None
                 else []
             )
         message = 'needs the table [viscosity]; without viscosity use "free-slip"'
@@ -224,7 +224,7 @@ class LiquidScene(ParticleScene):
         ]
         complaints += [
             Complaint((key, n, "viscosity"), value, "needs the table [viscosity]")
-            for key, n, value in own
+            for key, n, value in own_settings
         ]
         return complaints + [
             Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
@@ -247,7 +247,7 @@ class LiquidScene(ParticleScene):
     def slip_lengths(self) -> list[float]:
         """Return the slip lengths of the domain's wall and of each solid [m]."""
         assert self.viscosity is not None
-        own = [
+        slip_walls = [
             (self.domain.wall, None),
             *((solid.wall or self.domain.wall, solid.slip_length) for solid in self.solid),
         ]
@@ -255,7 +255,7 @@ class LiquidScene(ParticleScene):
             math.inf
             if wall == "free-slip"
             else (self.viscosity.slip_length if slip is None else slip)
-            for wall, slip in own
+            for wall, slip in slip_walls
         ]
 
     def models(self) -> list[Model]:
@@ -265,7 +265,7 @@ class LiquidScene(ParticleScene):
         models = []
         if self.pressure.model == "unilateral":
             models.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
-        elif self.lets_go:
+        elif self.walls_separate:
             models.append(
                 Model(
                     "separating walls",
@@ -383,7 +383,7 @@ class LiquidScene(ParticleScene):
         return False
 
     @property
-    def lets_go(self) -> bool:
+    def walls_separate(self) -> bool:
         """Return whether a wall of the scene is separating."""
         walls = self.domain.wall == "separating" and len(self.domain.open) < 2 * self.dimension
         return walls or any(
@@ -407,7 +407,7 @@ class LiquidScene(ParticleScene):
     def own_memory_parts(self) -> dict[str, int]:
         """Return the peak memory of pressure and surface on the device [bytes]."""
         cells, level_set = self.counted_cells, self.pressure.surface == "ghost-fluid"
-        bounded = self.lets_go or self.pressure.model == "unilateral"
+        bounded = self.walls_separate or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
             "pressure": cells

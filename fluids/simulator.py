@@ -211,7 +211,7 @@ class LiquidSimulation(ParticleSimulation):
         self.particles_to_grid(window)
         speed = self.top_speed(before)
         self._find_surface(window)
-        own = self._act(window, dt)
+        model_row = self._act(window, dt)
         if self.grid.device.is_cuda and self.surface.density is not None:
             # Counted here, to be read back together with the solve.
             self.monitor_density(window, self.surface.density)
@@ -246,7 +246,7 @@ class LiquidSimulation(ParticleSimulation):
             | self.solve_row(projected.result)
             | viscous
             | walls
-            | own
+            | model_row
         )
         if self.scene.output.diagnostics:
             row |= {
@@ -329,7 +329,7 @@ class LiquidSimulation(ParticleSimulation):
         work of moving walls on the liquid [J; J/m in 2-D]. With wall drag: drag_work, the energy
         that it takes from the liquid in the step [J; J/m in 2-D].
         """
-        own = tuple(name for model in self.models for name in model.columns)
+        model_columns = tuple(name for model in self.models for name in model.columns)
         drags = ("drag_work",) if self.scene.drags is not None else ()
         columns = (
             ("active", "max_divergence", "volume", *drags)
@@ -340,7 +340,7 @@ class LiquidSimulation(ParticleSimulation):
             columns = (*columns, "surface_energy")
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
         automatic = () if self.projection.automatic is None else ("tolerance", "time_error")
-        return (*columns, *automatic, *own)
+        return (*columns, *automatic, *model_columns)
 
     def frame(self) -> list[Part]:
         """Return the parts of a frame: particles, liquid cells, surface and volume.

@@ -49,13 +49,13 @@ class TimeErrorTolerance:
     Args:
         size: number of elements of a stored field.
         device: their device.
-        across: communicator; None if serial.
+        comm: communicator; None if serial.
 
     Attributes:
         used: relative residual that was the criterion of the last solve.
     """
 
-    def __init__(self, size: int, device: wp.Device, across: Communicator | None = None) -> None:
+    def __init__(self, size: int, device: wp.Device, comm: Communicator | None = None) -> None:
         self.used = FIRST
         self._error: float | None = None
         # Whether there was a previous step, and whether `_sum` has an error that was not read yet.
@@ -63,7 +63,7 @@ class TimeErrorTolerance:
         self._unknowns = 1
         self._reference = 0.0  # residual of the last step at x = 0, root mean square [m/s]
         self._sum = DeviceScalar(device)
-        self._reduction = Reduction(size, device, self._sum.array, across=across)
+        self._reduction = Reduction(size, device, self._sum.array, comm=comm)
 
     def criteria(self, ratio: float, atol: float) -> dict[str, float]:
         """Return `rtol` and `atol` of a solve; `atol` is a root mean square [m/s].

@@ -175,7 +175,7 @@ class Viscosity:
             max_iterations or (200 if thickest is None else 1000),
         )
         self._viscosity, self._density, self._phi = viscosity, density, phi
-        self._inner, self._across = grid.part.owned, grid.part.across
+        self._inner, self._comm = grid.part.owned, grid.part.comm
         self._passes = viscous_passes(
             grid.dimension,
             bool(boundary.open),
@@ -205,7 +205,7 @@ class Viscosity:
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = BodyDrag(
-                grid, boundary, bodies, density, self._passes, self._inner, self._across
+                grid, boundary, bodies, density, self._passes, self._inner, self._comm
             )
         self._solver = self._krylov()
         self._trail, self._sums = (
@@ -339,7 +339,7 @@ class Viscosity:
             )
 
     def _krylov(self) -> ConjugateGradient:
-        return ConjugateGradient(self._product, self.multigrid, across=self._across)
+        return ConjugateGradient(self._product, self.multigrid, comm=self._comm)
 
     def _boxes(self, window: Window) -> tuple[Window, Window | None]:
         """Return the box where fields may change, and its cells with unknowns.
@@ -540,14 +540,14 @@ class Viscosity:
         assert barriers is not None
         cut = self.boundary.cut
         cells, solids = [kind, contact, self._tau], [self._slips, cut.turn, cut.shift]
-        placed = [wp.vec3i(*grid.origin), grid.planes, grid.spacing]
+        placement = [wp.vec3i(*grid.origin), grid.planes, grid.spacing]
         for axis in range(grid.dimension):
             own, relative = barriers.apart[axis], self.relative[axis] if self.relative else None
             pulls = [self._thin[axis], self._thin_speed[axis], self._thin_owner[axis]]
             for turn, other in enumerate(n for n in range(grid.dimension) if n != axis):
                 number = barriers.number[other]
                 links = [axis, other, own, number, fine.volume[axis], relative, *cells]
-                given = [*links, *solids, *placed, int(turn == 0)]
+                given = [*links, *solids, *placement, int(turn == 0)]
                 self._above.launch(thin.pull_kernel, [*given, *pulls])
         for (a, b), edge in fine.edges.items():
             self._above.launch(thin.part_kernel, [a, b, barriers.apart[a], barriers.apart[b], edge])
@@ -568,13 +568,13 @@ class Viscosity:
         """Velocities of solids on the faces of each component."""
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
-    def _force(self, given: ViscousFields, *, changed: bool) -> list[float]:
+    def _force(self, kernel_args: ViscousFields, *, changed: bool) -> list[float]:
         """Write the residual; return its norm and the energies of the step.
 
         In this order: the norm, the energy lost by the force, the work of walls, the norm of the
         diagonal.
         """
-        self._graphs["_residual"].run(given, changed, variant=changed)
+        self._graphs["_residual"].run(kernel_args, changed, variant=changed)
         totals = np.zeros(4)
         for sums in self._sums:
             sums.changed()
@@ -583,8 +583,8 @@ class Viscosity:
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
             totals[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
-        if self._across is not None:
-            totals = self._across.sum(totals)
+        if self._comm is not None:
+            totals = self._comm.sum(totals)
         return [
             float(np.sqrt(totals[0])),
             float(totals[1]),
@@ -592,12 +592,12 @@ class Viscosity:
             float(np.sqrt(totals[3])),
         ]
 
-    def _residual(self, given: ViscousFields, changed: bool) -> None:
+    def _residual(self, kernel_args: ViscousFields, changed: bool) -> None:
         """Launch the kernels that write the residual and its sums."""
         fine, solids = self._fine, self._solids
         residual, velocity, distance = (
             self.multigrid.components(self.multigrid.r),
-            given.u,
+            kernel_args.u,
             self._distance,
         )
         for axis in range(self.grid.dimension):
@@ -608,8 +608,8 @@ class Viscosity:
                 self._unknowns,
                 fine.rows(axis),
                 self.grid.placement,
-                kind=given.kind,
-                contact=given.contact,
+                kind=kernel_args.kind,
+                contact=kernel_args.contact,
                 base=self.boundary.base,
                 u=velocity[axis],
                 ub=ub,

@@ -209,7 +209,7 @@ class BodyDrag:
         density: density of the liquid [kg/m^3].
         passes: kernels of the viscous solve.
         solved: cells whose faces are unknowns.
-        across: communicator; all methods are then collective. None if serial.
+        comm: communicator; all methods are then collective. None if serial.
 
     Attributes:
         moved: whether the arrays of the columns were reallocated since the last step.
@@ -224,7 +224,7 @@ class BodyDrag:
         density: float,
         passes: ViscousKernels,
         solved: Window,
-        across: Communicator | None,
+        comm: Communicator | None,
     ) -> None:
         self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved
         self._pull = WallPull(grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes)
@@ -232,7 +232,7 @@ class BodyDrag:
         self.columns = BlockColumns(
             grid.dimension * grid.size, len(bodies.bodies), self._width, wp.float64, grid.device
         )
-        self.columns.across = across
+        self.columns.comm = comm
         rank = self.columns.rank
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
@@ -256,8 +256,8 @@ class BodyDrag:
         points = np.array([body.position for body in bodies])
         self._pull.take(window, level, walls, points)
         pulled, drags = self._pull.pulled(velocity, points)
-        if self.columns.across is not None:
-            found = self.columns.across.sum(np.concatenate((pulled[:, None], drags), axis=1))
+        if self.columns.comm is not None:
+            found = self.columns.comm.sum(np.concatenate((pulled[:, None], drags), axis=1))
             pulled, drags = found[:, 0], found[:, 1:]
         self._drag = drags
         count = len(self._pull.rows)

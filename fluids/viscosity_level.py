@@ -116,7 +116,7 @@ class ViscosityLevel:
         b: list[wp.array],
         finer: StaggeredGrid | None = None,
     ) -> None:
-        shared = grid.part.across is not None
+        shared = grid.part.comm is not None
         ox, oy, oz = origin = grid.origin if shared else (0, 0, 0)
         self.odd_row, self.odd_cell, self.shift = (oy + oz) % 2, ox % 2, LevelShift()
         if shared and finer is not None:

@@ -38,7 +38,7 @@ class ViscosityMultigrid:
         self.grid, size, self._shared = (
             grid,
             grid.dimension * grid.size,
-            grid.part.across is not None,
+            grid.part.comm is not None,
         )
         self.r, self.z = (
             zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2)

@@ -38,7 +38,7 @@ from warp_lcp.kernels import Rows
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, copy, launch
 from warp_lcp.kernels.readback import DeviceScalar
-from warp_lcp.kernels.vectors import add_across
+from warp_lcp.kernels.vectors import sum_over_ranks
 
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import SandWalls, Velocity
@@ -112,7 +112,7 @@ class SandBodies:
         # Run indices per entry, in the format of `_owned`.
         self._each = wp.array(np.arange(count)[:, None] + [0, 1], dtype=wp.int32, device=device)
         # 1 if sand is beside a body on some rank; else no force is computed.
-        self._met = wp.zeros(1, dtype=wp.int32, device=device)
+        self._in_contact = wp.zeros(1, dtype=wp.int32, device=device)
         self.faces: BodyFaces | None = None
         self._walls: SandWalls
         self._faces, self._cells, self._edges = Places(), Places(), Places()
@@ -227,8 +227,8 @@ class SandBodies:
         active[0], active[1 : 1 + len(held)] = len(held), held
         self._active.assign(active)
         part = self.grid.part
-        if part.across is not None:
-            self._met.fill_(
+        if part.comm is not None:
+            self._in_contact.fill_(
                 int(part.ranks.any(bool(packing.flags.numpy().ravel()[self._trial.numpy()].any())))
             )
 
@@ -399,16 +399,16 @@ class SandBodies:
 
         On ranks, the sums over all.
         """
-        across, device = self.grid.part.across, self.grid.device
-        if across is None:
+        comm, device = self.grid.part.comm, self.grid.device
+        if comm is None:
             return self._owned, self._partial
         launch(
             add_runs_kernel,
             self._total.shape,
-            [self._owned, self._partial, self._met, self._total],
+            [self._owned, self._partial, self._in_contact, self._total],
             device=device,
         )
-        add_across(across, self._total.flatten(), slice(None), launch, condition=self._met)
+        sum_over_ranks(comm, self._total.flatten(), slice(None), launch, condition=self._in_contact)
         return self._each, self._total
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:

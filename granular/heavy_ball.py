@@ -141,14 +141,14 @@ class HeavyBallProjectedGradient(Settings):
 
         The residual is evaluated when a decision requires it.
         """
-        taken, due, stagnates = work.take_steps()
+        steps_taken, due, stagnates = work.take_steps()
         failure = wl.SolveStatus.STAGNATED if stagnates else None
         return wl.Step(
             "projection",
-            taken,
+            steps_taken,
             failure=failure,
             interim=True,
-            iterations=taken,
+            iterations=steps_taken,
             due=due,
             final=True,
         )
@@ -180,7 +180,7 @@ class MomentumWorkspace(StressWorkspace):
         self._leads = False  # whether the device started the solve and decides on its steps
         # Slot of the decisions with the residual of the current stresses; None if it is unknown.
         self._news: int | None = None
-        self._taken = 0  # steps that the outer loop has counted
+        self._steps_counted = 0  # steps that the outer loop has counted
 
     def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria, steps: int) -> float | None:
         """Begin a solve on the device; return the residual at its start.
@@ -199,7 +199,7 @@ class MomentumWorkspace(StressWorkspace):
         if self._ahead is None or not self._leads:
             return None
         self._ahead.begin(criteria.atol, steps)
-        self._taken = 0
+        self._steps_counted = 0
         reference = self._take(kernels.FIRST)
         self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None
         return reference
@@ -221,13 +221,18 @@ class MomentumWorkspace(StressWorkspace):
         The decisions are: evaluate the residual, and progress has ended.
         """
         if self._ahead is None or not self._leads:
-            taken = self.method.check_every * PERIOD
-            return taken, *self.judge(self.problem.advance(self.method.check_every), taken)
-        if self._ahead.decisions()[kernels.DONE] == self._taken:
+            steps_taken = self.method.check_every * PERIOD
+            return steps_taken, *self.judge(
+                self.problem.advance(self.method.check_every), steps_taken
+            )
+        if self._ahead.decisions()[kernels.DONE] == self._steps_counted:
             self._ahead.resume()
         found = self._ahead.decisions()
-        taken, self._taken = int(found[kernels.DONE]) - self._taken, int(found[kernels.DONE])
-        return taken, bool(found[kernels.DUE]), bool(found[kernels.STAGNATES])
+        steps_taken, self._steps_counted = (
+            int(found[kernels.DONE]) - self._steps_counted,
+            int(found[kernels.DONE]),
+        )
+        return steps_taken, bool(found[kernels.DUE]), bool(found[kernels.STAGNATES])
 
     def start(self, *, warm: bool, tolerance: float) -> bool:
         """Start a sequence of steps; return whether a minimum number is required.
@@ -255,13 +260,13 @@ class MomentumWorkspace(StressWorkspace):
             self._least = 0
         return self._least > 0
 
-    def judge(self, estimate: float, taken: int) -> tuple[bool, bool]:
+    def judge(self, estimate: float, steps_taken: int) -> tuple[bool, bool]:
         """Return two decisions: evaluate the residual, and progress has ended.
 
         Also limits the momentum.
         """
         method, stagnates = self.method, False
-        self._done += taken
+        self._done += steps_taken
         if not estimate < BETTER * self._best:
             late = (
                 self._done - self._best_at >= method.patience and estimate < NEAR_BEST * self._best

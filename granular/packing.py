@@ -148,7 +148,7 @@ class Packing:
         Args:
             layers: layers of a stress field.
         """
-        if self.grid.part.across is not None:
+        if self.grid.part.comm is not None:
             sand = self.flags.numpy() != 0
             self._forest = self.grid.part.forest(layers, REACH, which=sand, into=self._forest)
 

@@ -89,7 +89,7 @@ class ParticlePercentiles:
         self._device, self._place, self._count = device, Scalar(), 0
         self._reading = DeviceScalar(device, AXES, wp.float32)
         self._counts = wp.zeros(AXES * DIGITS, dtype=wp.int32, device=device)
-        self._found = wp.zeros(AXES, dtype=wp.uint32, device=device)
+        self._percentiles = wp.zeros(AXES, dtype=wp.uint32, device=device)
         self._rank = wp.zeros(AXES, dtype=wp.int32, device=device)
         self._selection = LaunchGraph(device, self._launch)
 
@@ -110,11 +110,11 @@ class ParticlePercentiles:
         mask = 0
         for shift in range(32 - BITS, -1, -BITS):
             digits = [wp.uint32(mask), wp.uint32(shift)]
-            inputs = [particles.position, self._found, self._counts, *digits]
+            inputs = [particles.position, self._percentiles, self._counts, *digits]
             launch_list(count_kernel, particles.count, inputs, device=self._device, ordered=True)
             inputs = [
                 self._counts,
-                self._found,
+                self._percentiles,
                 self._rank,
                 self._place,
                 *digits,

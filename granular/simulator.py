@@ -296,7 +296,7 @@ class SandSimulation(ParticleSimulation):
             points.fields[name] = field[k, j, i]
         cells = self._sand_cells()
         at = tuple(cells.T)
-        shown = {name: field[at] for name, field in fields.items()}
+        selected_fields = {name: field[at] for name, field in fields.items()}
         return [
             points,
             Cells(
@@ -304,7 +304,7 @@ class SandSimulation(ParticleSimulation):
                 cells[:, ::-1] - 1 + grid.origin,
                 grid.spacing,
                 grid.dimension,
-                shown,
+                selected_fields,
                 self.image_counts,
                 grid.part.corners,
             ),

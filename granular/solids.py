@@ -257,14 +257,17 @@ class SandSolids:
         """Return a warning for each solid at rest that is too thin for the stresses."""
         # Number of cell centers in each solid.
         covered = self.grid.part.ranks.sum(np.array([*self._covered, 0]))[:-1]
-        held = self.grid.barriers.walls.numbers if self.grid.barriers is not None else ()
+        barrier_numbers = self.grid.barriers.walls.numbers if self.grid.barriers is not None else ()
         return tuple(
             f"{solid.name} contains no center of a cell of {self.grid.spacing:.4g} m: it supports "
             "no sand, and particles may pass through"
             for number, (solid, cells) in enumerate(
                 zip(self._placed, covered.tolist(), strict=True), start=1
             )
-            if self.cut is None and not cells and solid.motion is None and number not in held
+            if self.cut is None
+            and not cells
+            and solid.motion is None
+            and number not in barrier_numbers
         )
 
     def _whole_note(self, cuts: bool) -> str:

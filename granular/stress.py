@@ -40,7 +40,7 @@ from warp_lcp.kernels.launch_graph import (
     launch_now,
 )
 from warp_lcp.kernels.memory import Scalar
-from warp_lcp.kernels.vectors import Reduction, add_across
+from warp_lcp.kernels.vectors import Reduction, sum_over_ranks
 from warp_lcp.settings import renamed_method
 
 WALL_GRAIN = 256  # wall faces per CPU thread
@@ -184,7 +184,7 @@ class Stress(wl.VariationalInequality):
             rate,
             bodies,
         )
-        self.shared, self._across = grid.part.shared, grid.part.across
+        self.shared, self._comm = grid.part.shared, grid.part.comm
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         tractions = 0 if packing.cut is None else grid.dimension
         shape = (1 + normals + 4 * shears + tractions, *grid.shape)
@@ -198,7 +198,7 @@ class Stress(wl.VariationalInequality):
         self.momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
         # Sums over all ranks.
-        self.total = self._sums if self._across is None else wp.zeros_like(self._sums)
+        self.total = self._sums if self._comm is None else wp.zeros_like(self._sums)
         # `cells` for kernels.
         self.counts = (
             wp.zeros(1, dtype=wp.float64, device=grid.device) if self.shared else packing.counts
@@ -400,13 +400,13 @@ class Stress(wl.VariationalInequality):
         period.
         """
         self._add_up_here(launch)
-        if self._across is None:
+        if self._comm is None:
             self._choose_momentum(self.total, launch)
             return
         device, last = self.packing.grid.device, step == PERIOD - 1
         launch(keep_step_kernel, 2 * COLUMNS, [self._sums, self._found, step], device=device)
         if last:
-            add_across(self._across, self._found.flatten(), slice(None), launch)
+            sum_over_ranks(self._comm, self._found.flatten(), slice(None), launch)
             launch(period_kernel, COLUMNS, [self._found, self.total], device=device)
         self._choose_momentum(self.total if last else self._nothing, launch)
 
@@ -462,14 +462,14 @@ class Stress(wl.VariationalInequality):
     def _add_up(self, launch: Launch) -> None:
         """Launch the sums over cells and walls of all ranks."""
         self._add_up_here(launch)
-        if self._across is not None:
+        if self._comm is not None:
             launch(
                 keep_step_kernel,
                 2 * COLUMNS,
                 [self._sums, self.total.reshape((1, -1)), 0],
                 device=self.packing.grid.device,
             )
-            add_across(self._across, self.total, slice(None), launch)
+            sum_over_ranks(self._comm, self.total, slice(None), launch)
 
     def _add_up_here(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)

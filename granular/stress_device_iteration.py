@@ -36,7 +36,7 @@ class StressDeviceIteration:
         self._decisions = DeviceScalar(device, kernels.DECISIONS)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         self._limits = wp.array(method.calm, dtype=wp.float64, device=device)
-        self._given = [Scalar() for _ in range(5)]  # arguments of the kernel from `limit_` on
+        self._scalars = [Scalar() for _ in range(5)]  # arguments of the kernel from `limit_` on
         self._beginning, self._resuming = (
             LaunchGraph(device, record)
             for record in (self._launch_beginning, self._launch_resumption)
@@ -65,7 +65,9 @@ class StressDeviceIteration:
         limit, least, still = math.inf, method.least, 0.0
         if stress.cold:
             limit, least, still = method.swing(stress), method.cold, kernels.STILL_SHARE * tolerance
-        for number, value in zip(self._given, (limit, tolerance, least, still, most), strict=True):
+        for number, value in zip(
+            self._scalars, (limit, tolerance, least, still, most), strict=True
+        ):
             number.value = float(value)
         self._make_loop()
         self._beginning.run()
@@ -119,7 +121,7 @@ class StressDeviceIteration:
             lookahead,
             self._method.momentum,
             MOST_MOMENTUM,
-            *self._given,
+            *self._scalars,
         ]
         launch(kernels.begin_steps_kernel, 1, [*fields, *arguments], device=device)
         s.start_from_now()

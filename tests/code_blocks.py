@@ -43,14 +43,14 @@ def anchors(page: Path) -> set[str]:
 
     And others where headings are plain.
     """
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for heading in re.findall(r"^#+ (.*)$", prose(page), flags=re.M):
         plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "")
         text = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()
         slug = re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", text).strip().lower())
-        found[slug] = found.get(slug, 0) + 1
+        counts[slug] = counts.get(slug, 0) + 1
     return {
         slug if count == 0 else f"{slug}_{count}"
-        for slug, many in found.items()
+        for slug, many in counts.items()
         for count in range(many)
     }

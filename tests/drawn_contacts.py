@@ -28,7 +28,7 @@ def drawn(family, seed, *, friction=None, ratio=None, side=3, **more):
     return assembled(*touch, roots, speeds, mu, **more)
 
 
-def assembled(first, second, normals, arms, others, roots, speeds, mu, **more):
+def assembled(first, second, normals, arms, other_arms, roots, speeds, mu, **more):
     """Return the problem of contacts with these normals and arms.
 
     Arms are from the centers of both bodies, G G' = M^-1, and `speeds` are the velocities before.
@@ -37,7 +37,7 @@ def assembled(first, second, normals, arms, others, roots, speeds, mu, **more):
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
     frames = np.stack([normals, tangents, np.cross(normals, tangents)], axis=1)
     one, other = (
-        np.concatenate([frames, np.cross(a[:, None], frames)], axis=2) for a in (arms, others)
+        np.concatenate([frames, np.cross(a[:, None], frames)], axis=2) for a in (arms, other_arms)
     )
     other = np.where((second < len(speeds))[:, None, None], -other, 0.0)
     roots, speeds = (
@@ -124,7 +124,7 @@ def stack(rng, ratio, height=4):
         [np.tile(corners[:, 0], n), np.full(4 * n, -0.25), np.tile(corners[:, 1], n)]
     )
     shift = rng.uniform(-0.1, 0.1, (n, 3)) * [1, 0, 1]
-    others = arms + [0.0, 0.5, 0.0] + shift[first]
+    other_arms = arms + [0.0, 0.5, 0.0] + shift[first]
     inertia = np.array([0.25 + 1.0, 2.0, 1.0 + 0.25]) / 12
     roots = np.zeros((n, 6, 6))
     roots[:, range(6), range(6)] = (
@@ -132,7 +132,7 @@ def stack(rng, ratio, height=4):
         ** 0.5
     )
     return (
-        (first, second, np.tile([0.0, 1.0, 0.0], (4 * n, 1)), arms, others),
+        (first, second, np.tile([0.0, 1.0, 0.0], (4 * n, 1)), arms, other_arms),
         roots,
         falling(rng, n, 0.1),
     )

@@ -154,9 +154,9 @@ def _sand(rng: random.Random, data: Tables, material: list[Tables], dimension: i
 
 def _solids(rng: random.Random, dimension: int, *, bodies: bool, sand: bool) -> list[Tables]:
     """Return up to one fixed solid, one moving solid and two bodies, separate."""
-    found: list[Tables] = []
+    solids: list[Tables] = []
     if _half(rng):
-        found.append(_ball([0.15, 0.2], 0.1, dimension))
+        solids.append(_ball([0.15, 0.2], 0.1, dimension))
     if _half(rng, 0.6):
         velocity, center = (
             [rng.uniform(-0.5, 0.5), rng.uniform(0.0, 0.3), 0.0][:dimension],
@@ -184,7 +184,7 @@ def _solids(rng: random.Random, dimension: int, *, bodies: bool, sand: bool) -> 
         ]
         low, high = [c - 0.1 for c in center], [c + 0.1 for c in center]
         shape = rng.choice([_ball([0.5, 0.3], 0.12, dimension), _box(low, high)])
-        found.append(shape | {"motion": rng.choice(motions)})
+        solids.append(shape | {"motion": rng.choice(motions)})
     if bodies:
         for x in rng.sample([0.2, 0.85], rng.choice([1, 2])):
             y = rng.choice([0.12, 0.45, 0.68]) if x == 0.85 else 0.68
@@ -197,7 +197,7 @@ def _solids(rng: random.Random, dimension: int, *, bodies: bool, sand: bool) -> 
                 ]
             )
             velocity = [rng.uniform(-1.0, 1.0), 0.0, 0.0][:dimension]
-            found.append(
+            solids.append(
                 shape
                 | {
                     "density": rng.choice([200.0, 900.0, 3000.0]),
@@ -205,12 +205,12 @@ def _solids(rng: random.Random, dimension: int, *, bodies: bool, sand: bool) -> 
                     "velocity": velocity,
                 }
             )
-    for solid in found:
+    for solid in solids:
         if sand and _half(rng, 0.3):
             solid["friction"] = rng.choice([0.2, "stick"])
         elif not sand and _half(rng, 0.3):
             solid["wall"] = rng.choice(["separating", "free-slip"])
-    return found
+    return solids
 
 
 def _source(rng: random.Random, dimension: int) -> Tables:

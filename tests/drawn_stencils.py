@@ -83,13 +83,15 @@ def neighbor(cells, cell, offset, periodic, outside):
 
     Along a periodic axis, the index of the cell that it stands for.
     """
-    n, there, kind = cells.ndim, list(np.add(cell, offset)), None
+    n, neighbor_cell, kind = cells.ndim, list(np.add(cell, offset)), None
     for axis, count in enumerate(cells.shape):
         if periodic[n - 1 - axis]:
-            there[axis] %= count
-        elif not 0 <= there[axis] < count:
+            neighbor_cell[axis] %= count
+        elif not 0 <= neighbor_cell[axis] < count:
             kind = outside
-    return tuple(i + 1 for i in there), cells[tuple(there)] if kind is None else kind
+    return tuple(i + 1 for i in neighbor_cell), cells[
+        tuple(neighbor_cell)
+    ] if kind is None else kind
 
 
 def value_at(coefficient, cell, shape):
@@ -126,20 +128,22 @@ def border_sums(drawn, padded):
     return out
 
 
-def mirrored(given, shape, cells, rng, *, broken):
+def mirrored(coefficients, shape, cells, rng, *, broken):
     """Return arrays with a_o(i) = a_-o(i + o), on a torus.
 
     If `broken`, that holds between FLUID cells only.
     """
-    made = {}
-    for offset, a in given.items():
+    mirrored_coefficients = {}
+    for offset, a in coefficients.items():
         opposite = tuple(-s for s in offset)
         if not any(offset) or offset > opposite:
-            made[offset] = np.array(np.broadcast_to(a, shape))
+            mirrored_coefficients[offset] = np.array(np.broadcast_to(a, shape))
             if any(offset):
-                made[opposite] = np.roll(made[offset], offset, tuple(range(len(shape))))
+                mirrored_coefficients[opposite] = np.roll(
+                    mirrored_coefficients[offset], offset, tuple(range(len(shape)))
+                )
     if broken:
-        for offset, a in made.items():
+        for offset, a in mirrored_coefficients.items():
             if any(offset):
                 toward = (
                     np.roll(cells, tuple(-s for s in offset), tuple(range(len(shape)))) != wl.FLUID
@@ -148,7 +152,7 @@ def mirrored(given, shape, cells, rng, *, broken):
                     if s:
                         np.moveaxis(toward, axis, 0)[-1 if s > 0 else 0] = True
                 a[toward] = -rng.random(np.count_nonzero(toward))
-    return made
+    return mirrored_coefficients
 
 
 def drawn(seed, kind=None, *, thin=True):
@@ -168,28 +172,32 @@ def drawn(seed, kind=None, *, thin=True):
     # On a torus the sides beyond the array belong to other cells.
     if kind in ("mirrored", "half mirrored"):
         periodic = tuple(p and shape[n - 1 - a] > 2 if a < n else p for a, p in enumerate(periodic))
-    given = {(0,) * n: 60.0}
+    coefficients = {(0,) * n: 60.0}
     # Few choices, since the kernels of each must be compiled: faces alone, all neighbors, some.
     chosen = int(rng.integers(3))
     for offset in itertools.product((-1, 0, 1), repeat=n):
         places = abs(np.array(offset)).sum(), sum((s + 1) * 3**a for a, s in enumerate(offset))
         if offset != (0,) * n and (places[0] == 1, True, places[1] % 3 != 1)[chosen]:
-            given[offset] = (
+            coefficients[offset] = (
                 -rng.random() if kind in ("numbers", "functions") else -rng.random(shape)
             )
     if kind in ("mirrored", "half mirrored"):
-        given = mirrored(
-            given, shape, cells, rng, broken=kind == "half mirrored" and not any(periodic)
+        coefficients = mirrored(
+            coefficients, shape, cells, rng, broken=kind == "half mirrored" and not any(periodic)
         )
     elif kind == "numbers" and rng.random() < 0.5:
-        given = {o: given.get(max(o, tuple(-s for s in o)), 0.0) for o in given}
-    plain = dict(given)
+        coefficients = {
+            o: coefficients.get(max(o, tuple(-s for s in o)), 0.0) for o in coefficients
+        }
+    plain = dict(coefficients)
     if kind == "functions":
-        for offset in list(given)[:3]:
+        for offset in list(coefficients)[:3]:
             pick = 0 if offset == (0,) * n else 2
-            given[offset], plain[offset] = FUNCTIONS[n][pick : pick + 2]
+            coefficients[offset], plain[offset] = FUNCTIONS[n][pick : pick + 2]
     shift = rng.random(shape) if rng.random() < 0.5 else None
-    return DrawnStencil(cells, given, plain, shift, periodic, int(rng.choice([wl.AIR, wl.SOLID])))
+    return DrawnStencil(
+        cells, coefficients, plain, shift, periodic, int(rng.choice([wl.AIR, wl.SOLID]))
+    )
 
 
 def beside(values, offset, periodic):
@@ -231,25 +239,29 @@ def drawn_singular(seed, kind):
             wl.FLUID,
             wl.SOLID,
         )
-    given: dict[tuple[int, ...], Any] = {}
+    coefficients: dict[tuple[int, ...], Any] = {}
     for o in offsets:
         opposite = tuple(-s for s in o)
         if kind in ("numbers", "circulant"):
-            given[o] = (
-                given[opposite] if kind == "numbers" and opposite in given else -rng.uniform(0.2, 1)
+            coefficients[o] = (
+                coefficients[opposite]
+                if kind == "numbers" and opposite in coefficients
+                else -rng.uniform(0.2, 1)
             )
         else:
-            given[o] = -(10 ** rng.uniform(-decades, 0, shape))
-            if kind == "symmetric" and opposite in given:
-                given[o] = beside(given[opposite], o, periodic)
+            coefficients[o] = -(10 ** rng.uniform(-decades, 0, shape))
+            if kind == "symmetric" and opposite in coefficients:
+                coefficients[o] = beside(coefficients[opposite], o, periodic)
             elif kind == "columns":
-                given[o] = given[o] * beside(np.ones(shape), o, periodic)
+                coefficients[o] = coefficients[o] * beside(np.ones(shape), o, periodic)
     across = [
-        beside(given[tuple(-s for s in o)], o, periodic) if kind == "columns" else given[o]
+        beside(coefficients[tuple(-s for s in o)], o, periodic)
+        if kind == "columns"
+        else coefficients[o]
         for o in offsets
     ]
-    given[(0,) * n] = -sum(across)
-    return DrawnStencil(cells, given, given, None, periodic, wl.SOLID)
+    coefficients[(0,) * n] = -sum(across)
+    return DrawnStencil(cells, coefficients, coefficients, None, periodic, wl.SOLID)
 
 
 def drawn_dominant(seed, side=40, side_in_space=10):
@@ -276,12 +288,12 @@ def drawn_dominant(seed, side=40, side_in_space=10):
         10 ** rng.uniform(-decades, 0, n),
     )
     turning = np.sin(3 * (np.indices(shape) / max(shape)).sum(0) + rng.uniform(0, 6))
-    given: dict[tuple[int, ...], Any] = {}
+    coefficients: dict[tuple[int, ...], Any] = {}
     for o in offsets:
         if form == "random":
-            given[o] = -(10 ** rng.uniform(-decades, 0, shape))
+            coefficients[o] = -(10 ** rng.uniform(-decades, 0, shape))
         elif form == "wind":
-            given[o] = -(
+            coefficients[o] = -(
                 1
                 + np.maximum(
                     0,
@@ -289,15 +301,17 @@ def drawn_dominant(seed, side=40, side_in_space=10):
                 )
             )
         else:
-            given[o] = -np.prod([strength[a] for a in range(n) if o[a]]) * rng.uniform(
+            coefficients[o] = -np.prod([strength[a] for a in range(n) if o[a]]) * rng.uniform(
                 0.5, 1, shape
             )
-    given[(0,) * n] = -(1 + 10.0 ** rng.integers(-5, 0)) * sum(given.values())
+    coefficients[(0,) * n] = -(1 + 10.0 ** rng.integers(-5, 0)) * sum(coefficients.values())
     bounded = rng.random() < 0.5
     upper = float(10 ** rng.uniform(-2, 0)) if bounded and rng.random() < 0.3 else np.inf
     b = rng.standard_normal(shape) * (cells == wl.FLUID)
     return (
-        DrawnStencil(cells, given, given, None, periodic, int(rng.choice([wl.AIR, wl.SOLID]))),
+        DrawnStencil(
+            cells, coefficients, coefficients, None, periodic, int(rng.choice([wl.AIR, wl.SOLID]))
+        ),
         b,
         0.0 if bounded else -np.inf,
         upper,

@@ -52,14 +52,16 @@ def figures(rng: np.random.Generator) -> dict[str, ArticulatedFigure]:
 
     Of the branching one only the limits are random.
     """
-    made = {}
+    kinematics = {}
     for name, chain, links in (("planar", planar_chain, 4), ("spatial", spatial_chain, 6)):
         lower, upper = -rng.uniform(0.2, 2.5, links), rng.uniform(0.2, 2.5, links)
-        made[name] = chain(list(rng.uniform(0.3, 1.0, links)), lower=lower, upper=upper)
+        kinematics[name] = chain(list(rng.uniform(0.3, 1.0, links)), lower=lower, upper=upper)
     body = branching_figure()
     part = rng.uniform(0.6, 1.0, body.hinges)
-    made["branching"] = dataclasses.replace(body, lower=part * body.lower, upper=part * body.upper)
-    return made
+    kinematics["branching"] = dataclasses.replace(
+        body, lower=part * body.lower, upper=part * body.upper
+    )
+    return kinematics
 
 
 def targets(count: int, *, seed: int = 134) -> Iterator[Target]:

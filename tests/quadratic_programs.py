@@ -162,26 +162,26 @@ def _opened(rng, P, q, G, A, lower, upper):
 
 def _scaled(rng, plain, cost, units, widest, sparse):
     """Return the program in other units."""
-    p, made = plain, scipy.sparse.csc_matrix if sparse else np.asarray
+    p, matrix_type = plain, scipy.sparse.csc_matrix if sparse else np.asarray
     rows, equations = (10.0 ** rng.uniform(-widest, widest, len(p[name])) for name in ("h", "b"))
 
     def infinite(values, sign):
         return np.where(np.isinf(values), sign * rng.choice(INFINITIES, len(values)), values)
 
-    found = {
-        "P": made(cost * units[:, None] * p["P"] * units),
+    scaled = {
+        "P": matrix_type(cost * units[:, None] * p["P"] * units),
         "q": cost * units * p["q"],
-        "G": made(rows[:, None] * p["G"] * units),
+        "G": matrix_type(rows[:, None] * p["G"] * units),
         "h": infinite(rows * p["h"], 1.0),
-        "A": made(equations[:, None] * p["A"] * units),
+        "A": matrix_type(equations[:, None] * p["A"] * units),
         "b": equations * p["b"],
         "lb": infinite(p["lb"] / units, -1.0),
         "ub": infinite(p["ub"] / units, 1.0),
     }
     for matrix, right in (("G", "h"), ("A", "b")):
-        if not len(found[right]) and rng.random() < 0.7:  # otherwise a matrix without rows
-            found[matrix] = found[right] = None
+        if not len(scaled[right]) and rng.random() < 0.7:  # otherwise a matrix without rows
+            scaled[matrix] = scaled[right] = None
     for side in ("lb", "ub"):
-        if not (np.abs(found[side]) < INFINITIES[0]).any() and rng.random() < 0.5:
-            found[side] = None
-    return found
+        if not (np.abs(scaled[side]) < INFINITIES[0]).any() and rng.random() < 0.5:
+            scaled[side] = None
+    return scaled

@@ -82,7 +82,7 @@ class Draw:
     def motion(self, kind: str) -> Tables:
         """Return a motion about (0.5, 0.3)."""
         axis = {"axis": [0.0, 0.0, 1.0]} if self.dimension == 3 else {}
-        still, moved = [0.0] * self.dimension, self.point(0.02, 0.01, 0.0)
+        zero, moved = [0.0] * self.dimension, self.point(0.02, 0.01, 0.0)
         motions: dict[str, Tables] = {
             "translation": {
                 "velocity": self.velocity(0.2, 0.1),
@@ -100,7 +100,7 @@ class Draw:
             },
             "keyframes": {
                 "times": [0.0, 0.2 * self.fall, self.fall],
-                "translate": [still, moved, still],
+                "translate": [zero, moved, zero],
                 "interpolation": "smooth",
             },
         }

@@ -39,13 +39,13 @@ def run_into(
 
     Options are those of a RunRequest or of `run_scene`.
     """
-    asked = {
+    defaults = {
         name: options.pop(name)
         for name in ("last_frame", "resume", "force", "force_memory", "record_problems")
         if name in options
     }
     return run_scene(
-        RunRequest(scene=scene, out=out, **asked),
+        RunRequest(scene=scene, out=out, **defaults),
         observer=observer or Lines(Console(quiet=True)),
         **options,
     )

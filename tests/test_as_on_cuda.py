@@ -76,13 +76,13 @@ def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
         text=True,
         env={**keep, "PYTHONPATH": paths},
     )
-    asked, said = process.stdin, process.stdout
+    asked, replies = process.stdin, process.stdout
     assert asked is not None
-    assert said is not None
+    assert replies is not None
 
     def ask(name: str) -> dict[str, list[float]]:
         print(name, file=asked, flush=True)
-        line = next((line for line in said if line.startswith("{")), "")
+        line = next((line for line in replies if line.startswith("{")), "")
         assert line, f"the process without the plugin ended with {process.wait()}"
         return json.loads(line)
 
@@ -291,7 +291,7 @@ def test_bodies_with_more_entries_than_there_is_room_for_are_solved_again(
 
 
 @EMULATED
-def test_the_model_of_gpus_hears_what_is_launched() -> None:
+def test_the_gpu_model_records_every_launch() -> None:
     command = [sys.executable, "-m", "benchmarks.gpu_model", "--cells", "16"]
     done = subprocess.run(
         command,

@@ -375,14 +375,14 @@ def modules_of_every_kernel(reals):
             wp.zeros(8, dtype=wp.float64, device="cpu"),
         )
         rows = Rows.flat(8, field.device).beside(Rows.flat(8, field.device), (1, 1, 1))
-        given = {
+        fields = {
             "d": wp.zeros(8, dtype=d_type, device="cpu"),
             "x": field,
             "v": vector,
             "scale": 1.0,
         }
-        ENTER.bind(rows, **given)
-        LEAVE.bind(rows, **given, others=None)
+        ENTER.bind(rows, **fields)
+        LEAVE.bind(rows, **fields, others=None)
     use_sparse_kernels(reals)
     use_sweeping_kernels(reals)
     use_gradient_projection_kernels(reals)
@@ -412,16 +412,16 @@ def modules_of_every_kernel(reals):
 def kernels_not_taken():
     """Return the kernels of headers that no pass above has used."""
     interleaved_passes(2)  # for a CPU alone
-    taken = {
+    launched = {
         (made.header.resolve(), made.declared)
         for made in gc.get_objects()
         if isinstance(made, StencilKernel) and made.declared
     }
     return [
         f"{path}:{section.line}"
-        for path in {header for header, _ in taken}
+        for path in {header for header, _ in launched}
         for section in sections(path).values()
-        if section.kind == "kernel" and (path, section.name) not in taken
+        if section.kind == "kernel" and (path, section.name) not in launched
     ]
 
 

@@ -92,21 +92,21 @@ def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
     if name == "quadratic-program":
         pytest.importorskip("piqp")
     (problem, A, b), method = case(family, name), wl.METHODS[name]()
-    whole, work, ended = wl.solve(problem, method, stopping=CRITERIA), method.init(problem), []
+    unlimited, work, ended = wl.solve(problem, method, stopping=CRITERIA), method.init(problem), []
     for seconds in LIMITS:
         result, looks = solve(problem, method, seconds, workspace=work)
         again = wl.solve(problem, method, workspace=work, stopping=CRITERIA)
         # An interrupted solve leaves no trace.
-        np.testing.assert_array_equal(again.x.numpy(), whole.x.numpy())
+        np.testing.assert_array_equal(again.x.numpy(), unlimited.x.numpy())
         if result.status is not S.TIME_LIMIT:
-            assert (result.status, result.iterations) == (whole.status, whole.iterations)
+            assert (result.status, result.iterations) == (unlimited.status, unlimited.iterations)
             break
         ended.append(result)
         assert not result
         assert looks <= seconds + MORE
-        assert result.iterations == result.history[-1].iteration < whole.iterations
+        assert result.iterations == result.history[-1].iteration < unlimited.iterations
         assert [r.residual for r in result.history[:-1]] == [
-            r.residual for r in whole.history[: result.iterations]
+            r.residual for r in unlimited.history[: result.iterations]
         ]
         assert result.residual == pytest.approx(min(r.residual for r in result.history), rel=1e-12)
         x = result.x.numpy().ravel()[: len(b)]

@@ -45,7 +45,7 @@ def test_rows_say_what_the_classes_say(row):
     assert section is None or section.group() in method.__doc__
 
 
-def test_what_the_text_says_of_all_methods_holds():
+def test_claims_about_all_methods_hold():
     """Statements about all methods.
 
     All take boxed bounds, those of one table take affine ones, and all except three take every kind

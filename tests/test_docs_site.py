@@ -52,7 +52,7 @@ def test_links_and_anchors_lead_somewhere(page):
             assert anchor in anchors(file), f"{link}: {file.name} has no such heading"
 
 
-def test_the_link_test_sees_what_is_wrong(tmp_path):
+def test_the_link_test_detects_wrong_links(tmp_path):
     """Link test on wrong links.
 
     Headings and links in code are ignored, and repeated headings are counted.
@@ -143,7 +143,7 @@ def test_searches_for_terms_of_the_field_find_their_places(term):
         assert term.lower() in lines.lower(), f"{file} does not name {term} in a summary"
 
 
-def test_the_page_of_the_architecture_has_every_room_in_the_contract_s_order():
+def test_the_architecture_page_lists_every_package_in_order():
     page, picture = ((DOCS / name).read_text() for name in ("architecture.md", "architecture.svg"))
     table = dict(re.findall(r"^\| `(?:warp_lcp/)?(\w+)(?:\.py)?` \| (.*?) \|", page, flags=re.M))
     assert {room for room in table if f">{room}</text>" not in picture} == {"benchmarks"}
@@ -274,7 +274,7 @@ CITATION = re.compile(r"([A-Z][a-z]+(?:-[A-Z][a-z]+)*)(?: et al\.)?,? \(?((?:19|
 NOT_NAMES = {"Since", "In", "From", "November", "Claypool"}
 
 
-def test_what_is_cited_is_in_the_bibliography():
+def test_every_citation_is_in_the_bibliography():
     entries = re.split(r"\n\n|\n- ", prose(DOCS / "bibliography.md"))
     sources = [
         path

@@ -80,13 +80,13 @@ def check_command(line):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_are_there(page):
+def test_documented_commands_exist(page):
     for line in shown(page):
         check_module(line)
         check_command(line)
 
 
-def test_enough_is_found():
+def test_enough_commands_are_found():
     lines = [line for page in PAGES for line in shown(page)]
     assert sum("python -m" in line for line in lines) > 5
     assert sum("warp-lcp " in line for line in lines) > 80
@@ -108,7 +108,7 @@ def test_enough_is_found():
         ("FOO=1 warp-lcp bench solver --size 8", "there is no suite solver"),
     ],
 )
-def test_wrong_ones_are_seen(line, expected):
+def test_wrong_commands_are_detected(line, expected):
     with pytest.raises(AssertionError, match=expected):
         check_module(line)
         check_command(line)

@@ -102,7 +102,7 @@ def test_no_method_waits_for_a_subclass_without_a_reason():
     }
 
 
-def test_what_counts():
+def test_empty_methods_are_recognized():
     source = """
 class Base:
     def a(self): "Do nothing."

@@ -13,7 +13,7 @@ VIEWS = ("reshape", "ravel", "view", "T")
 WRITES = {  # function: why it may
     "kernels/fields.py:copy": "sparse fields are the CPU's",
     "kernels/fields.py:unload": "sparse fields are the CPU's",
-    "kernels/vectors.py:_add_across": "on the CPU only; assigned on CUDA",
+    "kernels/vectors.py:_sum_over_ranks": "on the CPU only; assigned on CUDA",
     "solvers/staggering.py:accept": "assigned afterwards",
     "reduced/device_iteration.py:run": "on the CPU only, where the beginning is recorded",
     "reduced/residual_and_active_set.py:set": "on the CPU only; filled on CUDA",
@@ -74,7 +74,7 @@ def writes(function: ast.FunctionDef) -> bool:
     return False
 
 
-def test_nobody_writes_to_what_is_a_copy_on_cuda() -> None:
+def test_no_code_writes_to_a_host_copy_of_device_memory() -> None:
     found = set()
     for path in ROOT.rglob("*.py"):
         if "benchmarks" not in path.parts:

@@ -70,13 +70,17 @@ def test_least_squares_with_signs(kind):
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
-@pytest.mark.parametrize("given", ["pair", "numbers", "Bounds", "open"])
-def test_least_squares_in_boxes(given, seed):
+@pytest.mark.parametrize("bounds_kind", ["pair", "numbers", "Bounds", "open"])
+def test_least_squares_in_boxes(bounds_kind, seed):
     C, d = least_squares(seed)
     A, b, rng = C.T @ C, -C.T @ d, np.random.default_rng(seed)
     lower, upper = -rng.random(N), rng.random(N)
-    lower, upper = {"numbers": (-0.25, 0.5), "open": (-np.inf, upper)}.get(given, (lower, upper))
-    bounds = {"Bounds": Bounds(lower, upper), "open": (None, upper)}.get(given, (lower, upper))
+    lower, upper = {"numbers": (-0.25, 0.5), "open": (-np.inf, upper)}.get(
+        bounds_kind, (lower, upper)
+    )
+    bounds = {"Bounds": Bounds(lower, upper), "open": (None, upper)}.get(
+        bounds_kind, (lower, upper)
+    )
     expected = lsq_linear(C, d, (lower, upper), method="bvls", tol=1e-14)
     found = wl.linear_complementarity(A, b, bounds=bounds, tol=1e-9, method=wl.Lemke())
     check(found, A, b, lower, upper, expected.x)
@@ -149,23 +153,23 @@ def test_1e20_is_infinite(name, infinity):
     expected = boxed(
         A, b, np.where(np.arange(N) % 2, -0.1, -np.inf), np.where(np.arange(N) % 3, np.inf, 0.15)
     )
-    for given in (
+    for bounds in (
         (lower, upper),
         list(zip(lower, upper, strict=True)),
         Bounds(lower, upper),
         (wp.array(lower, device="cpu"), upper),
     ):
         check(
-            wl.linear_complementarity(A, b, bounds=given, tol=1e-10, method=name),
+            wl.linear_complementarity(A, b, bounds=bounds, tol=1e-10, method=name),
             A,
             b,
             lower,
             upper,
             expected,
         )
-    for given in ((-infinity, infinity), (None, None)):
+    for bounds in ((-infinity, infinity), (None, None)):
         np.testing.assert_allclose(
-            wl.linear_complementarity(A, b, bounds=given, tol=1e-10).x,
+            wl.linear_complementarity(A, b, bounds=bounds, tol=1e-10).x,
             np.linalg.solve(A, -b),
             atol=1e-8,
         )
@@ -212,7 +216,7 @@ def test_pairs_of_two_unknowns(bounds, expected):
         [(0, 1), [0, 1]],
     ],
 )
-def test_what_could_be_pairs_or_a_pair_is_refused(bounds):
+def test_ambiguous_bounds_are_refused(bounds):
     with pytest.raises(
         ValueError,
         match=r"bounds is a .* of two .*, which could be \(lo, hi\) or a pair for each of two "
@@ -278,7 +282,7 @@ def test_a_callback_stops(at):
     assert sweeps(x0=found.x).success
 
 
-def test_a_callback_stops_what_has_not_begun():
+def test_a_callback_stops_methods_that_have_not_begun():
     def stop(record):
         raise StopIteration
 
@@ -288,7 +292,7 @@ def test_a_callback_stops_what_has_not_begun():
     assert solved.status is wl.SolveStatus.CONVERGED
 
 
-def test_what_a_callback_raises_comes_out():
+def test_exceptions_of_a_callback_are_raised():
     def wrong(x):
         raise RuntimeError("mine")
 
@@ -363,7 +367,7 @@ A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
         ),
     ],
 )
-def test_what_is_refused(arguments, options, message):
+def test_invalid_arguments_are_refused(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         wl.linear_complementarity(*arguments, **options)
 
@@ -384,13 +388,13 @@ def test_callbacks_see_the_iterates_of_alternatives_and_stop_them():
     assert found.result.method != "psor"
     names = [record.step for record in found.result.history]
     assert any(name == f"start of {found.result.method}" for name in names)
-    told = [record for record in found.result.history if not record.step.startswith("start")]
+    messages = [record for record in found.result.history if not record.step.startswith("start")]
     assert [(one.nit, one.residual) for one in seen] == [
-        (record.iteration, record.residual) for record in told
+        (record.iteration, record.residual) for record in messages
     ]
     np.testing.assert_array_equal(seen[-1].x, found.x)
     first = names.index(f"start of {found.result.method}")
-    after = told[first - 1].iteration + 1  # within the alternative
+    after = messages[first - 1].iteration + 1  # within the alternative
 
     def stop(intermediate_result):
         if intermediate_result.nit == after:

@@ -126,7 +126,7 @@ def faults(name, method, problem, precision):
         } & p.facts
         return "refused", [f"refused a matrix that it takes: {refusal}"] if suits else []
     x = result.x.numpy().astype(np.float64)[fluid].ravel()
-    own = natural_residual(p.A, p.b, p.lower, p.upper, x)
+    norm = natural_residual(p.A, p.b, p.lower, p.upper, x)
     reference = natural_residual(
         p.A, p.b, p.lower, p.upper, np.clip(np.zeros(len(x)), p.lower, p.upper)
     )
@@ -134,25 +134,25 @@ def faults(name, method, problem, precision):
     wrong = []
     if (
         result.status is S.CONVERGED
-        and not own <= RTOL[precision] * reference * (1 + 1e-6) + rounding
+        and not norm <= RTOL[precision] * reference * (1 + 1e-6) + rounding
     ):
         wrong.append(
-            f"false CONVERGED: residual {own:.1e}, asked for {RTOL[precision] * reference:.1e}"
+            f"false CONVERGED: residual {norm:.1e}, asked for {RTOL[precision] * reference:.1e}"
         )
     # Bounds are rounded as x is.
     low, high = (v.astype(np.float32) if precision == "single" else v for v in (p.lower, p.upper))
     if result and not ((x >= low) & (x <= high)).all():
         wrong.append(f"CONVERGED {max((low - x).max(), (x - high).max()):.1e} outside the bounds")
-    if result.status is not S.CONVERGED and own < 0.99 * RTOL[precision] * reference - rounding:
+    if result.status is not S.CONVERGED and norm < 0.99 * RTOL[precision] * reference - rounding:
         wrong.append(f"{result.status.name} at a solution")
-    if not abs(result.residual - own) <= 1e-3 * own + rounding:
-        wrong.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
+    if not abs(result.residual - norm) <= 1e-3 * norm + rounding:
+        wrong.append(f"says the residual is {result.residual:.3e}, it is {norm:.3e}")
     if result.status in NEVER or result.status not in allowed(name, p.facts):
         wrong.append(f"{result.status.name} is not how this may end")
-    if result.status is S.FLOOR and own > 1e5 * np.finfo(
+    if result.status is S.FLOOR and norm > 1e5 * np.finfo(
         np.float32 if precision == "single" else np.float64
     ).eps * max(reference, rounding):
-        wrong.append(f"FLOOR at {own / reference:.1e}")
+        wrong.append(f"FLOOR at {norm / reference:.1e}")
     if name in SURE and "m-matrix" in p.facts and precision != "single" and not result:
         wrong.append(f"{result.status.name} on a positive definite M-matrix")
     if result and {"symmetric", "positive-definite"} <= p.facts and p.solution is not None:

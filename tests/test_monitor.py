@@ -52,7 +52,7 @@ def test_plots_have_the_relative_residuals_of_each_solve():
 
 
 @pytest.mark.parametrize("results", [[], {}, [1.0], "psor"])
-def test_what_is_no_result_is_refused(results):
+def test_arguments_that_are_no_result_are_refused(results):
     with pytest.raises(ValueError, match=r"expected a result of wl\.solve"):
         wl.plot_convergence(results)
     with pytest.raises(

@@ -39,14 +39,14 @@ def check(seed, **options):
     return drawn, found
 
 
-def optimal(given, found, message, accuracy=2e-8):
+def optimal(program, found, message, accuracy=2e-8):
     """Test the first-order conditions row by row, relative to the terms of each row."""
     dense = {
         name: v.toarray() if hasattr(v, "toarray") else v
-        for name, v in given.items()
+        for name, v in program.items()
         if v is not None
     }
-    n, x = len(given["q"]), found.x
+    n, x = len(program["q"]), found.x
     gradient, terms = (
         dense["P"] @ x + dense["q"],
         np.abs(dense["P"]) @ np.abs(x) + np.abs(dense["q"]),
@@ -178,7 +178,7 @@ def test_infinity_as_a_number(infinity):
     assert falls.extras["result"].message == "INFEASIBLE: the objective is unbounded below"
 
 
-def test_what_is_just_below_infinity_is_a_number():
+def test_values_just_below_infinity_are_numbers():
     found = qp.solve_problem(qpsolvers.Problem(np.zeros((1, 1)), np.ones(1), lb=np.array([-9e19])))
     assert found.found
     assert found.x == [-9e19]

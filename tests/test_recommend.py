@@ -44,7 +44,7 @@ def test_recommended_methods_converge(family):
         assert all(reason.endswith(".") for reason in advice.reasons)
 
 
-def test_there_are_sixty():
+def test_there_are_sixty_recommendation_cases():
     assert len(COUNTED) * len(SEEDS) >= 60
 
 
@@ -115,7 +115,7 @@ def test_definiteness_is_that_of_the_eigenvalues(seed):
         assert t.unknowns == len(A)
 
 
-def test_dominance_tells_where_nothing_is_factored():
+def test_diagonal_dominance_is_used_where_no_factorization_exists():
     L = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(2000, 2000)).tocsr()
     assert traits_of(wl.LCP(L, np.ones(2000)), 1e-2).definiteness == "definite"
     ring = L.tolil()
@@ -136,7 +136,7 @@ def test_bounds_and_diagonals_are_named():
     assert traits_of(wl.LCP(NO_INDEFINITE, -np.ones(5), low, high), 0.1).bounds == "affine"
 
 
-def test_the_trial_foresees_how_many_sweeps():
+def test_the_trial_predicts_the_number_of_sweeps():
     """Number of sweeps estimated by the trial, to a factor of 2.
 
     Where the rate has settled; a rate over another number of sweeps would be far off.
@@ -300,7 +300,7 @@ def misled():
 
 
 def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
-    told, alone = (
+    records, alone = (
         [],
         wl.solve(
             misled, wl.default_method(misled), stopping=wl.StoppingCriteria(max_iterations=75)
@@ -308,23 +308,23 @@ def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
     )
     assert not alone
     result = wl.solve(
-        misled, stopping=wl.StoppingCriteria(max_iterations=100), callback=told.append
+        misled, stopping=wl.StoppingCriteria(max_iterations=100), callback=records.append
     )
     assert result
     assert result.method in wl.recommend(misled).alternatives
-    assert result.iterations == told[-1].iteration == result.history[-1].iteration
+    assert result.iterations == records[-1].iteration == result.history[-1].iteration
     assert alone.iterations < result.iterations <= 100
     assert (
         result.linear_iterations == result.history[-1].linear_iterations >= alone.linear_iterations
     )
-    assert [r.iteration for r in told] == [r.iteration for r in result.history]
+    assert [r.iteration for r in records] == [r.iteration for r in result.history]
     for numbers in (
-        [r.iteration for r in told],
-        [r.linear_iterations for r in told],
-        [r.seconds for r in told],
+        [r.iteration for r in records],
+        [r.linear_iterations for r in records],
+        [r.seconds for r in records],
     ):
         assert numbers == sorted(numbers)
-    assert [r.step for r in told if r.step.startswith("start")] == [
+    assert [r.step for r in records if r.step.startswith("start")] == [
         "start",
         f"start of {result.method}",
     ]
@@ -357,7 +357,7 @@ def test_alternatives_keep_the_limits(misled):
     assert len([r for r in timed.history if r.step.startswith("start")]) == 1
 
 
-def test_scipy_s_manner_goes_on_too(misled):
+def test_linear_complementarity_uses_alternatives(misled):
     assert wl.linear_complementarity(misled.A, misled.b.numpy(), bounds=(0.0, 1.0)).success
 
 

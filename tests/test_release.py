@@ -91,7 +91,7 @@ def test_scripts_are_bash(name):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_command_line_tells_its_version():
+def test_the_command_line_prints_its_version():
     outcome = CliRunner().invoke(app, ["--version"])
     assert outcome.exit_code == 0
     assert re.fullmatch(r"\d+\.\d+\.\d+\S*|not installed as a distribution", outcome.output.strip())

@@ -31,7 +31,7 @@ def test_python_examples_run(code, capsys, tmp_path, monkeypatch):
     assert out.startswith("CONVERGED") or "not rough" in code or out.endswith("finished\n")
 
 
-def test_the_text_says_what_the_first_problem_prints(capsys):
+def test_the_text_shows_the_output_of_the_first_problem(capsys):
     run(blocks(TUTORIAL, "python")[0], TUTORIAL)
     assert f"`{capsys.readouterr().out.strip()}`" in TUTORIAL.read_text()
 

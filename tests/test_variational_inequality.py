@@ -181,14 +181,14 @@ def test_a_method_may_want_steps_from_a_start_within_the_tolerance() -> None:
     problem = Contacts(30, 99)
     work = ProjectedGradient().init(problem)
     work.wanted = True
-    for most, taken in ((100, 1), (0, 0)):
+    for most, steps in ((100, 1), (0, 0)):
         result = wl.solve(
             problem,
             ProjectedGradient(),
             workspace=work,
             stopping=wl.StoppingCriteria(atol=1e9, max_iterations=most),
         )
-        assert (result.status, result.iterations) == (wl.SolveStatus.CONVERGED, taken)
+        assert (result.status, result.iterations) == (wl.SolveStatus.CONVERGED, steps)
 
 
 def test_methods_and_problems_that_do_not_go_together() -> None:

@@ -28,15 +28,15 @@ class Deadline:
     Args:
         seconds: time limit from now; inf: no limit of its own. A deadline never ends later than
             that of the enclosing solve.
-        across: communicator of a distributed solve, see `warp_lcp.kernels.vectors.Communicator`:
+        comm: communicator of a distributed solve, see `warp_lcp.kernels.vectors.Communicator`:
             time is up on all ranks as soon as it is up on one. None if serial.
     """
 
-    def __init__(self, seconds: float = math.inf, across: Any = None) -> None:
+    def __init__(self, seconds: float = math.inf, comm: Any = None) -> None:
         outer = _running.get()
-        self.ends, self._across = now() + seconds, across
+        self.ends, self._comm = now() + seconds, comm
         if outer is not None and outer.ends < self.ends:
-            self.ends, self._across = outer.ends, outer._across
+            self.ends, self._comm = outer.ends, outer._comm
         self._token: Token[Deadline | None] | None = None
 
     def left(self) -> float:
@@ -44,7 +44,7 @@ class Deadline:
         if self.ends == math.inf:
             return math.inf
         left = max(0.0, self.ends - now())
-        return left if self._across is None else -float(self._across.max(-left))
+        return left if self._comm is None else -float(self._comm.max(-left))
 
     def __enter__(self) -> Deadline:
         """Make this the current deadline."""
@@ -72,7 +72,7 @@ def is_collective() -> bool:
     Then each rank must call these functions equally often.
     """
     running = _running.get()
-    return running is not None and running.ends != math.inf and running._across is not None
+    return running is not None and running.ends != math.inf and running._comm is not None
 
 
 def time_is_up() -> bool:

@@ -169,13 +169,16 @@ def solve_by_attempts(
         reserve: keep a quarter of the steps that are given for the alternatives of a method for
             matrices.
     """
-    begun, accuracy = time.perf_counter(), min(max((stopping or StoppingCriteria()).rtol, EPS), 0.5)
+    start_time, accuracy = (
+        time.perf_counter(),
+        min(max((stopping or StoppingCriteria()).rtol, EPS), 0.5),
+    )
     advice, results = recommend(problem, accuracy=accuracy), list[SolveResult]()
     reserve = (
         reserve and fallback and stopping is not None and advice.traits.kind in ("dense", "sparse")
     )
     for attempt in advice.attempts:
-        planned = _planned(attempt, problem, advice, accuracy, given=stopping is not None)
+        planned = _planned(attempt, problem, advice, accuracy, has_criteria=stopping is not None)
         if planned is None or (planned.alternative and isinstance(stopping, MeanCriteria)):
             continue
         reserves = (
@@ -185,7 +188,7 @@ def solve_by_attempts(
         )
         criteria = left(
             stopping or planned.stopping,
-            begun,
+            start_time,
             results if stopping is not None else [],
             reserve=reserves,
         )
@@ -198,7 +201,7 @@ def solve_by_attempts(
                 planned.name,
                 results,
                 callback,
-                begun,
+                start_time,
             )
         except ValueError:
             if not results:
@@ -232,7 +235,7 @@ class _Planned:
 
 
 def _planned(
-    attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: float, *, given: bool
+    attempt: Attempt, problem: LCP, advice: Recommendation, accuracy: float, *, has_criteria: bool
 ) -> _Planned | None:
     """Return the solve of an attempt, None if the attempt does not suit the problem.
 
@@ -241,7 +244,7 @@ def _planned(
         problem: as given.
         advice: the recommendation.
         accuracy: relative residual.
-        given: whether the caller has given criteria.
+        has_criteria: whether the caller has given criteria.
     """
     t = advice.traits
     if not attempt.suits(t):
@@ -254,7 +257,7 @@ def _planned(
         return _Planned(
             there.name, there.method, restated, restated.problem, there.stopping, alternative=False
         )
-    if attempt.again and given and restated is None:
+    if attempt.again and has_criteria and restated is None:
         return None
     name, first = attempt.method, attempt.method == advice.name and not attempt.again
     method = advice.method if attempt.method == advice.name else method_for(name, t)
@@ -278,11 +281,11 @@ def _recorded(
     name: str,
     results: list[SolveResult],
     callback: Watch | None,
-    begun: float,
+    start_time: float,
 ) -> SolveResult:
     """Solve, with the steps and seconds of earlier results added to the records."""
     shifted = partial(
-        _after, results[-1].history[-1] if results else None, name, time.perf_counter() - begun
+        _after, results[-1].history[-1] if results else None, name, time.perf_counter() - start_time
     )
     result = solve(None if callback is None else lambda record: callback(shifted(record)))
     return replace(
@@ -312,13 +315,17 @@ def _best(results: list[SolveResult]) -> SolveResult:
 
 
 def left(
-    stopping: Criteria, begun: float, results: Sequence[SolveResult] = (), *, reserve: bool = False
+    stopping: Criteria,
+    start_time: float,
+    results: Sequence[SolveResult] = (),
+    *,
+    reserve: bool = False,
 ) -> Criteria:
     """Return criteria with the remaining steps and time.
 
     Args:
         stopping: criteria for all.
-        begun: start of the solve by `time.perf_counter` [s].
+        start_time: start of the solve by `time.perf_counter` [s].
         results: of earlier attempts.
         reserve: keep a quarter of the steps for later attempts.
     """
@@ -331,7 +338,8 @@ def left(
     )
     if isinstance(changed, StoppingCriteria) and changed.max_seconds < math.inf:
         changed = replace(
-            changed, max_seconds=max(LEAST, changed.max_seconds - (time.perf_counter() - begun))
+            changed,
+            max_seconds=max(LEAST, changed.max_seconds - (time.perf_counter() - start_time)),
         )
     return changed
 

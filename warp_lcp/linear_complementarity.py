@@ -128,10 +128,10 @@ def linear_complementarity(
         checked(name, given, criteria[name])
         for name, given in (("tol", tol), ("atol", atol), ("maxiter", maxiter))
     )
-    report = _told(callback)
+    report = _callback_adapter(callback)
     operator = as_operator(A, b.device if isinstance(b, wp.array) else None)
     fields = _Fields(real_array(b, "b"), tuple(operator.shape))
-    lower, upper = _sides_of(bounds, fields.given)
+    lower, upper = _sides_of(bounds, fields.b_shape)
     lower, upper = (
         _bound(fields.load(lower, "bounds, lo"), "lo", np.inf),
         _bound(fields.load(upper, "bounds, hi"), "hi", -np.inf),
@@ -197,7 +197,7 @@ class _Fields:
     """Convert arrays between b's shape and the operator's shape."""
 
     def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
-        self.given, self._shape = b.shape, shape
+        self.b_shape, self._shape = b.shape, shape
 
     def load(
         self, values: BoundValues, name: str
@@ -206,16 +206,16 @@ class _Fields:
         if isinstance(values, (AffineBounds, wp.array)) or np.ndim(values) == 0:
             return values
         host = real_array(values, name)
-        if host.shape == self.given and host.size == int(np.prod(self._shape)):
+        if host.shape == self.b_shape and host.size == int(np.prod(self._shape)):
             return host.reshape(self._shape)
         if np.ndim(host) and name != "b" and host.shape != self._shape:
-            raise ValueError(f"{name} has shape {host.shape}: expected {self.given}")
+            raise ValueError(f"{name} has shape {host.shape}: expected {self.b_shape}")
         return host
 
     def unload(self, field: DeviceArray, dtype: DataType = np.float64) -> np.ndarray:
         """Return a field in b's shape if the sizes agree, else in its own shape."""
         host: np.ndarray = np.array(field.numpy(), dtype=dtype)
-        return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
+        return host.reshape(self.b_shape if host.size == int(np.prod(self.b_shape)) else host.shape)
 
 
 def _sides_of(bounds: Sides | None, shape: tuple[int, ...]) -> tuple[BoundValues, BoundValues]:
@@ -321,7 +321,9 @@ def _method(method: str | Solver) -> Solver:
     return method
 
 
-def _told(callback: Callable[..., object] | None) -> Callable[[OptimizeResult], object] | None:
+def _callback_adapter(
+    callback: Callable[..., object] | None,
+) -> Callable[[OptimizeResult], object] | None:
     """Return a function that calls a callback with either of SciPy's signatures."""
     if callback is None:
         return None

@@ -183,15 +183,15 @@ def criteria(rtol: float, most: int) -> StoppingCriteria:
     return StoppingCriteria(rtol=rtol, max_iterations=most, patience=max(30, most // 10))
 
 
-def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
+def _within(advice: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
     """Return a recommendation within a budget, or the reason why none fits.
 
     A method that needs too much memory is replaced by one that holds fields only. Sweeps that need
     too many steps are replaced by another rule's method, and a method whose first step takes too
     long is replaced by sweeps.
     """
-    t = found.traits
-    if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:
+    t = advice.traits
+    if budget.bytes is not None and (needs := memory_of(advice.name, t)) > budget.bytes:
         lean = next(
             (
                 n
@@ -201,18 +201,22 @@ def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendati
             None,
         )
         if lean is None:
-            found = _said(
-                found, f"No method fits into {budget.bytes} bytes; this one takes about {needs}."
+            advice = _said(
+                advice, f"No method fits into {budget.bytes} bytes; this one takes about {needs}."
             )
         else:
-            found = _instead(
-                found,
+            advice = _instead(
+                advice,
                 lean,
-                f"{found.name} takes about {needs} bytes of the {budget.bytes} allowed; {lean} "
+                f"{advice.name} takes about {needs} bytes of the {budget.bytes} allowed; {lean} "
                 "holds fields only.",
             )
     if budget.iterations is not None:
-        if budget.bytes is None and found.name in ("psor", "nncg") and t.sweeps > budget.iterations:
+        if (
+            budget.bytes is None
+            and advice.name in ("psor", "nncg")
+            and t.sweeps > budget.iterations
+        ):
             fewer = next(
                 (
                     rule
@@ -223,39 +227,41 @@ def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendati
             )
             if fewer is not None:
                 why = (
-                    f"{found.name} would take {t.sweeps:.0f} of the {budget.iterations} steps "
+                    f"{advice.name} would take {t.sweeps:.0f} of the {budget.iterations} steps "
                     f"allowed, {fewer.method} some {fewer.steps}."
                 )
-                found = _said(_from_rule(fewer, t, found.stopping.rtol), why)
-        found = replace(found, stopping=replace(found.stopping, max_iterations=budget.iterations))
-    return found if budget.seconds is None else _in_time(found, budget.seconds, problem)
+                advice = _said(_from_rule(fewer, t, advice.stopping.rtol), why)
+        advice = replace(
+            advice, stopping=replace(advice.stopping, max_iterations=budget.iterations)
+        )
+    return advice if budget.seconds is None else _in_time(advice, budget.seconds, problem)
 
 
-def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendation:
+def _in_time(advice: Recommendation, seconds: float, problem: LCP) -> Recommendation:
     """Return a recommendation whose first step ends in time.
 
     If the first step is too slow, sweeps replace the method: they improve x from the first one on.
     """
-    begun = time.perf_counter()
-    taken = _takes(found.name, problem, steps=1)
-    took = time.perf_counter() - begun
+    start_time = time.perf_counter()
+    taken = _takes(advice.name, problem, steps=1)
+    took = time.perf_counter() - start_time
     if taken and took <= seconds:
         return _said(
-            found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed."
+            advice, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed."
         )
-    begun = time.perf_counter()
-    if not found.traits.takes("psor") or not _takes("psor", problem, steps=TRIAL):
+    start_time = time.perf_counter()
+    if not advice.traits.takes("psor") or not _takes("psor", problem, steps=TRIAL):
         return _said(
-            found,
+            advice,
             f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no "
             "sweep is possible here.",
         )
-    many = max(1, int(seconds / ((time.perf_counter() - begun) / TRIAL)))
+    many = max(1, int(seconds / ((time.perf_counter() - start_time) / TRIAL)))
     why = (
-        f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s "
+        f"{advice.name} took {took:.2g} s for its first step, more than the {seconds:g} s "
         f"allowed: {many} sweeps fit, and each helps."
     )
-    cheaper = _instead(found, "psor", why)
+    cheaper = _instead(advice, "psor", why)
     return replace(
         cheaper,
         stopping=replace(
@@ -277,15 +283,15 @@ def _said(found: Recommendation, reason: str) -> Recommendation:
     return replace(found, reasons=(*found.reasons, reason))
 
 
-def _instead(found: Recommendation, name: str, reason: str) -> Recommendation:
+def _instead(advice: Recommendation, name: str, reason: str) -> Recommendation:
     """Return the recommendation with another method for the same criteria.
 
     The limit of steps is that of a method that sweeps.
     """
-    stopping = replace(found.stopping, max_iterations=LONGEST, patience=LONGEST // 10)
-    attempts = (Attempt(name), *(attempt for attempt in found.attempts if attempt.method != name))
+    stopping = replace(advice.stopping, max_iterations=LONGEST, patience=LONGEST // 10)
+    attempts = (Attempt(name), *(attempt for attempt in advice.attempts if attempt.method != name))
     changed = replace(
-        found,
+        advice,
         name=name,
         method=METHODS[name](),
         stopping=stopping,

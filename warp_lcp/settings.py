@@ -194,33 +194,31 @@ def renamed_method(
     new = method.__name__
 
     @wraps(method)
-    def call(self: Owner, *args: Given.args, **given: Given.kwargs) -> Found:
+    def call(self: Owner, *args: Given.args, **keywords: Given.kwargs) -> Found:
         warnings.warn(
             f"{type(self).__name__}.{old} is now {type(self).__name__}.{new}",
             DeprecationWarning,
             stacklevel=2,
         )
-        found: Found = getattr(self, new)(*args, **given)
+        found: Found = getattr(self, new)(*args, **keywords)
         return found
 
     return call
 
 
-def checked(name: str, given: object, annotation: Annotation) -> Any:
+def checked(name: str, raw: object, annotation: Annotation) -> Any:
     """Return a value converted to the type of its annotation.
 
     Args:
         name: of the value, for the message.
-        given: the value.
+        raw: the value.
         annotation: the valid types and ranges.
 
     Raises:
         SettingError: it is not.
     """
     value: object = (
-        given.item()
-        if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0
-        else given
+        raw.item() if isinstance(raw, (np.generic, np.ndarray)) and np.ndim(raw) == 0 else raw
     )
     plain = (
         str(value)
@@ -314,16 +312,16 @@ def adapter(annotation: Any) -> TypeAdapter[Any]:
     )
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
+def nearest(word: str, names: Iterable[str]) -> str:
     """Return `did you mean ...?` for the known word nearest to a word.
 
     A word may be the initials of a known one. Without a near word, the known ones are listed.
     """
-    known = sorted(known)
-    initials = {"".join(part[:1] for part in re.split("[_-]", name)): name for name in known}
+    names = sorted(names)
+    initials = {"".join(part[:1] for part in re.split("[_-]", name)): name for name in names}
     match = (
         [initials[word]]
         if len(word) > 1 and word in initials
-        else get_close_matches(word, known, n=1, cutoff=0.6)
+        else get_close_matches(word, names, n=1, cutoff=0.6)
     )
-    return f"did you mean {match[0]!r}?" if match else f"choose from {', '.join(known)}"
+    return f"did you mean {match[0]!r}?" if match else f"choose from {', '.join(names)}"

@@ -74,7 +74,7 @@ class Traits:
     @cached_property
     def ranks(self) -> bool:
         """Return whether the unknowns are spread over several processes."""
-        return layout_of(self._problem.A).across is not None
+        return layout_of(self._problem.A).comm is not None
 
     @cached_property
     def unknowns(self) -> int:

@@ -92,7 +92,7 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
     """Draw figure C.1 and check the solutions that the recipes plant."""
     rows, panels = list[list[str]](), list[RecordLines]()
     for kind, of_kind in problems.items():
-        infeasible, worst, held = 0, 0.0, list[float]()
+        infeasible, worst, at_bound_shares = 0, 0.0, list[float]()
         for p in of_kind:
             y = p.A @ p.solution + p.b if p.solution is not None else np.zeros(1)
             infeasible += bool(y.min() < -1e-9)
@@ -102,12 +102,12 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
                 p.lcp(device="cpu"), wl.FischerNewton(), stopping=wl.StoppingCriteria(rtol=1e-9)
             )
             x = result.x.numpy().ravel()
-            held.append(float((x < p.A @ x + p.b).mean()))
+            at_bound_shares.append(float((x < p.A @ x + p.b).mean()))
         figures = {
             "infeasible": infeasible,
             "problems": len(of_kind),
             "worst": worst,
-            "held": statistics.fmean(held),
+            "held": statistics.fmean(at_bound_shares),
         }
         results.records.append(
             BenchmarkRecord(
@@ -115,7 +115,7 @@ def _patterns(results: Results, problems: dict[str, list[Problem]]) -> None:
             )
         )
         planted = "none" if of_kind[0].solution is None else f"{infeasible} of {len(of_kind)}"
-        rows.append([kind, planted, f"{worst:.2g}", f"{statistics.fmean(held):.1%}"])
+        rows.append([kind, planted, f"{worst:.2g}", f"{statistics.fmean(at_bound_shares):.1%}"])
         if kind in COMPARED:
             A = of_kind[0].A
             assert not isinstance(A, wl.GridPoisson)
@@ -304,16 +304,16 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
 
 
 def _omega(
-    results: Results, given: dict[str, Problem], scale: ProblemScale, options: Options
+    results: Results, problems: dict[str, Problem], scale: ProblemScale, options: Options
 ) -> None:
     """Vary the relaxation factor of PSOR (figure C.4)."""
-    given = given | {
+    problems = problems | {
         f"splash {n}^3, p >= 0": splash(n).named("everywhere", device=options.device)
         for n in (2 * scale.side, 4 * scale.side)
     }
     stopping = wl.StoppingCriteria(rtol=RTOL, max_iterations=SWEEPS, patience=SWEEPS)
     rows, curves = list[list[str]](), dict[str, tuple[list[float], list[float]]]()
-    for label, problem in given.items():
+    for label, problem in problems.items():
         options.say(f"book: omega, {label}")
         lcp, done = problem.lcp(device=options.device), dict[float, int]()
         for omega in FACTORS:

@@ -123,18 +123,18 @@ def by_family(verdicts: Sequence[ExtremeVerdict]) -> list[BenchmarkRecord]:
     """Return the number of passed cases of each family."""
     records = []
     for family in dict.fromkeys(v.case.family for v in verdicts):
-        own = [v for v in verdicts if v.case.family == family]
+        family_verdicts = [v for v in verdicts if v.case.family == family]
         counts = {
-            "cases": len({v.case.name for v in own}),
-            "attempts": len(own),
-            "wrong": sum(bool(v.wrong) for v in own),
+            "cases": len({v.case.name for v in family_verdicts}),
+            "attempts": len(family_verdicts),
+            "wrong": sum(bool(v.wrong) for v in family_verdicts),
         }
         counts |= {
             kind.value: n
             for kind in Expected
-            if (n := sum(v.promise.expected is kind for v in own))
+            if (n := sum(v.promise.expected is kind for v in family_verdicts))
         }
-        seconds = [v.attempt.seconds for v in own]
+        seconds = [v.attempt.seconds for v in family_verdicts]
         figures = {name: Figure(count) for name, count in counts.items()}
         records.append(
             BenchmarkRecord(
@@ -191,16 +191,18 @@ def table(verdicts: Sequence[ExtremeVerdict]) -> RecordTable:
     for v in (v for v in verdicts if v.wrong or v.case.family not in judging.FAMILIES):
         by_case[v.case.family, v.case.name].append(v)
     rows = []
-    for name, own in by_case.items():
+    for name, case_verdicts in by_case.items():
         if all(
-            v.attempt.status in ORDINARY and v.attempt.seconds < 1.0 and not v.wrong for v in own
+            v.attempt.status in ORDINARY and v.attempt.seconds < 1.0 and not v.wrong
+            for v in case_verdicts
         ):
             continue
         cells = {
-            v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s" for v in own
+            v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s"
+            for v in case_verdicts
         }
-        wrong = "; ".join(f"{v.precision}: {v.outcome}" for v in own if v.wrong)
-        expected = "; ".join(dict.fromkeys(str(v.promise) for v in own))
+        wrong = "; ".join(f"{v.precision}: {v.outcome}" for v in case_verdicts if v.wrong)
+        expected = "; ".join(dict.fromkeys(str(v.promise) for v in case_verdicts))
         rows.append([*name, expected, *(cells.get(p, "-") for p in PRECISIONS), wrong or "yes"])
     remark = (
         "Cases that are wrong, stop before their tolerance, or take a second or more: status, "

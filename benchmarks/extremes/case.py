@@ -216,7 +216,7 @@ def checked(
     exact, x = problem.exact(), problem.unknowns(result.x.numpy())
     if not np.isfinite(x).all():
         return ExtremeAttempt(result.status.name, None, seconds, faults=["x is not finite"])
-    own, reference, sizes, single = (
+    own_residual, reference, sizes, single = (
         exact.residual(x),
         exact.residual(exact.start),
         exact.sizes(x),
@@ -226,35 +226,35 @@ def checked(
     if problem.rounded(wp.float32 if single else wp.float64):
         rounding += 4 * EPS * sizes
     required = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
-    met = own <= required * (1 + 1e-6) + rounding
+    meets = own_residual <= required * (1 + 1e-6) + rounding
     faults = []
-    if result and not met:
-        faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {required:.1e}")
+    if result and not meets:
+        faults.append(f"CONVERGED at a residual of {own_residual:.1e}, asked for {required:.1e}")
     # A result in single precision is rounded once more where it sits at a bound that is no float32
     # number.
     returned = 0.5 * EPS * sizes if single else 0.0
     # The norm of the residual may overflow where the scaled one does not.
-    known = np.isfinite(own) and result.status is not wl.SolveStatus.NON_FINITE
+    known = np.isfinite(own_residual) and result.status is not wl.SolveStatus.NON_FINITE
     # Projected multigrid scales by the diagonal without the term of the bodies. The natural
     # residual has the same zeros for any d > 0.
     says = [
         abs(result.residual - of) <= AGREES * of + rounding + returned
-        for of in (own, exact.residual(x, bodies=False))
+        for of in (own_residual, exact.residual(x, bodies=False))
     ]
     if known and not any(says):
-        faults.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
+        faults.append(f"says the residual is {result.residual:.3e}, it is {own_residual:.3e}")
     # Bounds are rounded as x is.
     beyond = np.maximum(exact.lower - x, x - exact.upper) - (EPS * np.abs(x) if single else 0.0)
     if result and (beyond > 0).any():
         faults.append(f"x is {beyond.max():.1e} outside its bounds")
-    if not result and own < 0.99 * required - rounding:
+    if not result and own_residual < 0.99 * required - rounding:
         faults.append(f"{result.status.name} at a solution")
     return ExtremeAttempt(
         result.status.name,
-        own / reference if reference > 0 else own,
+        own_residual / reference if reference > 0 else own_residual,
         seconds,
         faults=faults,
-        met=met,
+        met=meets,
     )
 
 

@@ -235,17 +235,17 @@ def swimming_3d(inverse_masses: Sequence[float]) -> GridProblem:
     return replace(problem, cells=cells, columns=U, weights=np.diag(np.array(inverse_masses)))
 
 
-def with_column(made: GridProblem, factor: float, weight: float) -> GridProblem:
+def with_column(problem: GridProblem, factor: float, weight: float) -> GridProblem:
     """Return the problem with its first column repeated, times a factor.
 
     The columns are then linearly dependent.
     """
-    assert made.columns is not None
-    assert made.weights is not None
-    weights = np.diag([*made.weights.diagonal(), weight])
+    assert problem.columns is not None
+    assert problem.weights is not None
+    weights = np.diag([*problem.weights.diagonal(), weight])
     return replace(
-        made,
-        columns=np.concatenate([made.columns, factor * made.columns[..., :1]], axis=-1),
+        problem,
+        columns=np.concatenate([problem.columns, factor * problem.columns[..., :1]], axis=-1),
         weights=weights,
     )
 

@@ -184,13 +184,13 @@ class Pools:
         """Return the pools of a symmetric problem whose off-diagonal entries are <= 0."""
         count, label = scipy.sparse.csgraph.connected_components(exact.matrix != 0, directed=False)
         tied = np.asarray(exact.matrix.sum(axis=1)).ravel() > 1e-12 * exact.matrix.diagonal()
-        held, below, above = (
+        at_bound, below, above = (
             np.bincount(label, v, count) > 0
             for v in (tied, np.isfinite(exact.lower), np.isfinite(exact.upper))
         )
         net, size = (np.bincount(label, v, count) for v in (exact.b, np.abs(exact.b)))
         net = np.where(np.abs(net) <= BALANCED * size, 0.0, net)
-        return Pools(label, ~held, net, size, np.bincount(label, minlength=count), below, above)
+        return Pools(label, ~at_bound, net, size, np.bincount(label, minlength=count), below, above)
 
     @property
     def lost(self) -> np.ndarray:

@@ -119,32 +119,32 @@ def lost(simulation: ParticleSimulation, before: int, *, leaves: bool) -> list[s
 
 
 def independent(
-    kept: Mapping[str, np.ndarray], simulation: LiquidSimulation
+    saved: Mapping[str, np.ndarray], simulation: LiquidSimulation
 ) -> tuple[float | None, list[str]]:
     """Return the relative residual of the last pressure, and its faults.
 
     They are computed from the recorded arrays alone.
     """
-    faces = {name: kept[name] for name in ("face_x", "face_y", "face_z") if name in kept}
+    faces = {name: saved[name] for name in ("face_x", "face_y", "face_z") if name in saved}
     problem = GridProblem(
-        cells=kept["cells"].astype(int),
-        b=kept["b"],
-        lower=kept["lower"],
-        upper=kept["upper"],
+        cells=saved["cells"].astype(int),
+        b=saved["b"],
+        lower=saved["lower"],
+        upper=saved["upper"],
         faces=faces,
-        shift=kept.get("shift"),
+        shift=saved.get("shift"),
     )
     exact = problem.exact()
     x = problem.unknowns(simulation.grid.interior(simulation.projection.pressure.numpy()))
-    own, reference = exact.residual(x), exact.residual(exact.start)
-    wanted = max(float(kept["absolute_tolerance"]), float(kept["tolerance"]) * reference)
+    own_residual, reference = exact.residual(x), exact.residual(exact.start)
+    wanted = max(float(saved["absolute_tolerance"]), float(saved["tolerance"]) * reference)
     rounding = 4 * float(np.finfo(np.float32).eps) * exact.sizes(x)
     fault = (
         []
-        if own <= 1.01 * wanted + rounding
-        else [f"the pressure's residual is {own:.1e}, asked for {wanted:.1e}"]
+        if own_residual <= 1.01 * wanted + rounding
+        else [f"the pressure's residual is {own_residual:.1e}, asked for {wanted:.1e}"]
     )
-    return (own / reference if reference > 0 else own), fault
+    return (own_residual / reference if reference > 0 else own_residual), fault
 
 
 @dataclass(frozen=True)

@@ -32,14 +32,16 @@ def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Benchmar
 
     Bytes read and bytes written both count.
     """
-    chosen = wp.get_device(device)
+    warp_device = wp.get_device(device)
     facts = {
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "hardware": {
             "cpu": cpu_model(),
             "cores": os.cpu_count(),
             "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
-            "device": f"{chosen.alias} {chosen.name}" if chosen.is_cuda else chosen.alias,
+            "device": f"{warp_device.alias} {warp_device.name}"
+            if warp_device.is_cuda
+            else warp_device.alias,
             "load": f"{os.getloadavg()[0]:.1f}",
         },
         "versions": versions(),

@@ -138,7 +138,7 @@ def _panels(canvas: Canvas, chart: Panels) -> None:
     rows = -(-len(chart.panels) // chart.columns)
     canvas.set_size_inches(PANEL[0] * chart.columns, PANEL[1] * rows + 0.6)
     names = list(dict.fromkeys(label for panel in chart.panels for label in panel.curves))
-    shown: Tables = {}
+    legend: Tables = {}
     for axes, panel in zip(
         canvas.subplots(rows, chart.columns, squeeze=False).ravel(), chart.panels, strict=False
     ):
@@ -147,13 +147,13 @@ def _panels(canvas: Canvas, chart: Panels) -> None:
         axes.tick_params(labelsize=7)
         axes.xaxis.label.set_size(7)
         axes.yaxis.label.set_size(7)
-        shown |= {line.get_label(): line for line in axes.lines}
+        legend |= {line.get_label(): line for line in axes.lines}
     if any(names):
         # Room for names of this many letters of 7 points, and lines.
         beside = int(PANEL[0] * chart.columns / (0.055 * max(map(len, names)) + 0.55))
         canvas.legend(
-            shown.values(),
-            shown.keys(),
+            legend.values(),
+            legend.keys(),
             loc="outside lower center",
             ncols=max(1, min(beside, len(names))),
             fontsize=7,

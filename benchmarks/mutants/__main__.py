@@ -156,8 +156,8 @@ def judge(mutant: Mutant) -> dict[str, object]:
     Tests that fail without it too are left out from then on.
     """
     path = TREE / mutant.module
-    whole, stat = path.read_text(), path.stat()
-    chosen = (
+    source, stat = path.read_text(), path.stat()
+    chosen_tests = (
         [FORMULAS[mutant.occurrence].tests]
         if mutant.operator == FORMULA
         else tests_of(TREE, mutant.module)
@@ -165,12 +165,12 @@ def judge(mutant: Mutant) -> dict[str, object]:
     spent, verdict, by = 0.0, "alive", ""
     rounds = list(FILES)
     while rounds and verdict == "alive":
-        path.write_text(mutated(whole, mutant.operator, mutant.occurrence))
+        path.write_text(mutated(source, mutant.operator, mutant.occurrence))
         outcome, text, took = tests(
-            [*chosen[: rounds[0]], *(f"--deselect={name}" for name in BROKEN)],
+            [*chosen_tests[: rounds[0]], *(f"--deselect={name}" for name in BROKEN)],
             brief=rounds[0] == FILES[0],
         )
-        path.write_text(whole)
+        path.write_text(source)
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         spent += took
         names = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE)
@@ -192,7 +192,7 @@ def judge(mutant: Mutant) -> dict[str, object]:
         **mutant._asdict(),
         "verdict": verdict,
         "by": by,
-        "tests": chosen[:number],
+        "tests": chosen_tests[:number],
         "seconds": round(spent, 1),
     }
 

@@ -143,7 +143,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_size(
-    n: int, there: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
+    n: int, roster: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
 ) -> list[BenchmarkRecord]:
     """Measure one sample of each solver in every round."""
     scene = splash(n)
@@ -152,7 +152,7 @@ def _measure_size(
         for bounds in BOUNDS
     }
     questions = {bounds: Question(scene, bounds) for bounds in BOUNDS}
-    contests = [Contest(peer, questions[bounds]) for peer in there.peers for bounds in peer.bounds]
+    contests = [Contest(peer, questions[bounds]) for peer in roster.peers for bounds in peer.bounds]
     for contest in contests:
         peer = contest.peer
         m, last = seconds.get((peer.name, contest.question.bounds), (n, 0.0))
@@ -193,7 +193,7 @@ def _targets(records: Sequence[BenchmarkRecord], n: int) -> RecordTable:
     """Return the targets at the largest size."""
 
     def least(bounds: str, *names: str) -> Figure | None:
-        here = [
+        own_records = [
             r
             for r in records
             if r.facts.get("n") == n
@@ -201,7 +201,7 @@ def _targets(records: Sequence[BenchmarkRecord], n: int) -> RecordTable:
             and r.facts["method"].startswith(names)
         ]
         return min(
-            (r.figures["over_engine"] for r in here if "over_engine" in r.figures),
+            (r.figures["over_engine"] for r in own_records if "over_engine" in r.figures),
             key=lambda f: f.value,
             default=None,
         )
@@ -264,15 +264,15 @@ def _table(n: int, records: Sequence[BenchmarkRecord]) -> RecordTable:
 
 def _bars(bounds: str, records: Sequence[BenchmarkRecord]) -> Bars:
     """Return the seconds of each solver at the largest size that has any."""
-    here = [
+    own_records = [
         r
         for r in records
         if r.name != MACHINE and r.facts["bounds"] == bounds and "total" in r.figures
     ]
     n = max(
-        (r.facts["n"] for r in here if r.facts["method"] != ENGINE),
-        default=max((r.facts["n"] for r in here), default=0),
+        (r.facts["n"] for r in own_records if r.facts["method"] != ENGINE),
+        default=max((r.facts["n"] for r in own_records), default=0),
     )
-    values = {r.facts["method"]: r.value("total") or 0.0 for r in here if r.facts["n"] == n}
+    values = {r.facts["method"]: r.value("total") or 0.0 for r in own_records if r.facts["n"] == n}
     ordered = dict(sorted(values.items(), key=lambda item: item[1]))
     return Bars(bounds, f"{bounds}, {n}^3, cold, to {RTOL:g}", "s", ordered, logarithmic=True)

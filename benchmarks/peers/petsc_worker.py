@@ -208,16 +208,16 @@ def inequality(request: Request) -> Reply:
         snes.setVariableBounds(low, high)
         snes.setTolerances(rtol=request["tolerance"], atol=0.0, stol=0.0, max_it=NEWTON_STEPS)
         snes.ksp.setType("cg")
-        own = None
+        multigrid = None
         if not request["options"]:
-            own = ReducedMultigrid(problem, snes)
+            multigrid = ReducedMultigrid(problem, snes)
             snes.ksp.getPC().setType("python")
-            snes.ksp.getPC().setPythonContext(own)
+            snes.ksp.getPC().setPythonContext(multigrid)
         snes.setFromOptions()
         middle = time.perf_counter()
         snes.solve(None, x)
         end = time.perf_counter()
-    seconds = end - middle - (0.0 if own is None else own.building)
+    seconds = end - middle - (0.0 if multigrid is None else multigrid.building)
     return _answer(
         request,
         x,

@@ -54,15 +54,19 @@ def _measure_scene(
         Setting(f"preset {preset}", _overrides(scene.scene.simulator, preset)) for preset in PRESETS
     ]
     measured = runs.measure([*presets, *settings])
-    own = [runs.record(run) for run in measured]
+    scene_records = [runs.record(run) for run in measured]
     if not any(run.trial for run in measured):
         raise StepFailed(f"{name}: no setting ran: {measured[0].failed}")
     solves, title = measure_solves(scene, options, frames), scene.scene.name
-    results.records.extend([*own, *solves])
+    results.records.extend([*scene_records, *solves])
     results.tables.extend(
-        [preset_table(title, own), run_table(title, own), solve_table(title, solves)]
+        [
+            preset_table(title, scene_records),
+            run_table(title, scene_records),
+            solve_table(title, solves),
+        ]
     )
-    results.charts.extend([*run_chart(title, own), *solve_chart(title, solves)])
+    results.charts.extend([*run_chart(title, scene_records), *solve_chart(title, solves)])
 
 
 def _overrides(simulator: str, preset: str) -> tuple[str, ...]:

@@ -238,7 +238,7 @@ class Pressures(SolveProbe):
     ) -> Callable[[], Found]:
         lcp, before = problem.lcp(), array_bytes()
         work = solver.init(lcp)
-        held = array_bytes() - before
+        held_bytes = array_bytes() - before
 
         def solve() -> Found:
             begun = self.read()
@@ -252,7 +252,7 @@ class Pressures(SolveProbe):
                 reference.residual(x),
                 reference.error(x),
                 result.status.name,
-                held,
+                held_bytes,
             )
 
         return solve

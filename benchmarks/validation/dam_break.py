@@ -88,7 +88,7 @@ class DamCollapse(NamedTuple):
 
 
 @check_at("dam break", "{cells} cells of a, {numerics.name}")
-def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def front_and_height(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
     """Compare a collapse with the data.
 
     The controls have wrong gravity, but their time is measured with the true one.
@@ -98,20 +98,22 @@ def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL)
     at, expected = T[compared], Z[compared]
     c = collapse(cells, numerics)
     shift, rms = best_shift(c.T, c.Z, at, expected, MAX_SHIFT)
-    found.add("RMS error of Z", 100.0 * relative_rms(c.T, c.Z, at, expected), high=20.0, unit="%")
-    found.add("RMS error of Z after the best shift", 100.0 * rms, high=limit, unit="%")
-    found.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
-    found.add("gravity that the front shows", shown_gravity(c), low=0.9, high=1.1, unit="g")
+    findings.add(
+        "RMS error of Z", 100.0 * relative_rms(c.T, c.Z, at, expected), high=20.0, unit="%"
+    )
+    findings.add("RMS error of Z after the best shift", 100.0 * rms, high=limit, unit="%")
+    findings.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
+    findings.add("gravity that the front shows", shown_gravity(c), low=0.9, high=1.1, unit="g")
     early = TAU <= TAU_LAST
-    found.add(
+    findings.add(
         "largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05
     )
-    found.curve("front", c.T, c.Z)
-    found.curve("height", c.tau, c.H)
-    found.curve(f"front, shifted by {-shift:.2f}", c.T - shift, c.Z)
+    findings.curve("front", c.T, c.Z)
+    findings.curve("height", c.tau, c.H)
+    findings.curve(f"front, shifted by {-shift:.2f}", c.T - shift, c.Z)
     for factor in WRONG_GRAVITY:
         wrong = collapse(cells, numerics, gravity=factor * GRAVITY)
-        found.must_break(
+        findings.must_break(
             f"{factor:g} g: gravity that the front shows",
             shown_gravity(wrong),
             low=0.9,
@@ -120,7 +122,7 @@ def front_and_height(found: Findings, cells: int, numerics: Numerics = SUB_CELL)
         )
         if factor == min(WRONG_GRAVITY):  # a shift can hide the error of nearer ones
             rms = 100.0 * best_shift(wrong.T, wrong.Z, at, expected, MAX_SHIFT)[1]
-            found.must_break(
+            findings.must_break(
                 f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%"
             )
 
@@ -154,7 +156,7 @@ def plate_friction() -> float:
 
 
 @check_at("dam break with drag", "{cells} cells of a, {numerics.name}")
-def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def far_front(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
     """Compare the speed of the front at large distances.
 
     A floor without drag lets it run too fast; the control has no drag.
@@ -171,14 +173,14 @@ def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> Non
             for row in steps(simulation, FAR_END / unit)
         ]
         time, place = stays(*np.array(run).T)
-        judge = found.add if tables else found.must_break
+        judge = findings.add if tables else findings.must_break
         judge(
             f"{label}: dZ/dT over the experiment's, Z from 4 to 14",
             slope(time, place) / expected,
             low=0.95,
             high=1.05,
         )
-        found.curve(label, time, place)
+        findings.curve(label, time, place)
 
 
 def create(
@@ -251,7 +253,7 @@ DAM_BREAK = ValidationCheck(
 
 
 @check_at("volume", "{resolution} cells, {numerics.name}")
-def columns(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
+def columns(findings: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
     """Compare the volume inside the surface with the one at the start.
 
     The control has no density correction; otherwise it is on by default.
@@ -264,26 +266,28 @@ def columns(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> 
         )
         time, volume, density = watch(simulation, DURATION)
         late.append(volume[time > DURATION - AVERAGED].mean())
-        found.curve(label, time, volume)
+        findings.curve(label, time, volume)
         if not tables:
-            found.add("volume of the last 2 s over that at the start", late[0], low=0.98, high=1.02)
+            findings.add(
+                "volume of the last 2 s over that at the start", late[0], low=0.98, high=1.02
+            )
             # The correction ignores crowding in single cells; it acts only if a thousandth of the
             # liquid is too dense.
-            found.add("mean of the largest densities", density.mean(), high=1.5)
-    found.must_break(
+            findings.add("mean of the largest densities", density.mean(), high=1.5)
+    findings.must_break(
         "no correction: volume of the last 2 s over that at the start", late[1], low=0.8
     )
 
 
 @check_at("volume of the dam break", "{cells} cells of a, {numerics.name}")
-def dam(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def dam(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
     """Compare the volume of Martin & Moyce's column with its initial volume.
 
     It has then come to the far wall and back. The control has no density correction.
     """
     for name, tables in (("", {}), ("no correction: ", UNCORRECTED)):
         time, volume, _ = watch(create(cells, numerics, **tables), DAM_DURATION)
-        judge = found.must_break if tables else found.add
+        judge = findings.must_break if tables else findings.add
         late = volume[time > DAM_DURATION - DAM_AVERAGED].mean()
         judge(f"{name}volume of the last .3 s over that at the start", late, low=0.98, high=1.02)
 

@@ -185,13 +185,18 @@ def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Val
         resolution: resolution as text.
         run: function that adds findings to its argument.
     """
-    found, start_time, error = Findings(), time.perf_counter(), ""
+    findings, start_time, error = Findings(), time.perf_counter(), ""
     try:
-        run(found)
+        run(findings)
     except (StepFailed, SimulationFailed, ValueError) as reason:
         error = str(reason)
     return ValidationTrial(
-        check, resolution, found.findings, time.perf_counter() - start_time, error, found.curves
+        check,
+        resolution,
+        findings.findings,
+        time.perf_counter() - start_time,
+        error,
+        findings.curves,
     )
 
 

@@ -49,7 +49,7 @@ TRANSFERS = ("apic", "flip", "pic")
 
 
 @check_at("flight", "{cells} cells")
-def thrown(found: Findings, cells: int) -> None:
+def thrown(findings: Findings, cells: int) -> None:
     """Throw each material.
 
     In the controls, gravity acts for the whole step before things move.
@@ -57,13 +57,13 @@ def thrown(found: Findings, cells: int) -> None:
     for what in THROWN:
         for cfl in CFL:
             old = off_its_parabola(what, cells, cfl, whole_kicks=True)
-            found.add(
+            findings.add(
                 f"{what}, CFL {cfl:g}: off its parabola",
                 off_its_parabola(what, cells, cfl),
                 high=MOST,
                 unit="of the way",
             )
-            found.must_break(
+            findings.must_break(
                 f"{what}, CFL {cfl:g}, old gravity: off its parabola",
                 old,
                 high=MOST,
@@ -176,7 +176,7 @@ def turning(simulation: LiquidSimulation) -> float:
 
 
 @check_at("spin", "spinning drop, {n} cells a meter")
-def spinning(found: Findings, n: int) -> None:
+def spinning(findings: Findings, n: int) -> None:
     """Simulate spinning drops without gravity.
 
     The control does not conserve the momenta of airborne material.
@@ -189,7 +189,7 @@ def spinning(found: Findings, n: int) -> None:
             for row in steps(simulation, FLIGHT)
         ]
         times, shares, energies = np.array(rows).T
-        found.curve(label, times, shares)
+        findings.curve(label, times, shares)
         return float(shares[-1]), energies
 
     for transfer in TRANSFERS:
@@ -197,24 +197,24 @@ def spinning(found: Findings, n: int) -> None:
         middle = positions(simulation).mean(axis=0)
         shares, energies = spun(f"{name}, {n} cells a meter", simulation)
         way = float(np.linalg.norm(positions(simulation).mean(axis=0) - middle))
-        found.add(
+        findings.add(
             f"{name}: angular momentum after {FLIGHT} s, of that at the start",
             shares,
             low=KEPT[n],
             high=2.0 - KEPT[n],
         )
-        found.add(f"{name}: way of the center of mass", way, high=1e-5, unit="m")
-        found.add(
+        findings.add(f"{name}: way of the center of mass", way, high=1e-5, unit="m")
+        findings.add(
             f"{name}: largest rise of the kinetic energy in a step",
             np.diff(energies).max() / energies[0],
             high=1e-3,
         )
     shares, _ = spun("APIC, control", drop(n, keeps=False))
-    found.must_break("APIC: angular momentum, bodies in flight left alone", shares, low=KEPT[n])
+    findings.must_break("APIC: angular momentum, bodies in flight left alone", shares, low=KEPT[n])
 
 
 @check_at("spin", "thrown spinning drop, {n} cells a meter")
-def parabolas(found: Findings, n: int) -> None:
+def parabolas(findings: Findings, n: int) -> None:
     """Throw spinning drops.
 
     The control does not conserve the momenta of airborne material.
@@ -228,10 +228,10 @@ def parabolas(found: Findings, n: int) -> None:
         return off(positions(simulation).mean(axis=0) - start, LAUNCH, FLIGHT)
 
     for cfl in CFL:
-        found.add(
+        findings.add(
             f"CFL {cfl:g}: center of mass off its parabola, of its way", missed(cfl), high=MOST
         )
-    found.must_break(
+    findings.must_break(
         "CFL 2: the same, bodies in flight left alone", missed(2.0, keeps=False), high=MOST
     )
 

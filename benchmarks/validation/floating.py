@@ -35,11 +35,11 @@ EXTREMES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3)
 
 
 @check_at("floating", "{dimension}-D, {cells} cells a diameter")
-def accelerations(found: Findings, dimension: int, cells: int) -> None:
+def accelerations(findings: Findings, dimension: int, cells: int) -> None:
     """Compare the first acceleration of a disc or sphere with potential flow."""
     for ratio in RATIOS[dimension]:
         expected = acceleration(dimension, ratio)
-        found.add(
+        findings.add(
             f"ratio {ratio:g}: a over expected",
             _first_acceleration(dimension, cells, ratio) / expected,
             low=0.95,
@@ -49,7 +49,7 @@ def accelerations(found: Findings, dimension: int, cells: int) -> None:
     apart = _first_acceleration(dimension, cells, light, together=False) / acceleration(
         dimension, light
     )
-    found.must_break(
+    findings.must_break(
         f"solved one after the other, ratio {light:g}: a over expected", apart, low=0.95, high=1.05
     )
 
@@ -100,7 +100,7 @@ def _first_acceleration(
 
 
 @check_at("floating", "{dimension}-D, {cells} cells, a box of {ratio:g} times the liquid's density")
-def displacement(found: Findings, dimension: int, cells: int, ratio: float) -> None:
+def displacement(findings: Findings, dimension: int, cells: int, ratio: float) -> None:
     """Let a box bob; compare its mean displaced mass with its mass."""
     width, height = BOX
     side = 1.0 if dimension == 2 else 0.8
@@ -120,10 +120,10 @@ def displacement(found: Findings, dimension: int, cells: int, ratio: float) -> N
         if simulation.time > 0.4 * SETTLES[dimension]:
             depths.append(water_level(simulation, width) - (float(row["body0_y"]) - 0.5 * height))
     draft = ratio * height
-    found.add(
+    findings.add(
         "mean displacement over the box's mass", float(np.mean(depths)) / draft, low=0.98, high=1.02
     )
-    found.must_break(
+    findings.must_break(
         "of a box a twentieth heavier", float(np.mean(depths)) / (1.05 * draft), low=0.98, high=1.02
     )
 
@@ -156,15 +156,15 @@ def water_level(simulation: LiquidSimulation, width: float) -> float:
 
 
 @check_at("floating", "{dimension}-D, an impact")
-def momentum(found: Findings, dimension: int) -> None:
+def momentum(findings: Findings, dimension: int) -> None:
     """Let liquid hit a body far from walls, and compare their momenta.
 
     The body must gain what the liquid loses, whatever the residual of the solve.
     """
     for ratio in (0.01, 1.0, 100.0):
         lost, exchanged = exchange(dimension, ratio)
-        found.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
-    found.must_break(
+        findings.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
+    findings.must_break(
         "solved one after the other: energy over that before",
         exchange(dimension, 0.01, together=False)[0],
         high=1.0,
@@ -227,13 +227,13 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
 
 
 @check_at("floating", "{cells}^3 cells, bodies of all weights")
-def iterations(found: Findings, cells: int) -> None:
+def iterations(findings: Findings, cells: int) -> None:
     """Count the iterations of the first step of submerged bodies of all weights."""
     counts = {ratio: _iterations(cells, ratio, corrected=True) for ratio in EXTREMES}
     for ratio, count in counts.items():
-        found.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)
+        findings.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)
     plain = _iterations(cells, min(EXTREMES), corrected=False)
-    found.must_break(
+    findings.must_break(
         f"uncorrected, ratio {min(EXTREMES):g}: iterations over those at 1",
         plain / counts[1.0],
         high=1.5,

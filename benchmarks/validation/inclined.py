@@ -74,46 +74,46 @@ FROM, TO, PARTS = 0.25, 0.6, 3  # [s] range in which the hopper's rate is measur
 
 
 @check_at("inclined layer", "{cells} cells of depth")
-def layer(found: Findings, cells: int, angles: tuple[float, ...] = ANGLES) -> None:
+def layer(findings: Findings, cells: int, angles: tuple[float, ...] = ANGLES) -> None:
     """Let sand rest and run on a rough slope.
 
     The control is the box of Narain et al., which yields where sand should rest.
     """
     whole, late = rests(cells, REST)
-    found.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
-    found.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
+    findings.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
+    findings.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
     ratios = []
     for angle in angles:
         ratio = runs(cells, angle) / accelerates(angle)
-        found.add(
+        findings.add(
             f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94, high=1.06
         )
         ratios.append(ratio * accelerates(angle) / GRAVITY)
-    found.curve("layer", angles, ratios)
+    findings.curve("layer", angles, ratios)
     _, flows = rests(cells, BOX_FLOWS, friction={"model": "box"})
-    found.must_break(
+    findings.must_break(
         f"box, {BOX_FLOWS:g} degrees, settled: mean acceleration", flows, high=0.01, unit="g"
     )
 
 
 @check_at("sliding slab", "{cells} cells of depth")
-def slab(found: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> None:
+def slab(findings: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> None:
     """Let stiff sand rest and slide on a smooth slope.
 
     The control is a floor without friction.
     """
     tables = {"material": {"friction_angle": STIFF}, "floor": SMOOTH}
     _, late = rests(cells, SLAB_REST, **tables)
-    found.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
+    findings.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
     for angle in angles:
         ratio = runs(cells, angle, speed=0.0, **tables) / accelerates(angle)
-        found.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
+        findings.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
     _, slips = rests(cells, SLAB_REST, material={"friction_angle": STIFF}, floor=0.0)
-    found.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
+    findings.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
 
 
 @check_at(BAGNOLD, "{cells} cells of depth")
-def bagnold(found: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> None:
+def bagnold(findings: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> None:
     """Let sand with rate-dependent friction reach its steady speed.
 
     The control is constant friction.
@@ -128,28 +128,28 @@ def bagnold(found: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> 
             bagnold_profile(y, angle),
             float(bagnold_profile(np.array([DEPTH]), angle)[0]),
         )
-        found.add(
+        findings.add(
             f"{angle:g} degrees: mean speed over Bagnold's",
             u.mean() / expected.mean(),
             low=0.95,
             high=1.05,
         )
         off = np.abs(u - expected).max() / most
-        found.add(
+        findings.add(
             f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed",
             off,
             high=0.05,
         )
-        found.curve(f"{angle:g} degrees", y / DEPTH, u)
+        findings.curve(f"{angle:g} degrees", y / DEPTH, u)
     _, mean = _watch(_create(cells, BELOW, CREEPS, **growing), cells, STOPPED)
-    found.add(
+    findings.add(
         f"{BELOW:g} degrees: speed in the end over that at the start",
         abs(mean[-1]) / CREEPS,
         high=0.01,
     )
     y, u = steady(cells, angles[0], **beads)
     ratio = u.mean() / bagnold_profile(y, angles[0]).mean()
-    found.must_break(
+    findings.must_break(
         f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's",
         ratio,
         low=0.95,
@@ -278,21 +278,21 @@ LAYERS = ValidationCheck(
 
 
 @check_at("sand oblique", "{cells} cells of height")
-def planes(found: Findings, cells: int, cases: tuple[tuple[float, float], ...] = PLANES) -> None:
+def planes(findings: Findings, cells: int, cases: tuple[tuple[float, float], ...] = PLANES) -> None:
     """Let a block slide down planes, and rest on rougher ones."""
     for angle, friction in cases:
         t = math.radians(angle)
         drive = GRAVITY * math.sin(t)
         measured = acceleration(angle, friction, cells)
         off = 100.0 * (measured - drive + friction * GRAVITY * math.cos(t)) / drive
-        found.add(
+        findings.add(
             f"{angle:g} degrees, friction {friction:g}: acceleration off Coulomb's, of g sin",
             abs(off),
             high=2.0,
             unit="%",
         )
         held = acceleration(angle, 1.2 * math.tan(t), cells)
-        found.add(
+        findings.add(
             f"{angle:g} degrees, friction 1.2 tan: acceleration of g sin",
             100.0 * abs(held) / drive,
             high=0.5,
@@ -302,7 +302,7 @@ def planes(found: Findings, cells: int, cases: tuple[tuple[float, float], ...] =
     drive = GRAVITY * math.sin(math.radians(angle))
     exact = drive - friction * GRAVITY * math.cos(math.radians(angle))
     stairs = acceleration(angle, friction, cells, whole=True)
-    found.must_break(
+    findings.must_break(
         "whole cells: acceleration off Coulomb's, of g sin",
         100.0 * abs(stairs - exact) / drive,
         high=2.0,
@@ -311,7 +311,7 @@ def planes(found: Findings, cells: int, cases: tuple[tuple[float, float], ...] =
 
 
 @check_at("sand oblique", "hopper of {cells} cells")
-def hopper(found: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> None:
+def hopper(findings: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> None:
     """Let sand run from a hopper at several places in the grid."""
     cut, stairs = (
         np.array([discharge(shift, cells, whole=whole) for shift in shifts])
@@ -321,11 +321,11 @@ def hopper(found: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHI
     def spread(rates: np.ndarray) -> float:
         return 100.0 * float(np.ptp(rates.mean(axis=1)) / rates.mean())
 
-    found.add("spread of the rate over places in the grid", spread(cut), high=6.0, unit="%")
+    findings.add("spread of the rate over places in the grid", spread(cut), high=6.0, unit="%")
     growth = 100.0 * float(np.abs(cut[:, -1] / cut[:, 0] - 1.0).max())
-    found.add("growth of the rate as the hopper empties", growth, high=10.0, unit="%")
-    found.add("rate / sqrt(g D^3)", float(cut.mean()), low=0.7, high=2.0)
-    found.must_break(
+    findings.add("growth of the rate as the hopper empties", growth, high=10.0, unit="%")
+    findings.add("rate / sqrt(g D^3)", float(cut.mean()), low=0.7, high=2.0)
+    findings.must_break(
         "whole cells: spread of the rate over places in the grid",
         spread(stairs),
         high=6.0,

@@ -94,62 +94,70 @@ class Rest(NamedTuple):
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
-def whole_cells(found: Findings, resolution: int, numerics: Numerics = VOXEL) -> None:
+def whole_cells(findings: Findings, resolution: int, numerics: Numerics = VOXEL) -> None:
     """Test rest with a surface and solids of whole cells.
 
     The controls are a pool with tilted gravity, and a surface within the cells.
     """
     for case, tables in CASES.items():
         rest = settle(resolution, VOXEL, DURATION, **tables)
-        found.add(f"{case}: largest speed", rest.largest(0.0, DURATION), high=1e-3)
+        findings.add(f"{case}: largest speed", rest.largest(0.0, DURATION), high=1e-3)
         if case.startswith("pool"):
-            found.add(
+            findings.add(
                 f"{case}: bias of the pressure", rest.bias, low=0.48, high=0.52, unit="rho g dx"
             )
         if case == "pool":
-            _draw_profile(found, rest)
+            _draw_profile(findings, rest)
     tilts = settle(resolution, VOXEL, AVERAGED, liquid=POOL, physics=tilted(TILT))
-    found.must_break(
+    findings.must_break(
         "level pool under tilted gravity: largest speed", tilts.largest(0.0, AVERAGED), high=1e-3
     )
     within = settle(resolution, SUB_CELL, 2 * AVERAGED, **CASES["pool"])
-    found.must_break(
+    findings.must_break(
         "sub-cell pool: bias of the pressure", within.bias, low=0.48, high=0.52, unit="rho g dx"
     )
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
-def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
+def sub_cell(findings: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
     """Test rest with a sub-cell surface and cut cells.
 
     The control is the bias of a surface of whole cells.
     """
     for case, tables in CASES.items():
         rest = settle(resolution, numerics, DURATION, **tables)
-        found.add(f"{case}: largest speed in the first second", rest.largest(0.0, 1.0), high=0.05)
-        found.add(f"{case}: largest speed from 8 to 10 s", rest.largest(8.0, DURATION), high=0.01)
-        found.curve(case, rest.time, rest.speed)
+        findings.add(
+            f"{case}: largest speed in the first second", rest.largest(0.0, 1.0), high=0.05
+        )
+        findings.add(
+            f"{case}: largest speed from 8 to 10 s", rest.largest(8.0, DURATION), high=0.01
+        )
+        findings.curve(case, rest.time, rest.speed)
         if case.startswith("pool"):
-            found.add(f"{case}: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx")
+            findings.add(
+                f"{case}: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx"
+            )
         if case == "pool":
-            _draw_profile(found, rest)
+            _draw_profile(findings, rest)
     level = LEVEL + 0.5 * SIDE / resolution  # its surface goes through the centers of cells
     rest = settle(resolution, numerics, DURATION, level, liquid=[box([0.0, 0.0], [SIDE, level])])
-    found.add(
+    findings.add(
         "pool half a cell higher: |bias of the pressure|",
         abs(rest.bias),
         high=0.02,
         unit="rho g dx",
     )
-    found.curve("pool half a cell higher", rest.time, rest.speed)
+    findings.curve("pool half a cell higher", rest.time, rest.speed)
     whole = settle(resolution, VOXEL, 2 * AVERAGED, **CASES["pool"])
-    found.must_break(
+    findings.must_break(
         "whole cells: |bias of the pressure|", abs(whole.bias), high=0.02, unit="rho g dx"
     )
 
 
 @check_at("tilted rest", "{resolution} cells, {numerics.name}")
-def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED) -> None:
+def tilted_surface(
+    findings: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED
+) -> None:
     """Test rest of a free surface with tilted gravity.
 
     The control is a surface of whole cells, whose stairs flow.
@@ -163,17 +171,21 @@ def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes
         settle(resolution, each, TILTED_DURATION, **tables) for each in (numerics, VOXEL)
     )
     late = rest.time > 0.5 * TILTED_DURATION
-    found.add("largest speed", rest.largest(0.0, TILTED_DURATION), high=0.1)
-    found.add("largest speed after the first second", rest.largest(1.0, TILTED_DURATION), high=0.1)
-    found.add(
+    findings.add("largest speed", rest.largest(0.0, TILTED_DURATION), high=0.1)
+    findings.add(
+        "largest speed after the first second", rest.largest(1.0, TILTED_DURATION), high=0.1
+    )
+    findings.add(
         "mean of the largest speeds, second half over first",
         rest.speed[late].mean() / rest.speed[~late].mean(),
         high=1.0,
     )
-    found.add("change of volume", 100.0 * abs(rest.volume - 1.0), high=0.5, unit="%")
-    found.must_break("whole cells: largest speed", stairs.largest(0.0, TILTED_DURATION), high=0.3)
-    found.curve("surface", rest.time, rest.speed)
-    found.curve("whole cells", stairs.time, stairs.speed)
+    findings.add("change of volume", 100.0 * abs(rest.volume - 1.0), high=0.5, unit="%")
+    findings.must_break(
+        "whole cells: largest speed", stairs.largest(0.0, TILTED_DURATION), high=0.3
+    )
+    findings.curve("surface", rest.time, rest.speed)
+    findings.curve("whole cells", stairs.time, stairs.speed)
 
 
 def settle(
@@ -251,7 +263,7 @@ RESTING = ValidationCheck(
 
 
 @check_at("sloshing", "{cells} cells of depth, {numerics.name}")
-def sloshing(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def sloshing(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
     """Measure the sloshing period, the worst of some samples.
 
     The control is a surface of whole cells, which resolves waves in stairs only.
@@ -262,13 +274,13 @@ def sloshing(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None
         worst = int(np.argmax(np.abs(np.array(periods) - PERIOD)))
         error = 100.0 * abs(periods[worst] / PERIOD - 1.0)
         time, elevation = waves[worst]
-        found.curve(
+        findings.curve(
             f"{cells} cells, {each.name}, {periods[worst]:.4f} s", time, elevation / AMPLITUDE
         )
         if each is numerics:
-            found.add("error of the period", error, high=3.0, unit="%")
+            findings.add("error of the period", error, high=3.0, unit="%")
         else:
-            found.must_break(STAIRS, error, high=8.0, unit="%")
+            findings.must_break(STAIRS, error, high=8.0, unit="%")
 
 
 def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndarray, np.ndarray]:
@@ -326,13 +338,13 @@ def write_wave(path: Path) -> None:
     path.write_text("\n".join([*vertices, *faces]) + "\n", encoding="utf-8")
 
 
-def finer(found: Findings, trials: Sequence[ValidationTrial]) -> None:
+def finer(findings: Findings, trials: Sequence[ValidationTrial]) -> None:
     """Compare the errors of the period at both resolutions."""
     (coarse, _), (fine, stairs) = (
         [t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials
     )
-    found.add("error of the period", fine, high=max(coarse, 0.5), unit="%")
-    found.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
+    findings.add("error of the period", fine, high=max(coarse, 0.5), unit="%")
+    findings.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
 
 
 def _modes(trials: Sequence[ValidationTrial]) -> RecordLines:

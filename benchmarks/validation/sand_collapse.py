@@ -102,33 +102,33 @@ def envelope(aspect: float) -> tuple[float, float]:
 
 @check_at("sand collapse", "{cells} cells of width")
 def runouts(
-    found: Findings, cells: int, aspects: tuple[float, ...] = (), *, controls: bool = True
+    findings: Findings, cells: int, aspects: tuple[float, ...] = (), *, controls: bool = True
 ) -> None:
     """Compare runouts and heights with the experiments.
 
     The controls have half of the friction, and the largest friction of a cone.
 
     Args:
-        found: collector of the figures.
+        findings: collector of the figures.
         cells: cells of a column's width.
         aspects: ratios of height to width; those of the check by default.
         controls: whether the negative controls run too.
     """
-    chosen, ways = aspects or CASES[cells], []
-    for aspect in chosen:
+    chosen_aspects, ways = aspects or CASES[cells], []
+    for aspect in chosen_aspects:
         c, label = collapse(aspect, cells), f"a = {aspect:g}"
         ways.append(c.runout)
-        _compare(found, label, c, envelope(aspect))
-        found.add(
+        _compare(findings, label, c, envelope(aspect))
+        findings.add(
             f"{label}: way of the front in the last {STAYS:g} s",
             abs(c.moved),
             high=0.02,
             unit="widths",
         )
-        found.add(f"{label}: kinetic energy in the end over the largest", c.energy, high=1e-3)
-        found.add(f"{label}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
-        found.curve(label, *c.outline)
-    found.curve("runout", chosen, ways)
+        findings.add(f"{label}: kinetic energy in the end over the largest", c.energy, high=1e-3)
+        findings.add(f"{label}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
+        findings.curve(label, *c.outline)
+    findings.curve("runout", chosen_aspects, ways)
     for angle in (
         (math.degrees(math.atan(0.5 * math.tan(math.radians(FRICTION_ANGLE)))), STEEPEST)
         if controls
@@ -138,12 +138,16 @@ def runouts(
             CONTROLLED, cells, length=12.0, angle=angle, floor=math.tan(math.radians(angle))
         )
         _compare(
-            found, f"{angle:.0f} degrees, a = {CONTROLLED:g}", c, envelope(CONTROLLED), control=True
+            findings,
+            f"{angle:.0f} degrees, a = {CONTROLLED:g}",
+            c,
+            envelope(CONTROLLED),
+            control=True,
         )
 
 
 def _compare(
-    found: Findings,
+    findings: Findings,
     label: str,
     c: SandCollapse,
     bounds: tuple[float, float],
@@ -151,7 +155,7 @@ def _compare(
     control: bool = False,
 ) -> None:
     """Judge a runout by its bounds and a height by that of Lube et al."""
-    judge = found.must_break if control else found.add
+    judge = findings.must_break if control else findings.add
     judge(f"{label}: runout", c.runout, low=bounds[0], high=bounds[1], unit="widths")
     judge(f"{label}: height over Lube's", c.height, low=1.0 - HEIGHT, high=1.0 + HEIGHT)
 
@@ -191,7 +195,7 @@ def _energy(rows: Sequence[Row]) -> float:
 
 @check_at("sand collapse", "mu(I), {cells} cells of width")
 def growing(
-    found: Findings, cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]
+    findings: Findings, cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]
 ) -> None:
     """Compare columns with rate-dependent friction.
 
@@ -201,39 +205,39 @@ def growing(
     for aspect in aspects:
         c = collapse(aspect, cells, friction={"dynamic_angle": DYNAMIC, "grain_size": GRAIN})
         _compare(
-            found,
+            findings,
             f"a = {aspect:g}",
             c,
             envelope(aspect) if aspect < TALL else (lube(aspect), lajeunesse(aspect)),
         )
         ways.append(c.runout)
-    found.curve("runout", aspects, ways)
+    findings.curve("runout", aspects, ways)
 
 
 @check_at("sand collapse", "3-D, {cells} cells")
-def cube(found: Findings, cells: int = CUBE) -> None:
+def cube(findings: Findings, cells: int = CUBE) -> None:
     """Simulate the collapse of a square column in 3-D.
 
     It must stop as a round pile with the runout of round columns. The controls are the cube itself,
     and sand of nearly the steepest cone. Sand with half of the friction would meet the walls.
     """
     start, x, rows = _falling_cube({"friction_angle": FRICTION_ANGLE}, WALL_FRICTION, cells)
-    found.add("kinetic energy in the end over the largest", _energy(rows), high=1e-3)
-    found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
-    found.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
-    found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
+    findings.add("kinetic energy in the end over the largest", _energy(rows), high=1e-3)
+    findings.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
+    findings.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
+    findings.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
     radius = CUBE_WIDTH / math.sqrt(math.pi)  # radius of a round column of equal area
     aspect = CUBE_WIDTH / radius
     # [Lube2004], [Lajeunesse2004].
     low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)
-    found.add(
+    findings.add(
         f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii"
     )
-    found.add(
+    findings.add(
         "least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J"
     )
     _, x, _ = _falling_cube({"friction_angle": STEEP}, math.tan(math.radians(STEEP)), cells)
-    found.must_break(
+    findings.must_break(
         f"{STEEP:g} degrees, a = {aspect:.2f}: runout",
         _reach(x) / radius - 1.0,
         low=low,
@@ -300,7 +304,7 @@ COLLAPSES = ValidationCheck(
 
 
 @check_at("sand invariants", "{cells} cells of width")
-def invariants(found: Findings, cells: int, duration: float = DURATION) -> None:
+def invariants(findings: Findings, cells: int, duration: float = DURATION) -> None:
     """Check the invariants of every step of a collapse.
 
     The controls have no density correction, few iterations, and a leaking floor.
@@ -309,61 +313,61 @@ def invariants(found: Findings, cells: int, duration: float = DURATION) -> None:
     mass = simulation.particle_mass * simulation.particles.count
     rows, least, off = watch(simulation, duration)
     densest = np.array([row["max_fraction"] for row in rows])
-    found.add("change of the mass", _change(rows, mass), high=1e-12)
-    found.add(
+    findings.add("change of the mass", _change(rows, mass), high=1e-12)
+    findings.add(
         "mass off rho a b",
         abs(mass / (simulation.scene.physics.density * ASPECT * WIDTH**2) - 1.0),
         high=1e-9,
     )
-    found.add("least pressure", least, low=0.0, unit="rho g dx")
-    found.add(
+    findings.add("least pressure", least, low=0.0, unit="rho g dx")
+    findings.add(
         "99th percentile over steps: complementarity of the pressure",
         np.percentile(off, 99.0),
         high=2.0 * TOLERANCE,
     )
-    found.add(
+    findings.add(
         "steps with complementarity to 1e-3", 100.0 * (off <= TOLERANCE).mean(), low=95.0, unit="%"
     )
-    found.add(
+    findings.add(
         "largest predicted excess of a cell",
         max(row["predicted_excess"] for row in rows),
         high=EXCESS,
     )
-    found.add(
+    findings.add(
         "least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J/m"
     )
-    found.add("densest cell of any step, corrected", densest.max(), high=DENSEST)
-    found.add(
+    findings.add("densest cell of any step, corrected", densest.max(), high=DENSEST)
+    findings.add(
         "95th percentile over steps: densest cell, corrected",
         np.percentile(densest, 95.0),
         high=DENSEST,
     )
-    found.curve("with density correction", [row["time"] for row in rows], densest)
+    findings.curve("with density correction", [row["time"] for row in rows], densest)
 
     rows = list(
         steps(column(ASPECT, cells, length=LENGTH, density_correction={"every": 0}), duration)
     )
     densest = np.array([row["max_fraction"] for row in rows])
-    found.must_break("no correction: densest cell of any step", densest.max(), high=DENSEST)
-    found.curve("without", [row["time"] for row in rows], densest)
+    findings.must_break("no correction: densest cell of any step", densest.max(), high=DENSEST)
+    findings.curve("without", [row["time"] for row in rows], densest)
     rows, _, off = watch(
         column(ASPECT, cells, length=LENGTH, solver={"max_iterations": FEW}), duration
     )
     early = f"{FEW} iterations"
-    found.must_break(
+    findings.must_break(
         f"{early}: steps with complementarity to 1e-3",
         100.0 * (off <= TOLERANCE).mean(),
         low=95.0,
         unit="%",
     )
-    found.must_break(
+    findings.must_break(
         f"{early}: largest predicted excess of a cell",
         max(row["predicted_excess"] for row in rows),
         high=EXCESS,
     )
     drain = scenes.box([WIDTH, 0.0], [LENGTH * WIDTH, WIDTH])
     rows = list(steps(column(ASPECT, cells, length=LENGTH, drain=[drain]), duration))
-    found.must_break(
+    findings.must_break(
         "a drain beside the column: change of the mass", _change(rows, mass), high=1e-12
     )
 
@@ -399,32 +403,32 @@ INVARIANTS = ValidationCheck(
 
 
 @check_at("sand rest", "{cells} cells of width")
-def resting(found: Findings, cells: int, watches: int = WATCHES) -> None:
+def resting(findings: Findings, cells: int, watches: int = WATCHES) -> None:
     """Measure the drift of a pile at rest.
 
     The control is sand of little friction.
     """
     whole, deep = np.array(rest(cells, watches)).T
-    found.add(
+    findings.add(
         f"{AFTER:g} s after the stop: drift four cells below the surface",
         deep[0],
         high=DEEP,
         unit="heights/s",
     )
-    found.add(f"{AFTER:g} s after the stop: drift of all", whole[0], high=ALL, unit="heights/s")
+    findings.add(f"{AFTER:g} s after the stop: drift of all", whole[0], high=ALL, unit="heights/s")
     if watches > 1:
-        found.add(
+        findings.add(
             "later: largest drift four cells below the surface",
             deep[1:].max(),
             high=DEEP,
             unit="heights/s",
         )
-        found.add("drift of all, in the end over that", whole[-1] / whole[0], high=1.0)
+        findings.add("drift of all, in the end over that", whole[-1] / whole[0], high=1.0)
     at = STOPPED * FALL + AFTER + WATCHED * (np.arange(watches) + 0.5)
-    found.curve("all", at, whole)
-    found.curve("deep", at, deep)
+    findings.curve("all", at, whole)
+    findings.curve("deep", at, deep)
     ((_, slides),) = rest(cells, 1, material={"friction_angle": SLIPPERY})
-    found.must_break(
+    findings.must_break(
         f"{SLIPPERY:g} degrees: drift four cells below the surface",
         slides,
         high=DEEP,
@@ -444,7 +448,7 @@ def rest(cells: int, watches: int, **tables: TableValue) -> list[tuple[float, fl
 
 
 @check_at("sand models", "{cells} cells of width")
-def models(found: Findings, cells: int) -> None:
+def models(findings: Findings, cells: int) -> None:
     """Compare cone and box: cost, runout and rest.
 
     The solves of the control end after a few iterations.
@@ -455,20 +459,26 @@ def models(found: Findings, cells: int) -> None:
         begun = time.perf_counter()
         rows = list(steps(simulation, STOPPED * FALL + AFTER))
         seconds = (time.perf_counter() - begun) / len(rows)
-        found.add(f"{model}: runout", scenes.runout(simulation), low=low, high=high, unit="widths")
-        found.add(f"{model}: time of a step", 1e3 * seconds, high=200.0, unit="ms")
-        found.add(
+        findings.add(
+            f"{model}: runout", scenes.runout(simulation), low=low, high=high, unit="widths"
+        )
+        findings.add(f"{model}: time of a step", 1e3 * seconds, high=200.0, unit="ms")
+        findings.add(
             f"{model}: iterations of a step",
             np.mean([row["solve_iterations"] for row in rows]),
             high=600.0,
         )
-        found.add(f"{model}: steps with stresses to 1e-3", share_solved(rows), low=least, unit="%")
+        findings.add(
+            f"{model}: steps with stresses to 1e-3", share_solved(rows), low=least, unit="%"
+        )
         whole, deep = scenes.drift(simulation, WATCHED, ASPECT * WIDTH)
-        found.add(f"{model}: drift of all", whole, high=1e-2, unit="heights/s")
-        found.add(f"{model}: drift four cells below the surface", deep, high=1e-2, unit="heights/s")
+        findings.add(f"{model}: drift of all", whole, high=1e-2, unit="heights/s")
+        findings.add(
+            f"{model}: drift four cells below the surface", deep, high=1e-2, unit="heights/s"
+        )
     hasty = column(ASPECT, cells, length=LENGTH, solver={"max_iterations": FEW})
     solved = share_solved(list(steps(hasty, STOPPED * FALL)))
-    found.must_break(
+    findings.must_break(
         f"cone, {FEW} iterations: steps with stresses to 1e-3", solved, low=95.0, unit="%"
     )
 

@@ -54,40 +54,40 @@ class Heap(NamedTuple):
 
 
 @check_at("sand heap", "{cells} cells of length")
-def heaps(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
+def heaps(findings: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
     """Pour heaps; the control, at the lowest resolution, has half the friction."""
     for angle in angles:
         heap = pour(cells, angle)
         low, high = angle - NEAR, angle + NEAR
-        found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
-        found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
-        found.add(
+        findings.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
+        findings.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
+        findings.add(
             f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08
         )
-        found.add(
+        findings.add(
             f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%"
         )
-        found.curve(f"{angle:g} degrees", *heap.outline)
+        findings.curve(f"{angle:g} degrees", *heap.outline)
     if cells == RESOLUTIONS[0]:
         low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
         flat = pour(cells, half_as_steep(CONTROLLED), lasts=SETTLES).angle
-        found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
+        findings.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
 
 
 @check_at("sand wedge", "{cells} cells of length")
-def wedges(found: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
+def wedges(findings: Findings, cells: int, angles: Sequence[float] = ANGLES) -> None:
     """Test the rest of wedges flatter than the angle at which a layer stops.
 
     The control has half the friction.
     """
     for angle in angles:
-        found.add(
+        findings.add(
             f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle), high=SHRINKS
         )
     flows = lost(
         cells, CONTROLLED, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)}
     )
-    found.must_break(
+    findings.must_break(
         f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS
     )
 
@@ -210,11 +210,11 @@ def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float
     )
 
 
-def alike(found: Findings, trials: Sequence[ValidationTrial]) -> None:
+def alike(findings: Findings, trials: Sequence[ValidationTrial]) -> None:
     """Compare the heaps of both resolutions."""
     for angle in ANGLES:
         coarse, fine = (t.value(f"{angle:g} degrees: heap") for t in trials[:2])
-        found.add(
+        findings.add(
             f"{angle:g} degrees: |difference of the heaps|",
             abs(fine - coarse),
             high=ALIKE,

@@ -66,57 +66,57 @@ def trial(refinement: int, openings: tuple[int, ...] = ()) -> ValidationTrial:
     The control is a liquid.
     """
 
-    def run(found: Findings) -> None:
-        dx, rates, chosen = SPACING / refinement, [], openings or OPENINGS[refinement]
-        for cells in chosen:
+    def run(findings: Findings) -> None:
+        dx, rates, chosen_openings = SPACING / refinement, [], openings or OPENINGS[refinement]
+        for cells in chosen_openings:
             d, label = sand(cells, refinement), f"D = {cells} cells"
             rates.append(float(d.rate.mean()))
-            found.add(
+            findings.add(
                 f"{label}: spread of the rate while fill > {LEAST:g} widths",
                 d.spread,
                 high=8.0,
                 unit="%",
             )
-            found.add(
+            findings.add(
                 f"{label}: rate / sqrt(g D^3)",
                 rates[-1] / math.sqrt(GRAVITY * (cells * dx) ** 3),
                 low=0.7,
                 high=1.3,
             )
-            found.add(f"{label}: steps with stresses to 1e-3", d.solved, low=95.0, unit="%")
-            found.curve(label, d.fill, d.rate / d.rate[0])
-        if len(chosen) > 2:
+            findings.add(f"{label}: steps with stresses to 1e-3", d.solved, low=95.0, unit="%")
+            findings.curve(label, d.fill, d.rate / d.rate[0])
+        if len(chosen_openings) > 2:
             root = np.array(rates) ** (2.0 / 3.0)
-            slope, offset = np.polyfit(np.array(chosen), root, 1)
-            fitted = slope * np.array(chosen) + offset
-            found.add(
+            slope, offset = np.polyfit(np.array(chosen_openings), root, 1)
+            fitted = slope * np.array(chosen_openings) + offset
+            findings.add(
                 "delta of rate ~ (D - delta)^(3/2)",
                 -offset / slope,
                 low=-0.5,
                 high=0.5,
                 unit="cells",
             )
-            found.add(
+            findings.add(
                 "worst rate off that law",
                 100.0 * np.abs((root / fitted) ** 1.5 - 1.0).max(),
                 high=4.0,
                 unit="%",
             )
-            found.curve("law", dx * np.array(chosen), root)
+            findings.curve("law", dx * np.array(chosen_openings), root)
         high, w = liquid(8)
-        found.must_break(
+        findings.must_break(
             f"liquid: spread of the rate while fill > {LEAST:g} widths",
             high.spread,
             high=8.0,
             unit="%",
         )
-        found.add(
+        findings.add(
             "liquid: exponent of the rate over height",
             np.polyfit(np.log(w.fill), np.log(w.rate), 1)[0],
             low=0.4,
             high=0.6,
         )
-        found.curve("liquid", w.fill, w.rate / w.rate[0])
+        findings.curve("liquid", w.fill, w.rate / w.rate[0])
 
     return attempt("sand hourglass", f"cells of {1000.0 * SPACING / refinement:g} mm", run)
 

@@ -69,7 +69,7 @@ def janssen(depth: float, friction: float, ratio: float, walls: int = 2) -> floa
 
 @check_at("sand silo", "{cells} cells of width, {dimension}-D")
 def trial(
-    found: Findings,
+    findings: Findings,
     cells: int,
     dimension: int = 2,
     frictions: tuple[float, ...] = FRICTIONS,
@@ -83,7 +83,7 @@ def trial(
     depths = range(1, math.ceil(more["deep"]))
     for friction in frictions:
         bears(
-            found,
+            findings,
             f"mu = {friction:g}",
             rest(fill(cells, friction, **more)),
             friction,
@@ -92,21 +92,23 @@ def trial(
         )
     friction = frictions[len(frictions) // 2]
     plain, short = (rest(fill(cells, friction, **more), tiny=tiny) for tiny in (0.0, TINY))
-    found.add(
+    findings.add(
         f"a step of {TINY:g} s every {PERIOD}: largest change of a load",
         change(plain, short, depths),
         high=0.02,
     )
     lid = rest(fill(cells, friction, lid=LOAD, **more))
     left = np.array([lid.at(z) - plain.at(z) for z in depths])
-    found.add(
+    findings.add(
         "a lid: what a width leaves of its load, at most",
         float((left[1:] / left[:-1]).max()),
         high=1.0,
     )
-    found.add("a lid: what is left of its load one width down", left[0] / LOAD, low=0.0, high=1.0)
+    findings.add(
+        "a lid: what is left of its load one width down", left[0] / LOAD, low=0.0, high=1.0
+    )
     level = rest(fill(cells, 0.0, **more))
-    found.add(
+    findings.add(
         "mu = 0: largest load off the weight above",
         max(abs(level.at(z) / z - 1.0) for z in depths),
         high=0.02,
@@ -114,10 +116,10 @@ def trial(
 
 
 @check_at("sand silo", "{cells} cells between two walls, 3-D")
-def slot(found: Findings, cells: int) -> None:
+def slot(findings: Findings, cells: int) -> None:
     """Compare a silo of two walls in 3-D with Janssen's law."""
     bears(
-        found,
+        findings,
         "mu = 0.5",
         rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT)),
         0.5,
@@ -126,7 +128,7 @@ def slot(found: Findings, cells: int) -> None:
 
 
 @check_at("sand silo, wrong", "{cells} cells of width, 2-D")
-def controls(found: Findings, cells: int) -> None:
+def controls(findings: Findings, cells: int) -> None:
     """Run the negative controls, which must all miss the law.
 
     The controls are sand pushed up, which reverses the walls' friction, and former rules of packing
@@ -139,21 +141,21 @@ def controls(found: Findings, cells: int) -> None:
         ("sand that is too dense is pushed out", rest(fill(cells, 0.5), each=_pack_as_before)),
     ):
         most = max(silo.at(z) / janssen(z, 0.5, RATIOS[0]) for z in depths)
-        found.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
-        found.must_break(
+        findings.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
+        findings.must_break(
             f"{label}: least shear of the walls, upward",
             float(silo.shear[silo.depth > NEAR].min()),
             low=0.0,
         )
-        found.curve(label, silo.depth, silo.load)
+        findings.curve(label, silo.depth, silo.load)
     gaps = rest(fill(cells, 0.5), each=_close_all_gaps)
-    found.must_break(
+    findings.must_break(
         "gaps of the sampling close: way of the center of mass over the height",
         gaps.fell,
         high=2e-4,
     )
     short = rest(fill(cells, 0.5), tiny=TINY, each=_keep_impulses)
-    found.must_break(
+    findings.must_break(
         "impulses of steps of other lengths: largest change of a load",
         change(plain, short, depths),
         high=0.02,
@@ -161,7 +163,7 @@ def controls(found: Findings, cells: int) -> None:
 
 
 def bears(
-    found: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2
+    findings: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2
 ) -> None:
     """Add the loads of a silo at whole widths of depth."""
     loads = np.array([silo.at(z) for z in depths])
@@ -169,30 +171,30 @@ def bears(
         np.array([janssen(z, friction, ratio, walls) for z in depths]) for ratio in reversed(RATIOS)
     )
     rises = np.diff(np.append(0.0, loads))
-    found.add(
+    findings.add(
         f"{label}: least load over that of K = 1", float((loads / least).min()), low=1.0 - BEYOND
     )
-    found.add(
+    findings.add(
         f"{label}: largest load over that of K = 1/3",
         float((loads / most).max()),
         high=1.0 + BEYOND,
     )
-    found.add(
+    findings.add(
         f"{label}: least rise of the load in a width", float(rises.min()), low=0.0, unit="rho g W"
     )
-    found.add(
+    findings.add(
         f"{label}: largest ratio of a rise to that before",
         float((rises[1:] / rises[:-1]).max()),
         high=1.0,
     )
     below = (silo.depth > NEAR) & (silo.depth < depths[-1])
-    found.add(
+    findings.add(
         f"{label}: least shear of the walls over the load, upward",
         float(silo.shear[below].min()),
         low=0.0,
     )
-    found.add(f"{label}: way of the center of mass over the height", silo.fell, high=2e-4)
-    found.curve(label, silo.depth, silo.load)
+    findings.add(f"{label}: way of the center of mass over the height", silo.fell, high=2e-4)
+    findings.curve(label, silo.depth, silo.load)
 
 
 def change(one: Silo, other: Silo, depths: range) -> float:

@@ -45,7 +45,7 @@ Watched = Callable[..., None]  # of a simulation
 
 
 @check_at("time steps", "{what}, {cells} cells")
-def trial(found: Findings, cells: int, what: str) -> None:
+def trial(findings: Findings, cells: int, what: str) -> None:
     """Halve the steps of a collapse.
 
     The controls push dense material apart within the step, and let gravity act for whole steps.
@@ -53,23 +53,23 @@ def trial(found: Findings, cells: int, what: str) -> None:
     lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
     runs = [collapse(what, cells, dt) for dt in lengths]
     changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
-    found.add(
+    findings.add(
         "most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total"
     )
-    found.add(
+    findings.add(
         "highest energy over that at the start",
         max(float(E.max()) for E, _ in runs),
         high=1.0 + MOST,
     )
-    found.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
-    found.add(
+    findings.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
+    findings.add(
         "change by the last halving over that by the first", changes[-1] / changes[0], high=1.0
     )
     for dt, (energy, _) in zip(lengths, runs, strict=True):
-        found.curve(f"{what}, {1e3 * dt:g} ms", MOMENTS, energy)
+        findings.curve(f"{what}, {1e3 * dt:g} ms", MOMENTS, energy)
     if what in PUSHED_APART:
         _, gained = collapse(what, cells, lengths[-1], change=PUSHED_APART[what])
-        found.must_break(
+        findings.must_break(
             "old relaxation: most that a step adds", gained, high=MOST, unit="of the total"
         )
 

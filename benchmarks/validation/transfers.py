@@ -120,18 +120,18 @@ def cloud(n: int, real: str, *, affine: bool) -> Cloud:
 
 
 @check_at("transfers", "{n} cells")
-def round_trip(found: Findings, n: int) -> None:
+def round_trip(findings: Findings, n: int) -> None:
     """Transfer to the grid and back.
 
     The control is PIC, which loses angular momentum.
     """
     for real, (*_, limit) in REALS.items():
         linear, angular = changes(cloud(n, real, affine=True))
-        found.add(f"APIC, {real}: change of momentum", linear, high=limit)
-        found.add(f"APIC, {real}: change of angular momentum", angular, high=limit)
+        findings.add(f"APIC, {real}: change of momentum", linear, high=limit)
+        findings.add(f"APIC, {real}: change of angular momentum", angular, high=limit)
     linear, angular = changes(cloud(n, "float64", affine=False))
-    found.add("PIC, float64: change of momentum", linear, high=1e-12)
-    found.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
+    findings.add("PIC, float64: change of momentum", linear, high=1e-12)
+    findings.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
 
 
 def changes(c: Cloud) -> tuple[float, float]:
@@ -152,30 +152,32 @@ def changes(c: Cloud) -> tuple[float, float]:
     "advection",
     f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells",
 )
-def orders(found: Findings) -> None:
+def orders(findings: Findings) -> None:
     """Find the order of the advection in time and in space.
 
     The order in time is found on Zalesak's disk, that in space in a vortex.
     """
     turns = [zalesak_error(steps) for steps in TURN_STEPS]
-    found.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
-    found.add(
+    findings.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
+    findings.add(
         f"Zalesak's disk, {TURN_STEPS[-1]} steps: largest error over the slot's width",
         turns[-1] / 0.05,
         high=0.01,
     )
     errors = [vortex_error(n) for n in VORTEX_GRIDS]
-    found.add("rotating blob in a vortex: order in space", order(errors), low=1.8, high=2.4)
-    found.must_break(
+    findings.add("rotating blob in a vortex: order in space", order(errors), low=1.8, high=2.4)
+    findings.must_break(
         "Euler's steps, one turn: order in time",
         order([euler_error(steps) for steps in TURN_STEPS]),
         low=2.7,
         high=3.3,
     )
     collocated = [vortex_error(n, off=0.5) for n in VORTEX_GRIDS]
-    found.must_break("fields half a cell off: order in space", order(collocated), low=1.8, high=2.4)
-    found.curves["Zalesak's disk, steps a turn"] = (TURN_STEPS, turns)
-    found.curves["vortex, cells a side"] = (VORTEX_GRIDS, errors)
+    findings.must_break(
+        "fields half a cell off: order in space", order(collocated), low=1.8, high=2.4
+    )
+    findings.curves["Zalesak's disk, steps a turn"] = (TURN_STEPS, turns)
+    findings.curves["vortex, cells a side"] = (VORTEX_GRIDS, errors)
 
 
 def zalesak_error(steps: int, n: int = 64) -> float:

@@ -65,23 +65,25 @@ class Fall(NamedTuple):
 
 
 @check_at("ceiling", "{resolution} cells, {numerics.name}, {ceiling}")
-def falling(found: Findings, resolution: int, numerics: Numerics, ceiling: str = "flat") -> None:
+def falling(findings: Findings, resolution: int, numerics: Numerics, ceiling: str = "flat") -> None:
     """Drop the block; then repeat with each thing that would hold it."""
     fall = drop(resolution, numerics, ceiling)
-    found.add("expected way", fall.expected, low=8.0, unit="cells")
-    found.add("worst particle", fall.worst, high=0.5, unit="cells")
-    found.add("largest |p| over rho g H", max(abs(fall.lowest), fall.highest) / WEIGHT, high=1e-6)
+    findings.add("expected way", fall.expected, low=8.0, unit="cells")
+    findings.add("worst particle", fall.worst, high=0.5, unit="cells")
+    findings.add(
+        "largest |p| over rho g H", max(abs(fall.lowest), fall.highest) / WEIGHT, high=1e-6
+    )
     hanging = drop(resolution, numerics, ceiling, wall="free-slip")
-    found.must_break("free-slip: mean way", float(hanging.fallen.mean()), low=0.5, unit="cells")
-    found.must_break("free-slip: lowest p over rho g H", hanging.lowest / WEIGHT, low=-0.1)
+    findings.must_break("free-slip: mean way", float(hanging.fallen.mean()), low=0.5, unit="cells")
+    findings.must_break("free-slip: lowest p over rho g H", hanging.lowest / WEIGHT, low=-0.1)
     stuck = drop(resolution, numerics, ceiling, release=False)
-    found.add(
+    findings.add(
         "wall's velocity kept: mean behind",
         stuck.expected - float(stuck.fallen.mean()),
         high=1.0,
         unit="cells",
     )
-    found.must_break("wall's velocity kept: worst particle", stuck.worst, high=0.5, unit="cells")
+    findings.must_break("wall's velocity kept: worst particle", stuck.worst, high=0.5, unit="cells")
 
 
 def drop(
@@ -147,17 +149,17 @@ CEILING = ValidationCheck(
 
 
 @check_at("slope", "{cells} cells of depth, {numerics.name}")
-def sliding(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def sliding(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
     """Let a layer slide on both kinds of wall.
 
     The control is a free-slip wall of whole cells, whose stairs stop it.
     """
     for wall in ("separating", "free-slip"):
         loss, lift, way = slide(cells, numerics, wall)
-        found.add(f"{wall}: way", way, low=0.98 * WAY_IN_DEPTHS * cells, unit="cells")
-        found.add(f"{wall}: loss of momentum", 100.0 * loss, high=0.1, unit="%")
-        found.add(f"{wall}: lift", abs(lift), high=0.05, unit="cells")
-    found.must_break(
+        findings.add(f"{wall}: way", way, low=0.98 * WAY_IN_DEPTHS * cells, unit="cells")
+        findings.add(f"{wall}: loss of momentum", 100.0 * loss, high=0.1, unit="%")
+        findings.add(f"{wall}: lift", abs(lift), high=0.05, unit="cells")
+    findings.must_break(
         "whole cells, free-slip: loss of momentum",
         100.0 * slide(cells, VOXEL, "free-slip")[0],
         high=0.1,

@@ -116,17 +116,17 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return NOTEBOOK.sub(r"](\1.md)", markdown)
 
 
-def formula(found: re.Match[str]) -> str:
+def formula(match: re.Match[str]) -> str:
     """Return a TeX formula as MathML."""
     from latex2mathml.converter import convert
 
-    mathml = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
+    mathml = convert(html.unescape(match[2]), display="block" if match[1] == "div" else "inline")
     if "\\" in mathml:
-        raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
+        raise ValueError(f"not all of this is TeX that can be drawn: {match[2]}")
     mathml = mathml.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace(
         "<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>"
     )
-    return f'<div class="formula">{mathml}</div>' if found[1] == "div" else mathml
+    return f'<div class="formula">{mathml}</div>' if match[1] == "div" else mathml
 
 
 def typeset(text: str) -> str:

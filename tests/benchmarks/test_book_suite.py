@@ -93,7 +93,7 @@ def test_planted_solutions_are_solutions_and_those_of_the_recipes_are_not(kind):
         assert infeasible == (kind == "fluid, recipe") or kind == "contact, recipe"
 
 
-def test_the_fluid_recipe_has_nothing_complementary():
+def test_the_fluid_recipe_has_no_active_bounds():
     """Positive solution of the linear system for the fluid recipe.
 
     The matrix is an M-matrix, b <= 0 where x > 0 and b = 0 elsewhere, so nothing is complementary.
@@ -118,7 +118,7 @@ def test_the_contact_recipe_has_the_pattern_of_stewart_and_trinkle_on_its_diagon
             assert_allclose(block[:, 5], [0, 1, 1, 1, 1, 0])
 
 
-def test_the_book_s_test_of_sweeps_accepts_what_solves_nothing():
+def test_the_book_s_stopping_test_accepts_wrong_solutions():
     p = kinds(ProblemScale(5, 4, 10, 12, (8,), (2,), 10))["contact, recipe"](0)
     trace = follow(p, appendix_c.PGS, Merit.PRODUCT, "cpu")
     state, _, residual = trace.verdict(Merit.PRODUCT, Limits())
@@ -142,7 +142,7 @@ def test_the_recipe_with_many_zero_eigenvalues_has_no_solution(zeros):
         assert np.abs(np.minimum(x, planted.A @ x + planted.b)).max() < 1e-5
 
 
-def test_verdicts_are_num4lcp_s():
+def test_statuses_agree_with_num4lcp():
     def trace(merits, status=wl.SolveStatus.MAX_ITERATIONS):
         return Trace(merits, [1.0] * len(merits), status)
 

@@ -33,7 +33,7 @@ MEETS = {
 
 
 @pytest.mark.parametrize("kind", MEETS)
-def test_a_kind_meets_its_rule(kind):
+def test_each_problem_kind_matches_its_selection_rule(kind):
     assert choose.rule_number(wl.recommend(draw(kind, 900), accuracy=choose.RTOL)) == MEETS[kind]
 
 

@@ -34,7 +34,7 @@ def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
     assert ledger.total() - ledger.height() == pytest.approx(0.5 * mass * speed**2, rel=1e-5)
 
 
-def test_what_a_source_brings_is_not_made() -> None:
+def test_energy_of_source_inflow_is_not_counted_as_gain() -> None:
     """Energy of emitted particles: that of particles at the inflow velocity.
 
     The first step emits them; nothing else happens.
@@ -185,7 +185,7 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", ["liquid, unilateral", "sand"])
-def test_the_old_relaxation_is_told(what: str) -> None:
+def test_an_energy_gain_of_the_old_relaxation_is_detected(what: str) -> None:
     """Detection of the former relaxation, which pushed dense material apart in a step.
 
     The shorter the step, the faster the material moved.
@@ -197,6 +197,6 @@ def test_the_old_relaxation_is_told(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", ["liquid, whole cells", "sand", "body over liquid"])
-def test_what_is_thrown_flies_along_its_parabola(what: str) -> None:
+def test_thrown_material_follows_its_parabola(what: str) -> None:
     assert flight.off_its_parabola(what, 16, 8.0) < flight.MOST
     assert flight.off_its_parabola(what, 16, 8.0, whole_kicks=True) > 0.1

@@ -83,7 +83,7 @@ def test_a_wrong_solver_is_caught(name, precision):
 
 
 @pytest.mark.parametrize("precision", case.PRECISIONS)
-def test_what_wrong_solvers_are_given_passes_with_a_right_one(precision):
+def test_cases_for_wrong_solvers_pass_with_a_correct_solver(precision):
     for _, make, method in broken.RIGHT:
         assert judge(SolveCase("right", "right", make, method), precision, "cpu").wrong == []
 
@@ -126,13 +126,13 @@ def test_judgment(promise, attempt, expected):
     assert (expected in "; ".join(found)) if expected else found == []
 
 
-def test_a_case_beyond_its_budget_is_not_as_it_must_be(monkeypatch):
+def test_a_case_beyond_its_budget_fails(monkeypatch):
     monkeypatch.setattr(case, "LAST_CALL", 0.0)
     slow = RefusalCase("slow", "slow", lambda device, precision: worked(0.05), "x", budget=0.01)
     assert any("its budget is 0.01 s" in line for line in judge(slow, "mixed", "cpu").wrong)
 
 
-def test_time_of_other_programs_is_not_in_a_budget(monkeypatch):
+def test_budgets_exclude_time_of_other_programs(monkeypatch):
     monkeypatch.setattr(case, "LAST_CALL", 0.0)
     waits = RefusalCase(
         "waits", "waits", lambda device, precision: time.sleep(0.2), "x", budget=0.1

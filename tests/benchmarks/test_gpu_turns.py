@@ -9,7 +9,7 @@ from benchmarks import gpu_turns
 from warp_lcp.scene.scene_file import built_in_scenes
 
 
-def test_methods_and_scenes_are_there() -> None:
+def test_listed_methods_and_scenes_exist() -> None:
     found = list(gpu_turns.pieces(gpu_turns.Sizes()))
     assert all(hasattr(wl, name) for kind, name, _ in found if kind != "step")
     assert set(gpu_turns.SCENES.values()) <= set(built_in_scenes())

@@ -61,7 +61,7 @@ def test_signs_at_upper_bounds_and_in_equations():
     ) == ["FALSE CONVERGED"]
 
 
-def test_a_row_that_others_hide_is_told():
+def test_a_small_row_hidden_by_large_ones_is_reported():
     """Report of a row that others hide.
 
     x_1 = 0 is wrong in its own row, but only 1e-12 of the norm to which the tolerance is relative.
@@ -80,7 +80,7 @@ def test_a_row_that_others_hide_is_told():
     assert categories(truth, HostileAnswer("CONVERGED", np.array([1.0, 1e12]))) == ["converged"]
 
 
-def test_a_false_infeasible_is_seen():
+def test_a_false_infeasible_status_is_detected():
     """Detection of a false INFEASIBLE.
 
     It is detected by the planted solution, by a linear program for monotone A, and by enumeration.
@@ -95,7 +95,7 @@ def test_a_false_infeasible_is_seen():
     assert exists(box([-1.0, 0.0], A=-A, definite=False, upper=np.ones(2)))
 
 
-def test_what_ends_honestly():
+def test_failure_statuses_are_not_counted_as_false_answers():
     known = box([-1.0, 1.0], solvable=True)
     assert categories(known, HostileAnswer("STAGNATED", np.zeros(2))) == ["not solved"]
     assert categories(known, HostileAnswer("STAGNATED", np.zeros(2)), "psor") == ["other method"]
@@ -187,7 +187,7 @@ def test_the_stencil_oracle_follows_the_definition():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_case_is_that_of_its_seed(kind):
+def test_a_case_repeats_for_its_seed(kind):
     names = {draw_case(kind, SEED, i).name for i in range(6)}
     assert names == {draw_case(kind, SEED, i).name for i in range(6)}
     assert len(names) > 3
@@ -229,12 +229,12 @@ SOLVED = {
 
 
 @pytest.mark.parametrize(("kind", "index"), [(kind, i) for kind in KINDS for i in SOLVED[kind]])
-def test_cases_are_solved_or_rightly_refused(kind, index):
+def test_cases_are_solved_or_correctly_refused(kind, index):
     _, verdicts = examine(draw_case(kind, SEED, index))
     assert [v for v in verdicts if v[0] in (*FAULTS, "not solved", "refused")] == []
 
 
-def test_a_worker_streams_what_becomes_of_its_cases():
+def test_a_worker_streams_the_results_of_its_cases():
     outcomes = supervise("narrow", SEED, 2)
     assert [o.index for o in outcomes] == [0, 1]
     assert all(o.verdicts for o in outcomes)

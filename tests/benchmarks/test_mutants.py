@@ -14,7 +14,7 @@ from warp_lcp.benchmarks.mutants.tests_of import tests_of as chosen_for
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_tests_that_bear_a_modules_name_come_first():
+def test_tests_named_after_the_module_run_first():
     assert (
         chosen_for(ROOT, "warp_lcp/multigrid/hierarchy.py")[0]
         == "tests/multigrid/test_hierarchy.py"
@@ -41,7 +41,7 @@ def test_a_mutant_is_one_change_that_still_is_python():
         assert (mutant.before, mutant.after) in [(a.strip(), b.strip()) for a, b in pairs if a != b]
 
 
-def test_formulas_stand_where_their_mutants_look_for_them():
+def test_formulas_are_found_in_their_files():
     for formula in FORMULAS:
         assert (ROOT / formula.module).read_text().count(formula.before) == 1, formula
         assert formula.before != formula.after
@@ -77,7 +77,7 @@ def test_headers_are_changed_between_operands_only():
     }
 
 
-def test_headers_have_the_tests_of_who_names_them():
+def test_headers_have_the_tests_of_modules_that_name_them():
     assert (
         "tests/multigrid/test_hierarchy.py"
         in chosen_for(ROOT, "warp_lcp/multigrid/headers/coarsen.h")[:4]

@@ -51,19 +51,21 @@ def question():
 def dense_solution(question, rounds=200):
     """Return the LCP's solution by primal-dual active sets and dense solves."""
     A, b, lower = question.matrix.toarray(), question.b, question.lower
-    held = np.zeros(len(b), dtype=bool)
+    at_bound = np.zeros(len(b), dtype=bool)
     for _ in range(rounds):
-        x, free = np.where(held, lower, 0.0), ~held
-        x[free] = np.linalg.solve(A[np.ix_(free, free)], -b[free] - A[np.ix_(free, held)] @ x[held])
+        x, free = np.where(at_bound, lower, 0.0), ~at_bound
+        x[free] = np.linalg.solve(
+            A[np.ix_(free, free)], -b[free] - A[np.ix_(free, at_bound)] @ x[at_bound]
+        )
         y = A @ x + b
-        new = np.isfinite(lower) & np.where(held, y > 0, x < lower)
-        if (new == held).all():
+        new = np.isfinite(lower) & np.where(at_bound, y > 0, x < lower)
+        if (new == at_bound).all():
             return x
-        held = new
+        at_bound = new
     raise AssertionError("the active set did not settle")
 
 
-def test_question_is_the_problem(question):
+def test_residuals_of_the_peer_problem_agree(question):
     problem = question.scene.lcp("walls", device="cpu")
     result = wl.solve(problem, stopping=wl.StoppingCriteria(rtol=1e-5))
     x = result.x.numpy().ravel()[question.where]
@@ -144,7 +146,7 @@ def test_exchange(stub):
         stub.ask({"method": "double", "x": 1})
 
 
-def test_a_missing_peer_tells_how_to_get_it(monkeypatch):
+def test_a_missing_peer_reports_how_to_install_it(monkeypatch):
     monkeypatch.delenv(petsc.VARIABLE, raising=False)
     assert petsc.interpreter("no_such_module") is None
     assert petsc.missing().startswith("missing: no interpreter imports petsc4py; apt-get install")

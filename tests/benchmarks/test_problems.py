@@ -31,7 +31,7 @@ def test_splash_has_liquid_on_walls_and_no_outflow_elsewhere():
 @pytest.mark.parametrize(
     "part", [(slice(0, 5), slice(3, 20), slice(11, 20)), (slice(6, 9), slice(0, 20), slice(4, 5))]
 )
-def test_a_part_is_that_of_the_whole(part):
+def test_a_part_of_the_splash_equals_the_same_part_of_the_whole(part):
     whole, found = splash(20, phase=0.23), splash_part(20, part, phase=0.23)
     around = np.pad(whole.cells, 1, constant_values=wl.SOLID)[
         tuple(slice(s.start, s.stop + 2) for s in part)

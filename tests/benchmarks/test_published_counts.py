@@ -206,14 +206,14 @@ def largest_eigenvalue(A):
 
     At most 50 products, or a relative change below 1e-4.
     """
-    v, found = np.ones(len(A)), 0.0
+    v, estimate = np.ones(len(A)), 0.0
     for _ in range(50):
         product = A @ v
-        before, found = found, float(v @ product) / float(v @ v)
-        if abs(found - before) < 1e-4 * abs(found):
+        before, estimate = estimate, float(v @ product) / float(v @ v)
+        if abs(estimate - before) < 1e-4 * abs(estimate):
             break
         v = product / np.linalg.norm(v)
-    return found
+    return estimate
 
 
 def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=False):
@@ -226,7 +226,7 @@ def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=Fal
     and then take a step of 2 / ||A|| along the free gradient; otherwise the whole step is
     projected.
     """
-    x, taken = np.maximum(0.0, lower), [0, 0, 0]
+    x, step_counts = np.maximum(0.0, lower), [0, 0, 0]
     M = A.diagonal() if diagonal else np.ones(len(b))
     longest = 2 / largest_eigenvalue(A)
     A = scipy.sparse.csr_array(A)
@@ -247,7 +247,7 @@ def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=Fal
         moves = d > 0
         limit = np.inf if release else ((x - lower)[moves] / d[moves]).min(initial=np.inf)
         expands = length > limit
-        taken[2 if release else int(expands)] += 1
+        step_counts[2 if release else int(expands)] += 1
         if expands and half_step:
             x = np.maximum(x - limit * d, lower)
             x = np.maximum(x - longest * split(x)[1], lower)
@@ -256,7 +256,7 @@ def projected_gradients(A, b, lower, tolerance, *, diagonal=False, half_step=Fal
         g, phi, beta = split(x)
         z = phi / M
         p = z if release or expands else z - (Ad @ z) / (d @ Ad) * d
-    return taken
+    return step_counts
 
 
 def half_string_problem():

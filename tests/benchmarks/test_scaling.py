@@ -108,7 +108,7 @@ def test_floors_grow_with_the_grid_and_shrink_with_the_precision():
     assert not scaling._failures([*small.values(), *large.values()])
 
 
-def test_a_solve_that_tells_another_residual_is_a_failure():
+def test_a_wrongly_reported_residual_is_a_failure():
     ended = BenchmarkRecord(
         "floor 16^3 walls mixed",
         {"floor": Figure(1e-7), "told": Figure(1e-15)},

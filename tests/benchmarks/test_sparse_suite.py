@@ -10,21 +10,23 @@ from warp_lcp.benchmarks.sparse_family import FAMILY, numbered_at_random
 
 @pytest.mark.parametrize("kind", FAMILY)
 def test_problems_of_a_kind(kind):
-    made = numbered_at_random(kind, 900, 30203)
-    A, d = made.A, made.A.diagonal()
+    problem = numbered_at_random(kind, 900, 30203)
+    A, d = problem.A, problem.A.diagonal()
     assert (d > 0).all()
-    assert (abs(A - A.T).max() < 1e-12 * d.max()) == made.symmetric
+    assert (abs(A - A.T).max() < 1e-12 * d.max()) == problem.symmetric
     assert np.abs(np.subtract(*A.nonzero())).mean() > 0.2 * A.shape[0]
-    if made.near_null_space is not None:
-        products = np.abs(A @ made.near_null_space).max(axis=1) / d
+    if problem.near_null_space is not None:
+        products = np.abs(A @ problem.near_null_space).max(axis=1) / d
         assert np.median(products) < 1e-13  # nodes beside the held side differ
-    seconds, result = sparse.ours(made, "cpu")
+    seconds, result = sparse.ours(problem, "cpu")
     assert seconds > 0
     assert result
-    x, y = result.x.numpy(), A @ result.x.numpy() + made.b
-    start = np.maximum(made.lower, 0)
-    first = np.linalg.norm(d * (start - np.maximum(start - (A @ start + made.b) / d, made.lower)))
-    assert np.linalg.norm(d * (x - np.maximum(x - y / d, made.lower))) <= 1.01e-6 * first
+    x, y = result.x.numpy(), A @ result.x.numpy() + problem.b
+    start = np.maximum(problem.lower, 0)
+    first = np.linalg.norm(
+        d * (start - np.maximum(start - (A @ start + problem.b) / d, problem.lower))
+    )
+    assert np.linalg.norm(d * (x - np.maximum(x - y / d, problem.lower))) <= 1.01e-6 * first
 
 
 def test_the_suite_compares_with_the_best_of_pyamg(monkeypatch, tmp_path):

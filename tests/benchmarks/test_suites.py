@@ -37,7 +37,7 @@ def test_suites_are_installed():
     )
 
 
-def test_the_page_says_what_each_suite_takes():
+def test_the_page_lists_the_cost_of_each_suite():
     page = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text()
     assert all(
         re.search(rf"^\| `{name}` \| .* \| {suite.takes} \|$", page, flags=re.M)

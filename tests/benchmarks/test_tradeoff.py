@@ -39,7 +39,7 @@ def test_the_pareto_front_against_all_pairs() -> None:
 
 
 @pytest.mark.parametrize("name", tradeoff.SCENES)
-def test_there_are_sixty_settings_that_the_scene_takes(name: str) -> None:
+def test_the_scene_accepts_all_sixty_settings(name: str) -> None:
     settings = settings_of(load_scene(name).scene.simulator)
     assert len(settings) >= 60
     assert len({setting.name for setting in settings}) == len(settings)
@@ -135,7 +135,7 @@ def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> No
     assert f"## {scene}: presets" in text
 
 
-def test_a_scene_is_for_suites_that_run_some() -> None:
+def test_a_scene_option_needs_a_suite_that_runs_scenes() -> None:
     result = CliRunner().invoke(cli.app, ["bench", "kernels", "dam-break"])
     assert result.exit_code == 2
     assert "dam-break: the suite kernels has its own scenes" in result.stderr

@@ -68,7 +68,7 @@ def test_default_method_on_many():
 
 
 @pytest.mark.parametrize("kind", unseen.KINDS)
-def test_a_problem_is_that_of_its_seed(kind):
+def test_a_problem_repeats_for_its_seed(kind):
     first, again, other = (unseen.problem(kind, seed).problem for seed in (5003, 5003, 5004))
     for name in vars(first):
         if name not in ("faces", "matrix"):
@@ -108,23 +108,23 @@ def test_small_grids_have_a_solution_by_enumeration():
     assert found >= 20
 
 
-def test_no_problem_is_lost_and_none_is_changed_without_need():
+def test_making_a_problem_solvable_changes_only_unsolvable_ones():
     cells = np.array([[FLUID, FLUID, SOLID, FLUID, FLUID, AIR]])
-    made = GridProblem(cells=cells, b=np.array([[-1.0, -3.0, 9.0, -5.0, -7.0, 9.0]]))
-    moved = solvable(made)
+    pools = GridProblem(cells=cells, b=np.array([[-1.0, -3.0, 9.0, -5.0, -7.0, 9.0]]))
+    moved = solvable(pools)
     # Inflow without an upper bound has no solution.
     assert moved.b[0, :2].sum() == pytest.approx(0.01 * 4)
     np.testing.assert_array_equal(moved.b[0, 2:], [0, -5, -7, 0])
-    outflow = replace(made, b=-made.b)
+    outflow = replace(pools, b=-pools.b)
     # The bound x >= 0 balances it.
     np.testing.assert_array_equal(solvable(outflow).b[0, :2], [1, 3])
     assert solvable(replace(outflow, lower=-np.inf)).b[0, :2].sum() == pytest.approx(0.0, abs=1e-14)
-    assert solvable(replace(made, lower=-np.inf, upper=2.0)).b[0, :2].sum() == -4
+    assert solvable(replace(pools, lower=-np.inf, upper=2.0)).b[0, :2].sum() == -4
     assert equality(outflow) is None
     assert equality(replace(outflow, b=np.array([[1.0, -1.0, 0, 1, 1, 0]]))) is not None
     assert (
         equality(
-            replace(made, cells=np.where(cells == SOLID, AIR, cells), b=np.zeros(cells.shape))
+            replace(pools, cells=np.where(cells == SOLID, AIR, cells), b=np.zeros(cells.shape))
         ).b.min()
         == -1
     )
@@ -177,7 +177,7 @@ def test_a_slow_solver_is_caught():
     )
 
 
-def test_a_warm_start_that_loses_is_caught():
+def test_a_slow_warm_start_is_detected():
     def lost(problem, solver, **options):
         result = wl.solve(problem, solver, **options)
         return (
@@ -193,7 +193,7 @@ def test_a_warm_start_that_loses_is_caught():
     )
 
 
-def test_many_warm_starts_that_lose_a_little_are_caught():
+def test_many_slightly_slow_warm_starts_are_detected():
     def loses(problem, solver, **options):
         result = wl.solve(problem, solver, **options)
         return (
@@ -291,19 +291,19 @@ def test_summary_counts_those_within_twice_the_equations():
 def test_records_name_kind_and_seed(monkeypatch, tmp_path):
     monkeypatch.setattr(extremes, "FAMILIES", ())
     monkeypatch.setattr(unseen, "KINDS", {"handful": unseen.KINDS["handful"]})
-    said = []
-    results = extremes.measure(Options("cpu", (), 1, said.append, seed=4217), tmp_path)
-    assert "unseen ... seeds from 4217 on" in said
+    messages = []
+    results = extremes.measure(Options("cpu", (), 1, messages.append, seed=4217), tmp_path)
+    assert "unseen ... seeds from 4217 on" in messages
     counted = {r.name: r.value("attempts") for r in results.records}
     assert (counted["unseen"], counted["unseen, every method"]) == (judging.GRIDS_A_KIND, 1)
     assert results.tables[1].title == "Unseen problems"
     assert results.tables[2].rows == []  # random problems have rows only for failures
     monkeypatch.setattr(judging, "limit", lambda equations, of, allowance: 0.0)
-    results = extremes.measure(Options("cpu", (), 1, said.append, seed=4217), tmp_path)
+    results = extremes.measure(Options("cpu", (), 1, messages.append, seed=4217), tmp_path)
     assert [row[1] for row in results.tables[2].rows][:2] == ["handful 4217", "handful 4218"]
     monkeypatch.setattr(unseen, "KINDS", {})
     # Draws a seed if none is given.
-    extremes.measure(Options("cpu", (), 1, said.append), tmp_path)
+    extremes.measure(Options("cpu", (), 1, messages.append), tmp_path)
 
 
 def test_fresh_seeds_are_neither_reserved_nor_those_of_tests():

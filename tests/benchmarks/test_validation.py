@@ -59,7 +59,7 @@ def found(value: float, broken: float) -> ValidationTrial:
     return attempt("waves", "8 cells", run)
 
 
-def test_records_say_what_held_and_which_controls_failed() -> None:
+def test_records_list_passed_bounds_and_failed_controls() -> None:
     good, bad, blind = found(0.5, 2.0), found(1.5, 2.0), found(0.5, 0.5)
     assert [t.passed for t in (good, bad, blind)] == [True, False, False]
     record = good.record()
@@ -245,7 +245,7 @@ def test_cells_are_filled_by_their_particles() -> None:
     assert np.array_equal(fill(simulation), expected)
 
 
-def test_round_trips_keep_what_they_must() -> None:
+def test_round_trips_keep_their_invariants() -> None:
     trial = transfers.round_trip(16)
     assert trial.failures() == []
     assert trial.record().facts["controls_failed_as_they_must"]
@@ -264,7 +264,7 @@ def test_the_advection_has_its_orders_and_worse_ones_do_not() -> None:
 
 
 @pytest.mark.parametrize(("numerics", "shape"), [(VOXEL, "flat"), (SUB_CELL, "slanted")])
-def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not(
+def test_a_block_separates_from_the_ceiling_and_its_controls_do_not(
     numerics: Numerics, shape: str
 ) -> None:
     trial = walls.falling(24, numerics, shape)
@@ -312,6 +312,6 @@ def test_a_failed_check_ends_the_process_with_1_after_its_files(
     assert ("| waves, 8 cells: error = 2 % (<= 1 %) | steep |" in page) is (error > 1.0)
 
 
-def test_its_resolutions_are_its_own(tmp_path: Path) -> None:
+def test_each_check_has_its_own_resolutions(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="has its own resolutions"):
         VALIDATION.run(device="cpu", out=tmp_path, sizes=(16,))

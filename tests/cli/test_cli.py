@@ -72,7 +72,7 @@ def test_a_profile_is_shown_and_written(scene_file, out):
         "tune {}",
     ],
 )
-def test_paths_that_no_file_can_have(words, name):
+def test_invalid_paths_are_refused(words, name):
     result = invoke(*words.format(name).split())
     assert result.exit_code == 2
     assert name in result.stderr
@@ -138,7 +138,7 @@ def test_a_finished_run_that_is_resumed_says_so(scene_file, out):
     assert more.stdout.startswith("finished: frame 12 of 12 reached")
 
 
-def test_files_nearby_are_named_where_one_is_not_there(scene_file, tmp_path, monkeypatch):
+def test_similar_files_are_suggested_for_a_missing_file(scene_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("my-scene.toml", "other.toml"):
         (tmp_path / name).write_text(scene_file.read_text())
@@ -158,7 +158,7 @@ def test_files_nearby_are_named_where_one_is_not_there(scene_file, tmp_path, mon
     )
 
 
-def test_initials_of_a_key_are_understood(scene_file):
+def test_initials_of_a_key_suggest_the_key(scene_file):
     said = invoke("check", scene_file, "--set", "time.fps=24").stderr
     assert "time.fps: unknown key; did you mean 'frames_per_second'?" in said
 

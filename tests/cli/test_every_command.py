@@ -46,9 +46,9 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     out, problems = tmp_path / "out", tmp_path / "problems"
     sets = [word for override in overrides for word in ("--set", override)]
     loaded = load_scene(str(scene))
-    told = "whole run" if isinstance(loaded, ParticleScene) else "disk"
+    expected_text = "whole run" if isinstance(loaded, ParticleScene) else "disk"
     alone = loaded.scene.simulator == "fluids" and not any(solid.is_body for solid in loaded.solid)
-    assert told in succeed("check", scene, "--device", "cpu", *sets)
+    assert expected_text in succeed("check", scene, "--device", "cpu", *sets)
     assert "seconds a step" in succeed("check", scene, "--device", "cpu", "--calibrate", *sets)
     recorded = ["--record-problems", problems] if alone else []
     assert "finished: frame 1 " in succeed(
@@ -60,7 +60,7 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     assert "finished earlier" in succeed(
         "run", "--resume", "--out", out, "--device", "cpu", "--frames", 2
     )
-    assert told in succeed("check", out / "scene.toml", "--device", "cpu"), (
+    assert expected_text in succeed("check", out / "scene.toml", "--device", "cpu"), (
         "the scene as it ran is one"
     )
     assert "image" in succeed("render", out, "--slice", "--size", "320x240")
@@ -141,15 +141,18 @@ def test_drawn_scenes_have_every_table_shape_and_motion() -> None:
     """Tables of random scenes: each is one that the commands above meet."""
     drawn = [scene_of_every_table(seed) for seed in FEW]
     for simulator in ("fluids", "granular"):
-        mine = [data for data in drawn if data["scene"]["simulator"] == simulator]
+        of_simulator = [data for data in drawn if data["scene"]["simulator"] == simulator]
         model: type[Table] = simulators()[simulator].scene_model
-        assert set(model.model_fields) == set().union(*mine)
+        assert set(model.model_fields) == set().union(*of_simulator)
         for key in ("liquid" if simulator == "fluids" else "sand", "solid"):
-            assert {shape["shape"] for data in mine for shape in data[key]} == set(SHAPES)
+            assert {shape["shape"] for data in of_simulator for shape in data[key]} == set(SHAPES)
         assert {
-            solid["motion"]["kind"] for data in mine for solid in data["solid"] if "motion" in solid
+            solid["motion"]["kind"]
+            for data in of_simulator
+            for solid in data["solid"]
+            if "motion" in solid
         } == set(MOTIONS)
-        sizes = [data["domain"]["size"] for data in mine]
+        sizes = [data["domain"]["size"] for data in of_simulator]
         assert {(max(size), len(size)) for size in sizes} == {
             (side, dimension) for side in SIDES for dimension in (2, 3)
         }

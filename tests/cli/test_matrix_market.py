@@ -35,7 +35,7 @@ def written(matrix, **options) -> bytes:
 
 @pytest.mark.parametrize("symmetry", OF)
 @pytest.mark.parametrize("sparse", [False, True])
-def test_what_scipy_writes_is_read(tmp_path, symmetry, sparse):
+def test_files_written_by_scipy_are_read(tmp_path, symmetry, sparse):
     matrix = OF[symmetry](THIN if sparse else FULL)
     found = read(
         tmp_path / "a.mtx",
@@ -101,7 +101,7 @@ def test_packed_files(tmp_path, suffix, pack):
         ),
     ],
 )
-def test_what_is_wrong_is_told(tmp_path, data, message):
+def test_invalid_files_are_refused_with_a_reason(tmp_path, data, message):
     with pytest.raises(ValueError, match=message) as found:
         read(tmp_path / "a.mtx", data)
     assert isinstance(found.value, MarketError | ClaimError) or "complex" in message
@@ -116,7 +116,7 @@ def test_a_shape_is_refused_before_its_matrix_is_read(tmp_path):
         )
 
 
-def test_the_shape_is_read_alone(tmp_path):
+def test_the_shape_is_read_without_the_entries(tmp_path):
     path = tmp_path / "a.mtx"
     path.write_bytes(REAL + b"% " + b"long" * 40_000 + b"\n7 9 1\n" + b"no numbers")
     assert read_shape(path, lambda rows, columns: True, "") == (7, 9)

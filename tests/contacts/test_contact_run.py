@@ -67,7 +67,7 @@ def places(simulation: ContactSimulation) -> np.ndarray:
 @pytest.mark.parametrize(
     "name", ["box-stack", "heavy-on-light", "leaning-wall", "sphere-stack", "wall"]
 )
-def test_what_stands_in_the_book_stands(name: str) -> None:
+def test_stable_stacks_of_the_book_stay_at_rest(name: str) -> None:
     """Stability of the book's stacks.
 
     After half a second no body has moved by a hundredth of a side, and the residual meets the
@@ -162,7 +162,7 @@ def test_a_ball_bounces_as_its_restitution_says() -> None:
         [DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE], [DEFAULT, "nncg", "staggering", "lemke", *CONE]
     ),
 )
-def test_every_method_says_what_it_left(method: str) -> None:
+def test_every_method_reports_its_final_residual(method: str) -> None:
     """Reported status of every method on three boxes at rest.
 
     The log has its name, status, iterations and residual.
@@ -182,7 +182,7 @@ def test_every_method_says_what_it_left(method: str) -> None:
     assert np.abs(places(simulation) - before).max() < 1e-3 * SIDE
 
 
-def test_the_log_says_when_a_method_falls_short() -> None:
+def test_the_log_reports_unconverged_contact_solves() -> None:
     simulation = made(
         loaded(
             *(box(1.0, SIDE * n) for n in range(3)),
@@ -249,23 +249,26 @@ def test_the_commands(tmp_path: Path) -> None:
     A resumed run has the same log and frames as an uninterrupted one. Other programs read the
     frames, and images are drawn.
     """
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
     assert "box-stack" in succeed("check", "box-stack", "--device", "cpu")
-    succeed("run", "box-stack", "--device", "cpu", "--out", whole, "--frames", 4)
+    succeed("run", "box-stack", "--device", "cpu", "--out", uninterrupted, "--frames", 4)
     succeed("run", "box-stack", "--device", "cpu", "--out", parts, "--frames", 2)
     succeed("run", "--resume", "--device", "cpu", "--out", parts, "--frames", 4)
-    for file in sorted((whole / "frames").iterdir()):
+    for file in sorted((uninterrupted / "frames").iterdir()):
         assert file.read_bytes() == (parts / "frames" / file.name).read_bytes(), file.name
-    with open(whole / "log.csv", newline="") as one, open(parts / "log.csv", newline="") as other:
+    with (
+        open(uninterrupted / "log.csv", newline="") as one,
+        open(parts / "log.csv", newline="") as other,
+    ):
         rows, continued = list(csv.DictReader(one)), list(csv.DictReader(other))
     assert [row | {"seconds": ""} for row in rows] == [row | {"seconds": ""} for row in continued]
     assert all(float(row["solve_residual"]) <= 1e-5 for row in rows)
-    frame = whole / "frames" / "bodies_000004.vtu"
+    frame = uninterrupted / "frames" / "bodies_000004.vtu"
     mesh, read = meshio.read(frame), wl.read_frame(frame)
     assert len(mesh.points) == len(read.points)
     assert set(np.unique(mesh.point_data["body"])) == set(range(10))
-    assert "frame_000004.png" in succeed("render", whole, "--frame", 4, "--size", "320x240")
-    assert (whole / "images" / "frame_000004.png").stat().st_size > 1000
+    assert "frame_000004.png" in succeed("render", uninterrupted, "--frame", 4, "--size", "320x240")
+    assert (uninterrupted / "images" / "frame_000004.png").stat().st_size > 1000
     assert "simulator contacts" in succeed("info")
 
 
@@ -288,7 +291,7 @@ def test_the_commands(tmp_path: Path) -> None:
         ({"solid": [box(1.0, 0.0), box(5.0, 0.0)]}, "solid[1]: lies outside the domain"),
     ],
 )
-def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
+def test_invalid_contact_scenes_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneError) as error:
         load_scene(tables(box(1.0, 0.0)) | change)
     assert message in str(error.value)

@@ -218,7 +218,7 @@ def test_the_price_of_damping():
     assert steps(False, damping=1e-4, curvature=True) < 0.5 * steps(False, damping=1e-4)
 
 
-def test_honest_ends():
+def test_failures_have_a_failure_status():
     arm = planar_chain([1.0, 1.0])
     few = InverseKinematics(device="cpu", max_iterations=1).solve(
         arm, np.array([[0.0, 1.5]]), np.array([0.2, 0.3])

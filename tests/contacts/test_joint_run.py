@@ -237,7 +237,7 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
+def test_invalid_joint_scenes_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneError) as error:
         load_scene(tables(JOINTS) | change)
     assert message in str(error.value)

@@ -186,7 +186,7 @@ def rounded_on_one_rank(ranks):
     face = np.ones((34, 21, 41))
     face[3, 4, 5] = 0.3
     for method in (PM, NEWTON):
-        found, _ = compare(
+        result, _ = compare(
             ranks,
             "rounded",
             scene(shape),
@@ -197,7 +197,7 @@ def rounded_on_one_rank(ranks):
             face_x=face,
             others=(wl.SolveStatus.FLOOR,),
         )
-        assert found.status is wl.SolveStatus.FLOOR, found.status
+        assert result.status is wl.SolveStatus.FLOOR, result.status
 
 
 def low_rank(ranks):
@@ -276,17 +276,17 @@ def closed_pools(ranks):
     ):
         b[region] -= b[region].mean()
     for method in (PM, NEWTON):
-        found, A = compare(ranks, "closed pools", cells, b, -np.inf, method=method, same=1e-8)
+        result, A = compare(ranks, "closed pools", cells, b, -np.inf, method=method, same=1e-8)
         assert A.floating_components().count == 2
         compare(ranks, "closed pools, bounded", cells, b + 0.1, 0.0, method=method, same=1e-8)
         piston = np.zeros((*cells.shape, 1))
         piston[:, 5, :] = 1.0 / 288.0  # its product with the pool beneath it is no null space
-        found, A = compare(
+        result, A = compare(
             ranks, "a piston", cells, b, -np.inf, method=method, columns=(piston, np.ones((1, 1)))
         )
         assert A.floating_components().count == 1
-    found, A = compare(ranks, "no solution", cells, b + 1.0, -np.inf, method=PM)
-    assert found.status is wl.SolveStatus.INFEASIBLE
+    result, A = compare(ranks, "no solution", cells, b + 1.0, -np.inf, method=PM)
+    assert result.status is wl.SolveStatus.INFEASIBLE
 
 
 def memory_in_place(ranks):
@@ -307,17 +307,17 @@ def memory_in_place(ranks):
         stored.numpy()[1:-1, 1:-1, 1:-1] = part(b, boxes.box, shape)
         guess = None
         for _ in range(2):  # the second time warm
-            found = wl.solve(
+            result = wl.solve(
                 problem, PM, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-9), x0=guess
             )
-            guess = found.x
+            guess = result.x
         expected = wl.solve(
             wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0),
             PM,
             stopping=wl.StoppingCriteria(rtol=1e-9),
         )
-        assert found and expected
-        inner = found.x.numpy()[1:-1, 1:-1, 1:-1]
+        assert result and expected
+        inner = result.x.numpy()[1:-1, 1:-1, 1:-1]
         assert (
             np.abs(inner - part(expected.x.numpy(), boxes.box, shape)).max()
             <= 1e-7 * np.abs(expected.x.numpy()).max()
@@ -363,15 +363,15 @@ def legs(ranks):
         A = wl.GridPoisson(part(cells, boxes.box, shape), decomposition=boxes, device="cpu", **mine)
         for streams, threads in ((True, 1), (False, 1), (True, 2)):
             wl.set_threads(threads)
-            made = make_hierarchy(A.stencil, wp.float64, bounded=True)
-            made.hold(
+            hierarchy = make_hierarchy(A.stencil, wp.float64, bounded=True)
+            hierarchy.hold(
                 A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8)
             )
-            made.rebuild_changed()
+            hierarchy.rebuild_changed()
             for field, values in (
-                (made.finest.b, b),
-                (made.finest.lower, -gaps[0]),
-                (made.finest.upper, gaps[1]),
+                (hierarchy.finest.b, b),
+                (hierarchy.finest.lower, -gaps[0]),
+                (hierarchy.finest.upper, gaps[1]),
             ):
                 field.assign(
                     A.layout.load(
@@ -380,10 +380,10 @@ def legs(ranks):
                     )
                 )
             with mock.patch.object(StencilLevel, "fuses", StencilLevel.fuses if streams else False):
-                cycles = made.cycle, made.cycle, made.monotone_cycle, made.cycle
+                cycles = hierarchy.cycle, hierarchy.cycle, hierarchy.monotone_cycle, hierarchy.cycle
             for cycle in cycles:
                 cycle.run()
-                found.append(A.layout.unload(made.finest.x).numpy())
+                found.append(A.layout.unload(hierarchy.finest.x).numpy())
         wl.set_threads(1)
         for once, apart, together in zip(found[:4], found[4:8], found[8:], strict=True):
             assert once.tobytes() == together.tobytes(), processes

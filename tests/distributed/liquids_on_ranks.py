@@ -398,20 +398,19 @@ def run(ranks: Ranks, folder: Path) -> None:
         rows += advance(simulation, STEPS - 3)
         moved += [name] if simulation.grid.part.decomposition.parts != cut else []
         ranks.agree("the log", rows)
-        everyone = ranks.comm.allgather(list(simulation.frame()))
-        assert sum(len(points.points) for points, *_ in everyone) == rows[-1]["particles"]
-        bodies = [part for _, _, *parts in everyone for part in parts]
+        frames = ranks.comm.allgather(list(simulation.frame()))
+        assert sum(len(points.points) for points, *_ in frames) == rows[-1]["particles"]
+        bodies = [part for _, _, *parts in frames for part in parts]
         # Of one rank.
         assert [part.name for part in bodies] == ["bodies"] * (simulation.bodies is not None)
-        cells = np.concatenate([cells.index for _, cells, *_ in everyone])
+        cells = np.concatenate([cells.index for _, cells, *_ in frames])
         assert len(np.unique(cells, axis=0)) == len(cells)
         box_ = simulation.grid.part.box
         assert (
-            (everyone[ranks.rank][1].index >= box_.low)
-            & (everyone[ranks.rank][1].index < box_.high)
+            (frames[ranks.rank][1].index >= box_.low) & (frames[ranks.rank][1].index < box_.high)
         ).all()
-        assert everyone[ranks.rank][1].box == (box_.low, box_.high)
-        pressure = np.concatenate([cells.fields["pressure"] for _, cells, *_ in everyone])
+        assert frames[ranks.rank][1].box == (box_.low, box_.high)
+        pressure = np.concatenate([cells.fields["pressure"] for _, cells, *_ in frames])
         if ranks.is_root:
             order = np.lexsort(cells.T)
             np.savez(

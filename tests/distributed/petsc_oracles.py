@@ -126,19 +126,23 @@ def shared_problem(problem, ranks, dtype=wp.float64):
     counts = (*reversed(problem.cells.shape), 1)[:3]
     boxes = Decomposition(counts, ranks)
 
-    def mine(field, extra=(0, 0, 0)):
+    def own_part(field, extra=(0, 0, 0)):
         z, y, x = (slice(s.start, s.stop + e) for s, e in zip(boxes.box.slices, extra, strict=True))
         grid = field.reshape([n + e for n, e in zip(reversed(counts), extra, strict=True)])[z, y, x]
         return np.ascontiguousarray(grid[0] if problem.cells.ndim == 2 else grid)
 
-    given = dict(problem.coefficients)
+    coefficients = dict(problem.coefficients)
     for axis, name in enumerate(("face_z", "face_y", "face_x")):
-        if np.ndim(given.get(name, 1.0)):
-            given[name] = mine(given[name], tuple(int(a == axis) for a in range(3)))
-    if "shift" in given:
-        given["shift"] = mine(given["shift"])
-    A = wl.GridPoisson(mine(problem.cells), decomposition=boxes, device="cpu", dtype=dtype, **given)
-    return boxes, wl.LCP(A, mine(problem.b), mine(problem.lower), mine(problem.upper))
+        if np.ndim(coefficients.get(name, 1.0)):
+            coefficients[name] = own_part(
+                coefficients[name], tuple(int(a == axis) for a in range(3))
+            )
+    if "shift" in coefficients:
+        coefficients["shift"] = own_part(coefficients["shift"])
+    A = wl.GridPoisson(
+        own_part(problem.cells), decomposition=boxes, device="cpu", dtype=dtype, **coefficients
+    )
+    return boxes, wl.LCP(A, own_part(problem.b), own_part(problem.lower), own_part(problem.upper))
 
 
 def whole_field(mine, boxes, shape):
@@ -188,12 +192,12 @@ def compare(problem):
 
     Return the reports of each, and the differences of x and of the active set.
     """
-    A, told, reference = problem.matrix(), {}, None
+    A, figures, reference = problem.matrix(), {}, None
     for name, solver in OURS.items():
         x, result = solve_ours(problem, solver, Ranks.world())
         places = problem.places(A, x)
         reference = reference or (x, places)
-        told[name] = {
+        figures[name] = {
             "converged": bool(result),
             "iterations": result.iterations,
             "linear_iterations": result.linear_iterations,
@@ -203,12 +207,12 @@ def compare(problem):
         }
     for name, solve in THEIRS.items():
         x, reason, iterations = solve(problem, A)
-        told[name] = {
+        figures[name] = {
             "converged": reason > 0,
             "iterations": iterations,
             **differences(x, problem.places(A, x), *reference),
         }
-    return told
+    return figures
 
 
 def differences(x, places, other_x, other_places):

@@ -24,14 +24,14 @@ def test_petscs_own_methods_find_the_same_solution_and_active_set(mpi, ranks):
         below, above = methods["newton"]["held"]
         assert below > 30
         assert (above > 30) == bounds.endswith("boxed")
-        for method, told in methods.items():
-            assert told["converged"], (bounds, method, told)
-            assert told["error"] < 1e-8, (bounds, method, told)
-            assert told["held_otherwise"] == 0, (bounds, method, told)
+        for method, figures in methods.items():
+            assert figures["converged"], (bounds, method, figures)
+            assert figures["error"] < 1e-8, (bounds, method, figures)
+            assert figures["held_otherwise"] == 0, (bounds, method, figures)
         for method in OURS:  # the reported residual is that of its x
-            told = methods[method]
-            assert told["residual_by_scipy"] == pytest.approx(told["residual"], rel=1e-3), (
+            figures = methods[method]
+            assert figures["residual_by_scipy"] == pytest.approx(figures["residual"], rel=1e-3), (
                 bounds,
                 method,
-                told,
+                figures,
             )

@@ -32,7 +32,7 @@ def test_a_column_is_cut_along_the_axis_that_it_stays_balanced_along():
     )
 
 
-def test_material_everywhere_is_cut_where_least_is_seen_by_others():
+def test_uniform_material_is_cut_with_the_fewest_ghost_cells():
     assert balanced_processes((64, 32, 32), 2, layers=5, states=[[ALL]]) == (2, 1, 1)
     assert balanced_processes((64, 64, 1), 4, layers=5, states=[[box(64, 64, 1)]]) == (2, 2, 1)
 
@@ -76,7 +76,7 @@ def busiest(load, cut):
 
 
 @pytest.mark.parametrize(("least", "pays"), [(560.0, True), (780.0, False)])
-def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least, pays, monkeypatch):
+def test_boxes_are_repartitioned_only_if_the_step_gets_a_quarter_shorter(least, pays, monkeypatch):
     """Repartition only if the whole step becomes shorter by a quarter.
 
     The rest of a step, as much as all work of the busiest rank, does not become shorter: 2000 is

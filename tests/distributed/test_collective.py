@@ -89,7 +89,7 @@ EXPECTED = {
 }
 
 
-def test_blocks_end_alike(mpi):
+def test_collective_blocks_end_alike_on_all_ranks(mpi):
     found = mpi(3, BLOCKS).stdout.splitlines()
     for name, expected in EXPECTED.items():
         assert {line for line in found if f" {name}:" in line} == {
@@ -100,13 +100,13 @@ def test_blocks_end_alike(mpi):
     assert bug == others | {"1 bug: KeyError 'key'  ['on rank 1 of 3'] [1]"}
 
 
-def test_a_rank_that_nobody_meets_ends_all(mpi):
+def test_a_rank_without_a_collective_partner_aborts_all(mpi):
     done = mpi(3, ALONE, exit_code=1)
     assert "rank 1 of 3: left alone\nall ranks are aborted" in done.stderr
     assert "done" not in done.stdout
 
 
-def test_one_process_needs_no_others():
+def test_one_process_needs_no_communication():
     alone = Collective.of_one()
     with pytest.raises(KeyError), alone.together():
         {}["key"]

@@ -15,7 +15,7 @@ from warp_lcp.distributed.ranks import dealt
         ("cuda:1", 0, ["cuda:0", "cuda:1"], "cuda:1"),
     ],
 )
-def test_devices_are_dealt_in_turns(name, number, found, expected):
+def test_devices_are_assigned_round_robin(name, number, found, expected):
     assert dealt(name, number, found) == expected
 
 

@@ -82,14 +82,14 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
-    status, reason, said, step = FAULTS[fault]
+def test_after_a_fault_all_ranks_end_and_the_run_resumes(befall, run, tmp_path, fault):
+    status, reason, expected_text, step = FAULTS[fault]
     text = befall(2, fault)
     found = read_record(tmp_path / "out")
     # by mpiexec, a second later, before the step's end
     killed = "Ctrl-C" in fault and found["status"] == "running"
     assert killed or (found["status"], found["reason"][: len(reason)]) == (status, reason)
-    assert said in text
+    assert expected_text in text
     ranks = 3 if "late" in fault else 0
     wait_for_ranks(tmp_path / "out")
     run(ranks, "run dots.toml --out out --resume")
@@ -118,7 +118,7 @@ AFTER = """
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_what_fails_after_a_step_leaves_it(mpi, run, tmp_path, rank):
+def test_a_failure_after_a_step_keeps_the_step(mpi, run, tmp_path, rank):
     done = mpi(2, AFTER.format(folder=str(PROGRAM.parent), rank=rank), exit_code=1)
     assert "LookupError: nothing to show" in done.stderr
     found = read_record(tmp_path / "out")

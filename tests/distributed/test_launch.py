@@ -43,7 +43,7 @@ def test_a_hang_is_ended(mpi):
         mpi(2, "-c", hang, seconds=2.0)
 
 
-def test_the_environment_has_the_last_word(monkeypatch):
+def test_environment_variables_override_launch_defaults(monkeypatch):
     monkeypatch.setenv("PETSC_DIR", "/somewhere")
     given = launch.environment()
     assert given["PETSC_DIR"] == "/somewhere"
@@ -56,7 +56,7 @@ def test_the_environment_has_the_last_word(monkeypatch):
     ("there", "expected"),
     [(None, "no mpiexec: install"), ("/usr/bin/mpiexec", "no petsc4py and no mpi4py: install")],
 )
-def test_what_is_missing_is_named(monkeypatch, there, expected):
+def test_missing_programs_are_named(monkeypatch, there, expected):
     monkeypatch.setattr(launch.shutil, "which", lambda name: there)
     monkeypatch.setattr(launch.importlib.util, "find_spec", lambda name: None)
     assert launch.missing().startswith(expected)

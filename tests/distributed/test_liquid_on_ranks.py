@@ -346,7 +346,7 @@ def test_a_source_keeps_its_cells_in_other_boxes_wherever_bodies_are():
     np.testing.assert_array_equal(simulation.bodies.state()["bodies"], bodies)
 
 
-def test_velocities_that_ranks_cannot_follow_are_seen_near_cuts_and_along_them():
+def test_too_large_velocities_are_detected_near_and_along_cuts():
     part = Subdomain(
         Decomposition((40, 8, 1), Ranks(Seat(0, 2))),
         spacing=0.1,
@@ -394,7 +394,7 @@ def damaged(name, change):
         ),
     ],
 )
-def test_pieces_of_something_else_are_refused(change, message):
+def test_checkpoint_parts_of_another_scene_are_refused(change, message):
     simulation, piece = damaged("flat", change)
     with pytest.raises(ValueError, match=message):
         simulation.restore_pieces([piece])
@@ -409,7 +409,7 @@ def test_pieces_of_something_else_are_refused(change, message):
         )
     ],
 )
-def test_what_ranks_have_not_is_refused_by_name(tables, key):
+def test_features_unsupported_on_ranks_are_refused_by_name(tables, key):
     with pytest.raises(ValueError, match=f"{key} is not there on several processes"):
         alone(scene(**tables))
 

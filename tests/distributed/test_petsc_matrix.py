@@ -16,5 +16,5 @@ CHECKS = ("products", "preconditioner", "linear_solves", "bounded_methods")
 @pytest.mark.parametrize(
     ("ranks", "checks"), [(1, ("cycles_of_pcmg", *CHECKS)), (2, CHECKS), (4, CHECKS[:1])]
 )
-def test_they_are_what_the_definition_says_and_petscs_solvers_work_with_them(mpi, ranks, checks):
+def test_petsc_objects_match_their_definition_and_work_in_petsc_solvers(mpi, ranks, checks):
     assert sorted(mpi(ranks, PROGRAM, *checks).stdout.split()) == sorted(checks * ranks)

@@ -35,7 +35,7 @@ FAIL = """
 
 
 @pytest.mark.parametrize("what", ["interrupt", "killed"])
-def test_one_ends_all(mpi, what):
+def test_a_dead_rank_ends_all_ranks(mpi, what):
     done = mpi(2, FAIL, what, exit_code=None, seconds=60.0)
     assert done.returncode != 0
     assert "done" not in done.stdout
@@ -44,7 +44,7 @@ def test_one_ends_all(mpi, what):
     )
 
 
-def test_different_things_are_refused_once(mpi):
+def test_differing_collective_calls_are_refused_once(mpi):
     done = mpi(3, FAIL, "differ", exit_code=2)
     assert (
         done.stderr.count(
@@ -61,7 +61,7 @@ SHORT = ("--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=32"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", range(200))
-def test_short_runs_end(mpi, turn):
+def test_short_runs_end_on_all_ranks(mpi, turn):
     """Short runs one after the other, which may reveal rare deadlocks."""
     done = mpi(
         2 + turn % 3,

@@ -40,14 +40,14 @@ def test_ranks_measure_what_one_process_does(mpi, tmp_path):
     assert done.stdout.split() == [str(tmp_path / "ranks.json"), str(tmp_path / "ranks.md")]
     found = records(tmp_path / "ranks.json")
     for bounds in ("linear", "walls", "everywhere"):
-        here = found[f"16^3 {bounds}, ranks: 2"]
-        assert here["converged"] == 1
-        assert here["residual"] <= 1e-8  # computed independently of the solve
-        assert here["residual"] == pytest.approx(here["told"], rel=1e-3)
-        assert abs(here["iterations_to_1e-06"] - here["single_iterations"]) <= 1
-        assert here["setup"] < here["to_1e-04"] <= here["to_1e-06"] <= here["to_1e-08"]
-        assert here["boxes"] in ("1 x 1 x 2", "1 x 2 x 1", "2 x 1 x 1")
-        assert 0.0 <= here["resident_more"] < here["resident"]
+        record = found[f"16^3 {bounds}, ranks: 2"]
+        assert record["converged"] == 1
+        assert record["residual"] <= 1e-8  # computed independently of the solve
+        assert record["residual"] == pytest.approx(record["told"], rel=1e-3)
+        assert abs(record["iterations_to_1e-06"] - record["single_iterations"]) <= 1
+        assert record["setup"] < record["to_1e-04"] <= record["to_1e-06"] <= record["to_1e-08"]
+        assert record["boxes"] in ("1 x 1 x 2", "1 x 2 x 1", "2 x 1 x 1")
+        assert 0.0 <= record["resident_more"] < record["resident"]
     assert "ranks: 2" not in done.stdout
     assert "| 16^3 | walls | 2 |" in (tmp_path / "ranks.md").read_text()
 
@@ -71,7 +71,7 @@ def test_a_wrong_solution_is_seen(mpi):
     assert mpi(2, text).stdout.split() == ["True", "True"]
 
 
-def test_it_starts_the_ranks_itself(mpi, tmp_path, monkeypatch):
+def test_the_suite_starts_its_ranks(mpi, tmp_path, monkeypatch):
     monkeypatch.setattr(ranks, "RANKS", (1, 2))
     results = ranks.measure(Options("cpu", (16,), 1, lambda text: None), tmp_path)
     assert not results.failures
@@ -112,12 +112,12 @@ def found(records):
 
 def test_figures_to_reach(monkeypatch):
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 2)
-    kept = [
+    records = [
         measured(128, 1, 0.2, 8, 100.0, 1.2),
         measured(128, 2, 0.1, 9, 55.0, 0.7),
         measured(128, 4, 0.3, 10, 30.0, 2.0),
     ]
-    table = ranks.targets(found(kept), [64, 128])
+    table = ranks.targets(found(records), [64, 128])
     assert [row[2:] for row in table.rows] == [
         ["2", "no"],
         ["2", "yes"],
@@ -126,10 +126,10 @@ def test_figures_to_reach(monkeypatch):
         ["0.55", "yes"],
     ]
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 1)
-    assert ranks.targets(found(kept), [128]).rows[1][2:] == ["not measured here", ""]
+    assert ranks.targets(found(records), [128]).rows[1][2:] == ["not measured here", ""]
 
 
-def test_what_a_liquid_costs_a_rank_is_counted(mpi):
+def test_memory_and_messages_of_a_liquid_on_a_rank_are_counted(mpi):
     """Count the exchanges of a liquid on ranks.
 
     Ghost cells of at least 28 bytes of fields, in 5 layers at the one cut, are filled several times

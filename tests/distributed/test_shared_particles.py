@@ -136,15 +136,15 @@ def test_particles_go_around(counts, size, periodic):
         particles = Particles(part.grid, position[mine], velocity[mine], affine=True)
         particles.sort()
         for step in range(SORT_EVERY + 3):
-            everyone = np.concatenate(seat.allgather(particles.position.numpy().astype(float)))
-            assert len(everyone) == len(position)
+            all_positions = np.concatenate(seat.allgather(particles.position.numpy().astype(float)))
+            assert len(all_positions) == len(position)
             particles.arrange(step)
             found = particles.position.numpy().astype(float)
             assert len(np.unique(particles.exchange.place)) == len(found)
             images = [
                 x + np.array(shift) * SPACING
                 for shift in part.decomposition.shifts
-                for x in everyone
+                for x in all_positions
             ]
             near = np.array([x for x in images if within(x, low, high)])
             seen = found[within(found, low, high)]

@@ -104,7 +104,7 @@ WRONG = {  # commands, with the message of each
 }
 
 
-def test_wrong_input_is_said_once(mpi, problem):
+def test_wrong_input_is_reported_once(mpi, problem):
     text = """
     import sys
     from warp_lcp.cli.commands import main

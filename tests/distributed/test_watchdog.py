@@ -71,14 +71,14 @@ WAIT = """
 
 
 @pytest.mark.parametrize(("posts", "expected"), VERDICTS)
-def test_the_late_one_is_named(posts, expected):
+def test_the_late_rank_is_named(posts, expected):
     said = verdict(dict(enumerate(posts)))
     assert said.startswith(expected)
     assert bool(said) == bool(expected)
     assert verdict(dict(reversed(list(enumerate(posts))))) == said  # whichever rank reports it
 
 
-def test_a_post_is_there_whole_or_not_at_all(tmp_path):
+def test_heartbeats_are_read_whole_or_not_at_all(tmp_path):
     board = HeartbeatTable(tmp_path)
     assert board.read(3) is None
     board.write(3, INSIDE)
@@ -91,7 +91,7 @@ def test_a_post_is_there_whole_or_not_at_all(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_where_a_rank_is():
+def test_the_position_of_a_rank_is_described():
     here = place_of(sys._getframe())
     assert re.fullmatch(rf"{__name__}:\d+", here)
     assert place_of(None) == "its end"

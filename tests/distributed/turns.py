@@ -61,12 +61,12 @@ def on_ranks(size: int, work: Callable[[Seat], Any]) -> list[Any]:
 
     Only one rank computes at a time.
     """
-    table, found, errors = Table(size), [None] * size, []
+    table, results, errors = Table(size), [None] * size, []
 
     def run(rank: int) -> None:
         with table.turn:
             try:
-                found[rank] = work(Seat(rank, size, table))
+                results[rank] = work(Seat(rank, size, table))
             except BaseException as error:
                 errors.append(error)
                 table.barrier.abort()
@@ -78,4 +78,4 @@ def on_ranks(size: int, work: Callable[[Seat], Any]) -> list[Any]:
         thread.join()
     if errors:
         raise errors[0]
-    return found
+    return results

@@ -142,7 +142,7 @@ def test_the_log_comes_in_whole_rows_from_where_one_stopped(dots, tmp_path):
         assert ask(server, "/log?from=16")[1] == b"2,0.2\n"
 
 
-def test_nothing_else_is_told_and_to_nobody_else(dots, tmp_path):
+def test_the_server_exposes_only_its_own_files_to_this_machine(dots, tmp_path):
     folder = write_run(tmp_path / "run", [[dots_at([0.1, 0.2, 0.0])]])
     with serving(folder) as server:
         assert server.server_address[0] == LOOPBACK

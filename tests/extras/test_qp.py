@@ -40,14 +40,14 @@ def program(use, rank, seed, sparse):
     lower[:2], upper[3] = -np.inf, np.inf
     if "h" in use:
         h[2] = np.inf
-    made = scipy.sparse.csc_matrix if sparse else np.asarray
+    matrix_type = scipy.sparse.csc_matrix if sparse else np.asarray
     # In P's range: a minimizer exists.
     q = root @ rng.standard_normal(rank) if "-" in use or rank < n else rng.standard_normal(n)
-    rows = ((made(G), h) if "G" in use else (None, None)) + (
-        (made(A), A @ x) if "A" in use else (None, None)
+    rows = ((matrix_type(G), h) if "G" in use else (None, None)) + (
+        (matrix_type(A), A @ x) if "A" in use else (None, None)
     )
     return qpsolvers.Problem(
-        made(root @ root.T), q, *rows, *((None, None) if "-" in use else (lower, upper))
+        matrix_type(root @ root.T), q, *rows, *((None, None) if "-" in use else (lower, upper))
     )
 
 
@@ -118,18 +118,18 @@ def test_linear_programs():
 
 @pytest.mark.parametrize("why", ["infeasible", "unbounded"])
 def test_programs_without_a_solution_are_not_found(why, capsys):
-    made = {
+    programs = {
         "infeasible": qpsolvers.Problem(
             np.eye(2), np.ones(2), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0])
         ),
         "unbounded": qpsolvers.Problem(np.diag([1.0, 0.0]), -np.ones(2), lb=np.zeros(2)),
     }
-    found = qpsolvers.solve_problem(made[why], "warp_lcp", verbose=True)
+    found = qpsolvers.solve_problem(programs[why], "warp_lcp", verbose=True)
     assert found.found is False
     assert found.x is None
     assert found.z is None
     assert capsys.readouterr().out.startswith("warp_lcp: ")
-    P, q, *rest = made[why].unpack()
+    P, q, *rest = programs[why].unpack()
     assert qpsolvers.solve_qp(P, q, *rest, solver="warp_lcp") is None
 
 
@@ -164,7 +164,7 @@ def test_limits_and_methods():
         ({"A": np.eye(2)}, "A and b: one is missing"),
     ],
 )
-def test_what_is_refused(change, message):
+def test_invalid_programs_are_refused(change, message):
     problem = qpsolvers.Problem(**{"P": np.eye(2), "q": np.ones(2), "ub": np.ones(2)} | change)
     with pytest.raises(ValueError, match=message):
         qp.solve_problem(problem)

@@ -410,7 +410,7 @@ def test_a_frame_that_is_cut_is_named(dots, tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_full_disk_is_told(dots, tmp_path):
+def test_a_full_disk_is_reported(dots, tmp_path):
     resource = pytest.importorskip("resource", reason="limits of files are for POSIX")
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5, 0.5], 0.2)]] * 5, size=ROOM)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -98,7 +98,7 @@ def test_other_versions_of_the_format_are_read(tmp_path):
         ({"a": b"text"}, "'a' is not a plain array"),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path, members, message):
+def test_impossible_archives_are_refused(tmp_path, members, message):
     with pytest.raises(ArchiveError, match=message):
         read(zipped(tmp_path / "a.npz", members))
 

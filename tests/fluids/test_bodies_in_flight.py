@@ -109,7 +109,7 @@ def test_a_spinning_drop_keeps_its_angular_momentum_and_its_energy(
     ("model", "cfl"), [("incompressible", 2.0), ("incompressible", 8.0), ("unilateral", 2.0)]
 )
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_spins_in_flight_goes_along_its_parabola(
+def test_the_center_of_a_spinning_drop_follows_its_parabola(
     model: str, cfl: float, dimension: int
 ) -> None:
     """Parabola of a spinning block, which is not round.

@@ -104,7 +104,7 @@ def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(
 
 
 @pytest.mark.parametrize(("wall", "falls"), [("separating", True), ("free-slip", False)])
-def test_a_solid_ceiling_decides_for_itself(wall: str, falls: bool) -> None:
+def test_a_solid_ceiling_has_its_own_separation_setting(wall: str, falls: bool) -> None:
     solid, liquid = [box([0.0, 0.7], [0.4, 0.8], wall=wall)], [box([0.0, 0.5], [0.4, 0.7])]
     fallen, expected, _ = drop(
         create(scene(size=[0.4, 0.8], resolution=32, liquid=liquid, solid=solid, wall="free-slip")),

@@ -68,7 +68,7 @@ def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, m
     simulation = crowded(dimension, model)
     simulation.step(1e-4)
     projection, rng = simulation.projection, np.random.default_rng(67)
-    still = [wp.zeros_like(field) for field in simulation.velocity]
+    zero_velocity = [wp.zeros_like(field) for field in simulation.velocity]
 
     def right_side(velocities):
         for body, v in zip(simulation.bodies.bodies, velocities, strict=True):
@@ -78,7 +78,7 @@ def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, m
                 body.inertia @ six[3:],
             )
         simulation.boundary.begin_step(simulation.time, 1e-4)
-        projection.prepare(still, 1e-4, 1e-4)
+        projection.prepare(zero_velocity, 1e-4, 1e-4)
         return projection._b.numpy().ravel().copy()
 
     width = 3 if dimension == 2 else 6
@@ -97,14 +97,14 @@ def projected(simulation, dt):
 
     The velocities of the bodies (6 each) are returned too.
     """
-    before, taken = simulation.begin_step(dt), {}
+    before, recorded = simulation.begin_step(dt), {}
     window = simulation.window(before)
     simulation.particles_to_grid(window)
     prepare = simulation.projection.prepare
 
     def watched(velocity, *steps):
-        taken["u"] = [field.numpy().astype(np.float64) for field in velocity]
-        taken["V"] = np.array(
+        recorded["u"] = [field.numpy().astype(np.float64) for field in velocity]
+        recorded["V"] = np.array(
             [np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies]
         )
         return prepare(velocity, *steps)
@@ -113,9 +113,9 @@ def projected(simulation, dt):
     simulation._project(window, dt, simulation.top_speed(before))
     after = [field.numpy().astype(np.float64) for field in simulation.velocity]
     return (
-        taken["u"],
+        recorded["u"],
         after,
-        taken["V"],
+        recorded["V"],
         np.array(
             [np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies]
         ),
@@ -234,7 +234,7 @@ def test_light_bodies_rise_and_heavy_ones_sink(density, sign, model):
     assert sum(row["stuck"] for row in rows) == 0
 
 
-def test_liquid_lets_go_of_a_body_that_leaves_it():
+def test_liquid_separates_from_a_body_that_leaves_it():
     """Separation of liquid from a body that leaves it.
 
     A separating body that is thrown up out of the water is not held back; a free-slip one pulls the
@@ -369,7 +369,7 @@ def test_methods_agree_on_where_bodies_go(method):
     assert all(row["solve_status"] == "CONVERGED" for row in rows)
 
 
-def test_what_a_body_buries_does_not_fall_for_ever():
+def test_liquid_under_a_body_does_not_accelerate_without_limit():
     """Particles buried by a body.
 
     Particles between a body and the floor to which it has sunk have no open face near; gravity

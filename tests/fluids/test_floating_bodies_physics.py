@@ -47,7 +47,7 @@ def test_a_disc_sets_off_with_its_added_mass(ratio):
     )
 
 
-def test_walls_that_let_go_of_liquid_do_not_change_how_a_disc_sets_off():
+def test_separating_walls_do_not_change_the_added_mass_of_a_disc():
     assert first_acceleration(2, 16, 0.5, "separating") == pytest.approx(
         first_acceleration(2, 16, 0.5), rel=1e-3
     )

@@ -37,8 +37,8 @@ OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_eve
 )
 def test_resumed_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
     scene = load_scene(name, overrides)
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_into(scene, whole, observer=StepCounter()).status == "finished"
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run_into(scene, uninterrupted, observer=StepCounter()).status == "finished"
     watch = StepCounter()
     first = run_into(scene, parts, observer=watch, stop=lambda: watch.steps >= 3)
     assert first.status == "stopped"
@@ -47,7 +47,7 @@ def test_resumed_equals_uninterrupted(name: str, overrides: list[str], tmp_path:
     assert second.status == "finished"
     assert second.resumed_from_step == 3
     assert watch.steps + rest.steps == second.steps
-    assert written_files(whole) == written_files(parts)
+    assert written_files(uninterrupted) == written_files(parts)
 
 
 BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}

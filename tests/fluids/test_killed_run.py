@@ -179,18 +179,18 @@ def kill_and_resume(
     """
     scene = folder / "scene.toml"
     scene.write_text(SCENE.replace("duration = 1.5", f"duration = {duration}"))
-    whole = folder / "whole"
+    uninterrupted = folder / "whole"
     # The first run loads and compiles kernels.
     for option in (["--set", "time.duration=0.1"], ["--force"]):
-        code, text = call(scene, whole, *option)
+        code, text = call(scene, uninterrupted, *option)
         assert code == 0, text
-    expected, seconds = results(whole), 1.2 * read_record(whole)["seconds"]
+    expected, seconds = results(uninterrupted), 1.2 * read_record(uninterrupted)["seconds"]
     rng, steps, died = np.random.default_rng(seed), [], 0
     for run in range(10 * kills):
         out, before = folder / f"parts_{run}", None
         while True:
-            begun = (out / "run.json").is_file()
-            process = begin(scene, out, *(["--resume"] if begun else []))
+            has_record = (out / "run.json").is_file()
+            process = begin(scene, out, *(["--resume"] if has_record else []))
             if died < kills:
                 wait_until_it_holds(process, out)
                 time.sleep(rng.uniform(0.0, seconds))
@@ -198,7 +198,7 @@ def kill_and_resume(
             text, _ = process.communicate(timeout=LIMIT)
             if (
                 before
-                and begun
+                and has_record
                 and (
                     process.returncode == 0 or read_record(out)["resumed_from_step"] == before.step
                 )
@@ -210,7 +210,7 @@ def kill_and_resume(
             died += 1
             before = Before(out)
         assert results(out) == expected
-        assert read_record(out)["steps"] == read_record(whole)["steps"]
+        assert read_record(out)["steps"] == read_record(uninterrupted)["steps"]
         if died == kills:
             return steps
     raise AssertionError("the runs end before they can be killed")

@@ -47,7 +47,7 @@ def test_defaults() -> None:
         ({"liquid": [box([0.0, 0.0], [0.5, 0.25], velocity=[1.0, 2.0, 3.0])]}, "velocity"),
     ],
 )
-def test_what_a_scene_may_not_say(tables: dict[str, Any], place: str) -> None:
+def test_invalid_keys_and_values_are_refused(tables: dict[str, Any], place: str) -> None:
     with pytest.raises(ValidationError) as caught:
         small(**tables)
     assert any(place in str(part) for error in caught.value.errors() for part in error["loc"])

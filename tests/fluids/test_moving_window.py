@@ -53,14 +53,14 @@ def states(tables: dict[str, Any]) -> list[dict[str, bytes]]:
 
 
 @pytest.mark.parametrize("tables", TABLES.values(), ids=TABLES)
-def test_windows_leave_what_passes_over_all_do(tables, monkeypatch):
+def test_kernels_on_windows_have_the_results_of_kernels_on_all_cells(tables, monkeypatch):
     found = states(tables)
     monkeypatch.setattr(DirtyRegion, "through", lambda self, window: self.all)
     for step, (state, expected) in enumerate(zip(found, states(tables), strict=True)):
         assert [name for name in expected if state[name] != expected[name]] == [], step
 
 
-def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
+def test_cost_of_pressure_and_fragments_scales_with_the_liquid(monkeypatch):
     """Visited cells of passes in a domain eight times as wide."""
     visited = [Counter[str]()]
     run, take = Window.run, WindowTally.take
@@ -96,7 +96,7 @@ def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
     assert all(wide[name] <= 1.2 * narrow[name] for name in narrow)
 
 
-def test_a_trail_leads_through_the_last_window():
+def test_a_dirty_region_covers_the_last_window():
     grid = StaggeredGrid((20, 10, 1), 1.0, 2)
     trail = DirtyRegion(grid.domain)
     boxes = [

@@ -78,7 +78,7 @@ def test_particles_below_the_band_are_around_solids_inside_only(dimension):
     assert 4.0 < gap.max() < 1.0 + WIDTH + 1.0
 
 
-def test_nothing_is_there_without_the_table():
+def test_without_the_table_there_is_no_band():
     """Without the table no field, no column, no entry of the state."""
     simulation = tank(particles={})
     assert simulation.band is None
@@ -167,7 +167,7 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_ceiling_lets_go(dimension):
+def test_liquid_separates_from_a_ceiling(dimension):
     """Separation of a block from a ceiling.
 
     A new surface opens where there were no particles: the block falls as one and keeps its volume.
@@ -251,7 +251,7 @@ def wave(rows: list[dict[str, Any]]) -> tuple[float, float]:
     return 2.0 * float(np.diff(times).mean()), -float(np.polyfit(times, np.log(heights), 1)[0])
 
 
-def test_a_wave_is_as_fast_and_damped_as_without():
+def test_a_band_does_not_change_speed_and_damping_of_a_wave():
     """Speed and damping of a wave.
 
     The period is that of linear theory within 1 %, and that of particles everywhere within 0.2 %,
@@ -401,7 +401,7 @@ def test_another_resolution(resolution, particles):
     assert (row["particles"] < before) == bool(particles)
 
 
-def test_refusals():
+def test_invalid_band_settings_are_refused():
     """Refusals, each with an alternative."""
     with pytest.raises(ValidationError, match=r"greater than or equal to 3"):
         tank(particles={"narrow_band": {"width": 2.99}})

@@ -127,12 +127,12 @@ def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bo
     ("sides", "message"),
     [(["top", "top"], "named twice"), (["front"], "3-D"), (["up"], "left"), ("top", "list")],
 )
-def test_what_sides_may_not_be(sides: Any, message: str) -> None:
+def test_invalid_side_settings_are_refused(sides: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         opened(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])]), sides)
 
 
-def test_what_the_density_correction_pushes_out_has_left() -> None:
+def test_particles_pushed_through_an_open_side_leave() -> None:
     model = scene(
         size=[1.0, 0.5],
         resolution=32,

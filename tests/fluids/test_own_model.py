@@ -12,7 +12,7 @@ from warp_lcp.fluids import SIMULATOR
 PAGE = Path(__file__).parents[2] / "docs/own-model.md"
 
 
-def test_a_sponge_slows_liquid_by_its_rate_and_tells_the_energy():
+def test_a_sponge_damps_liquid_at_its_rate_and_logs_the_energy():
     """Velocity and energy in a sponge.
 
     A block in flight without gravity, all of it in the sponge: u is divided by 1 + k dt in each

@@ -131,7 +131,7 @@ def test_a_piston_pushes_as_much_liquid_out_of_the_surface_as_it_sweeps(separati
     assert projected.max_outflow < 1e-5
 
 
-def test_a_piston_that_retracts_lets_go_of_a_separating_wall_and_sucks_on_a_free_slip_one() -> None:
+def test_liquid_separates_from_a_retracting_piston_unless_it_is_free_slip() -> None:
     pool = liquid(slice(0, 4), slice(1, None))
     free, stuck = (Tank(pool, separating=separating, piston=-0.3) for separating in (True, False))
     left, held = free.project(), stuck.project()

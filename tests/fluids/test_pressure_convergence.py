@@ -304,7 +304,7 @@ def test_liquid_in_a_round_tank_converges_with_second_order(field: Field, openin
 
 
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
-def test_what_nodes_miss_of_a_round_wall_costs_single_cells_only(field: Field) -> None:
+def test_level_set_errors_at_a_round_wall_affect_single_cells_only(field: Field) -> None:
     """Error of fractions from nodes at a round wall.
 
     The source is that of the circle. An edge that the circle cuts twice is closed, so that its cell

@@ -258,26 +258,26 @@ def dam(folder: Path, duration: float = 0.4) -> LiquidScene:
 
 def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
     scene, asked = dam(tmp_path), itertools.count(1)
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_into(scene, whole).status == "finished"
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run_into(scene, uninterrupted).status == "finished"
     assert run_into(scene, parts, stop=lambda: next(asked) >= 7).status == "stopped"
     with open(parts / "probes.csv", "a") as file:
         file.write("8,0.2,1.0,0.0,0.0\n9,0.")  # a killed process wrote only this part
     assert run_into(scene, parts, resume=True).status == "finished"
-    assert (parts / "probes.csv").read_bytes() == (whole / "probes.csv").read_bytes()
+    assert (parts / "probes.csv").read_bytes() == (uninterrupted / "probes.csv").read_bytes()
     with (
-        open(whole / "probes.csv", newline="") as table,
-        open(whole / "log.csv", newline="") as log,
+        open(uninterrupted / "probes.csv", newline="") as table,
+        open(uninterrupted / "log.csv", newline="") as log,
     ):
         rows, steps = list(csv.DictReader(table)), list(csv.DictReader(log))
     assert list(rows[0]) == ["step", "time", "a_pressure", "b_vx", "b_vy"]
     assert [row["step"] for row in rows] == [row["step"] for row in steps]
     assert [row["time"] for row in rows[1:]] == [row["time"] for row in steps[:-1]]
     assert rows[0]["b_vx"] == "", "no velocity in air"
-    (whole / "probes.csv").write_text(
-        "\n".join((whole / "probes.csv").read_text().split("\n")[:3]) + "\n"
+    (uninterrupted / "probes.csv").write_text(
+        "\n".join((uninterrupted / "probes.csv").read_text().split("\n")[:3]) + "\n"
     )
-    again = run_into(dam(tmp_path, 0.5), whole, resume=True)
+    again = run_into(dam(tmp_path, 0.5), uninterrupted, resume=True)
     assert any(warning.startswith("probes.csv: rows of steps") for warning in again.warnings)
 
 

@@ -51,21 +51,23 @@ def test_the_recorded_problem_is_the_one_that_was_solved(tmp_path, name):
     ]
     for path, pressure in zip(files(tmp_path), pressures, strict=True):
         problem = load(path, device="cpu")
-        kept = dict(np.load(path, allow_pickle=False))
+        recorded = dict(np.load(path, allow_pickle=False))
         # The oracle uses the description of the file alone. With a shifted face, or the shift of
         # another step, the run's x is no solution.
-        faces = [kept.get(f"face_{axis}", 1.0) for axis in "xyz"]
-        A = assemble(kept["cells"], faces, kept.get("shift"))
-        fluid = kept["cells"].ravel() == wl.FLUID
+        faces = [recorded.get(f"face_{axis}", 1.0) for axis in "xyz"]
+        A = assemble(recorded["cells"], faces, recorded.get("shift"))
+        fluid = recorded["cells"].ravel() == wl.FLUID
         A = A[np.ix_(fluid, fluid)]
         np.testing.assert_allclose(problem.dense().A, A, atol=2e-6 * np.abs(A).max())
         b, lower, upper = (
-            np.broadcast_to(kept[key], kept["cells"].shape).ravel()[fluid]
+            np.broadcast_to(recorded[key], recorded["cells"].shape).ravel()[fluid]
             for key in ("b", "lower", "upper")
         )
         x = pressure.ravel()[fluid]
         reference = natural_residual(A, b, lower, upper, np.clip(0.0 * b, lower, upper))
-        allowed = max(float(kept["absolute_tolerance"]), float(kept["tolerance"]) * reference)
+        allowed = max(
+            float(recorded["absolute_tolerance"]), float(recorded["tolerance"]) * reference
+        )
         assert natural_residual(A, b, lower, upper, x) <= 1.5 * allowed + 1e-6 * np.abs(
             A
         ).max() * np.linalg.norm(x)
@@ -129,17 +131,17 @@ def test_spray_has_no_problem(tmp_path):
 def test_damaged_files_are_refused(tmp_path):
     record(CASES["voxel"](), tmp_path, 1)
     (path,) = files(tmp_path)
-    whole, kept = path.read_bytes(), dict(np.load(path))
+    whole, recorded = path.read_bytes(), dict(np.load(path))
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"problem_000000\.npz: is not a recorded problem"):
         load(path)
-    np.savez(path, **{**kept, "format": FORMAT + 1})
+    np.savez(path, **{**recorded, "format": FORMAT + 1})
     with pytest.raises(ValueError, match="its format is 2, this version reads 1"):
         load(path)
-    np.savez(path, **{key: kept[key] for key in kept if key != "b"})
+    np.savez(path, **{key: recorded[key] for key in recorded if key != "b"})
     with pytest.raises(ValueError, match="it lacks b"):
         load(path)
-    np.savez(path, **{**kept, "b": kept["b"][1:]})
+    np.savez(path, **{**recorded, "b": recorded["b"][1:]})
     with pytest.raises(ValueError, match="is not a recorded problem"):
         load(path)
 

@@ -142,7 +142,7 @@ CROWDED = [("voxel", "stands"), ("cut-cell", "stands"), ("cut-cell", "moves"), (
 
 @pytest.mark.parametrize(("solids", "moves"), CROWDED)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_the_pressure_takes_from_the_liquid_solids_get(
+def test_pressure_momentum_of_the_liquid_goes_to_solids(
     dimension: int, solids: str, moves: str, monkeypatch: Any
 ) -> None:
     """Momentum that the pressure takes from the liquid and gives to solids.
@@ -188,18 +188,22 @@ def test_what_the_pressure_takes_from_the_liquid_solids_get(
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_body_is_told_what_it_got(dimension: int) -> None:
+def test_the_force_log_has_the_impulse_of_the_body(dimension: int) -> None:
     """Force on a body by the table and by the coupling.
 
     Both add up the same faces, each in its own way.
     """
     simulation = crowded(dimension, "cut-cell", "body")
-    body, given = simulation.bodies.bodies[0], []
+    body, pushes = simulation.bodies.bodies[0], []
     push = simulation.projection.push_bodies
 
     def watched(result: Any) -> None:
         push(result)
-        given.append(body.given[:3].copy() if dimension == 3 else body.given[[0, 1, 5]].copy())
+        pushes.append(
+            body.received_impulse[:3].copy()
+            if dimension == 3
+            else body.received_impulse[[0, 1, 5]].copy()
+        )
 
     simulation.projection.push_bodies = watched  # type: ignore[method-assign]
     for _ in range(4):
@@ -207,8 +211,8 @@ def test_a_body_is_told_what_it_got(dimension: int) -> None:
         told = (
             forces(simulation, 0.0)["solid1"][: 3 if dimension == 3 else None] * simulation.kick_dt
         )
-        assert told == pytest.approx(given[-1], rel=1e-6, abs=1e-9)
-    assert np.abs(given).max() > 0.0
+        assert told == pytest.approx(pushes[-1], rel=1e-6, abs=1e-9)
+    assert np.abs(pushes).max() > 0.0
 
 
 @pytest.mark.parametrize(("dimension", "viscosity"), covering([2, 3], [0.05, 20.0]))
@@ -288,14 +292,14 @@ def test_an_impact_takes_the_momentum(solids: str) -> None:
         )
 
     mass = simulation.particle_mass * simulation.particles.count
-    start, given, elapsed = momentum(), np.zeros(2), 0.0
+    start, impulse, elapsed = momentum(), np.zeros(2), 0.0
     while simulation.time < 0.4:
         simulation.step(min(simulation.stable_dt(), 0.01))
-        given += sum(force[:2] for force in forces(simulation, 0.0).values()) * simulation.kick_dt
+        impulse += sum(force[:2] for force in forces(simulation, 0.0).values()) * simulation.kick_dt
         elapsed += simulation.kick_dt
     change = momentum() - start - mass * elapsed * np.array([0.0, -GRAVITY])
-    assert np.abs(given).max() > mass * 1.0
-    assert np.abs(change + given).max() < 0.05 * np.abs(given).max()
+    assert np.abs(impulse).max() > mass * 1.0
+    assert np.abs(change + impulse).max() < 0.05 * np.abs(impulse).max()
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
@@ -380,7 +384,7 @@ def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
     assert all(float(row["domain_fy"]) < 0.0 for row in rows), "the floor bears"
 
 
-def test_sand_has_none() -> None:
+def test_sand_has_no_forces_on_solids() -> None:
     sand = {"size": [1.0, 0.5], "resolution": 16, "sand": [small_sands.box([0.0, 0.0], [0.3, 0.3])]}
     with pytest.raises(ValidationError, match="is for liquids only"):
         small_sands.scene(**sand, output=FORCES)

@@ -252,8 +252,8 @@ def test_a_plane_at_the_contact_angle_is_straight(
     foot = np.array([cells / 2 + 0.3, 8.0 - 0.3 * math.tan(slope) if slope else 0.0, 0.0])
     tilt = math.radians(angle) - slope  # of the surface, whose liquid lies to its right
     found = {}
-    for given in (angle, angle - 30.0):
-        simulation = tank(dimension, cells, angle=given, **wall)
+    for prescribed_angle in (angle, angle - 30.0):
+        simulation = tank(dimension, cells, angle=prescribed_angle, **wall)
         at = samples(simulation, 10 if dimension == 2 else 4)
         open_ = ((at > 0.0) & (at < cells))[..., :dimension].all(axis=-1)
         if slope:
@@ -267,7 +267,7 @@ def test_a_plane_at_the_contact_angle_is_straight(
         if dimension == 3:
             # The sides have the angle, too.
             near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0
-        found[given] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
+        found[prescribed_angle] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
     assert found[angle] < 0.03
     assert found[angle - 30.0] > 0.06
 
@@ -554,7 +554,7 @@ def test_capillary_waves_converge() -> None:
     assert wave(32, 10.0) == pytest.approx(1.0, abs=0.05)
 
 
-def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
+def cap(angle: float, prescribed_angle: float) -> tuple[LiquidSimulation, float, float]:
     """Return a drop on the floor with a contact angle.
 
     The height of its center of mass and the radius of its surface [m] are returned too.
@@ -563,7 +563,7 @@ def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
     radius = RADIUS * math.sqrt(0.5 * math.pi / (a - math.sin(a) * math.cos(a)))
     side = 6.0 * RADIUS
     liquid = [{"shape": "sphere", "center": [side / 2, -radius * math.cos(a)], "radius": radius}]
-    tension = WATER | {"contact_angle": given}
+    tension = WATER | {"contact_angle": prescribed_angle}
     tables = {"wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}, "surface_tension": tension}
     simulation = create(scene(size=[side, side / 2], resolution=96, liquid=liquid, **tables))
     height = radius * (2.0 * math.sin(a) ** 3 / 3.0 / (a - math.sin(a) * math.cos(a)) - math.cos(a))
@@ -591,7 +591,7 @@ def test_a_step_is_no_longer_than_the_filter_allows() -> None:
     assert any("surface tension: steps of at most" in note for note in simulation.notes())
 
 
-def test_without_the_table_there_is_none() -> None:
+def test_without_the_table_there_is_no_surface_tension() -> None:
     simulation = drop(8, surface_tension=None)
     assert simulation.tension is None and simulation.projection.jump is None
     assert "surface_energy" not in simulation.columns()
@@ -610,13 +610,13 @@ def test_without_the_table_there_is_none() -> None:
         ({"surface_tension": WATER, "pressure": {"model": "unilateral"}}, "incompressible"),
     ],
 )
-def test_what_cannot_be_is_refused(tables: dict[str, Any], message: str) -> None:
+def test_invalid_settings_are_refused(tables: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], **tables)
 
 
 @pytest.mark.parametrize(("angle", "dimension"), covering([20.0, 60.0, 100.0, 150.0], [2, 3]))
-def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) -> None:
+def test_separating_walls_do_not_accelerate_a_splash(dimension: int, angle: float) -> None:
     """Speed of a splash at separating walls.
 
     Beside a separating wall the liquid bears the pull of the surface, however near to its center
@@ -651,7 +651,7 @@ def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) 
 
 
 @pytest.mark.parametrize(("angle", "hangs"), [(50.0, True), (130.0, False)])
-def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, hangs: bool) -> None:
+def test_a_wetting_drop_hangs_from_a_separating_ceiling(angle: float, hangs: bool) -> None:
     """Drop at a separating ceiling, with and without wetting.
 
     Over 7.8 mm of free fall: the air holds up what wets the ceiling, and nothing holds up what does
@@ -677,7 +677,7 @@ def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, ha
 @pytest.mark.parametrize(
     ("width", "angle"), [(0.004, 30.0), (0.004, 70.0), (0.008, 20.0), (0.008, 60.0)]
 )
-def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) -> None:
+def test_a_meniscus_rises_along_separating_walls(width: float, angle: float) -> None:
     """Rise of a meniscus along separating walls.
 
     Its pressure is below that of the air, also some cells below the surface, and no air gets there.
@@ -747,7 +747,7 @@ def test_a_full_box_has_no_surface() -> None:
     assert simulation.step(1e-3)["max_speed"] < 1e-5
 
 
-def test_a_moving_solid_and_short_steps_are_taken_along() -> None:
+def test_surface_tension_works_with_a_moving_solid_and_short_steps() -> None:
     motion = {"kind": "translation", "velocity": [0.1, 0.0]}
     solid = [{"shape": "sphere", "center": [0.02, 0.01], "radius": 0.004, "motion": motion}]
     liquid = [box([0.0, 0.0], [0.04, 0.01])]

@@ -116,7 +116,7 @@ def test_pools_on_two_sides_of_a_plate_stay_apart(thickness: float) -> None:
     assert np.abs(simulation.particles.velocity.numpy()).max() < 0.05
 
 
-def test_a_thin_piston_takes_all_along() -> None:
+def test_a_thin_piston_moves_all_liquid() -> None:
     """Thin piston that moves all liquid.
 
     At 1 m/s and CFL 8 it moves several cells in a step, each many times its thickness.
@@ -134,7 +134,7 @@ def test_a_thin_piston_takes_all_along() -> None:
     assert simulation.particles.position.numpy()[:, 0].min() > 0.4
 
 
-def test_gaps_narrower_than_a_cell_are_told() -> None:
+def test_gaps_narrower_than_a_cell_are_reported() -> None:
     def notes(gap: float) -> list[str]:
         plates = [box([-0.1, 0.42], [0.5, 0.43]), box([0.5 + gap, 0.42], [1.1, 0.43])]
         simulation = create(

@@ -86,13 +86,13 @@ def flow(width: float, tables: dict[str, Any]) -> tuple[np.ndarray, float]:
         box([0.0, top], [1.0, top + 8.0 * CELL]),
         box([-0.1, top - width * CELL], [1.1, top]),
     )
-    given = {
+    defaults = {
         "physics": {"gravity": [2.0, -9.8]},
         "particles": {"jitter": 0.0},
         "output": {"forces": True},
     }
     simulation = create(
-        scene(size=[1.0, 1.0], resolution=CELLS, liquid=[layer], solid=[plate], **given | tables)
+        scene(size=[1.0, 1.0], resolution=CELLS, liquid=[layer], solid=[plate], **defaults | tables)
     )
     speeds(simulation, 0.1)
     x, y, _ = simulation.particles.position.numpy().T
@@ -117,7 +117,7 @@ def test_liquid_flows_along_a_sheet_as_along_a_thick_wall(tables: dict[str, Any]
     assert pull == pytest.approx(expected, rel=0.02, abs=0.05)
 
 
-def test_what_sheets_cannot_do_is_told() -> None:
+def test_unsupported_settings_of_sheets_are_refused() -> None:
     angle = MODELS["contact angle"]
     assert any(
         "contact_angle is 90 on solid[0] (box)" in note for note in pools(THIN, angle).notes()

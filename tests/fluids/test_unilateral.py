@@ -89,7 +89,7 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_is_too_dense_flies_as_it_is_and_settles_slowly(dimension: int) -> None:
+def test_overfull_cells_keep_their_velocity_in_flight_and_settle_slowly(dimension: int) -> None:
     """Speed of too dense liquid.
 
     Without gravity excess density is no velocity. With it a cell twice as full expands by at most a

@@ -26,19 +26,19 @@ def blob(
     dimension: int,
     viscosity: float = 100.0,
     resolution: int = 24,
-    own: float | None = None,
+    own_viscosity: float | None = None,
     **tables,
 ):
     """Return a box of liquid in free flight."""
     low, high = [0.3, 0.35, 0.4][:dimension], [0.7, 0.62, 0.65][:dimension]
     physics = {"physics": {"gravity": [0.0] * dimension}}
-    given = {"viscosity": {"value": viscosity}, **physics, **tables}
+    defaults = {"viscosity": {"value": viscosity}, **physics, **tables}
     return create(
         scene(
             size=[1.0] * dimension,
             resolution=resolution,
-            liquid=[box(low, high, viscosity=own)],
-            **given,
+            liquid=[box(low, high, viscosity=own_viscosity)],
+            **defaults,
         )
     )
 
@@ -101,15 +101,18 @@ def force_of_energy(simulation, u, tau: float, relative=None):
 
 
 @pytest.mark.parametrize(("dimension", "varies"), covering([2, 3], [False, True]))
-def test_the_equations_are_the_energys(dimension: int, varies: bool) -> None:
-    simulation, rng = blob(dimension, own=100.0 if varies else None), np.random.default_rng(3)
+def test_the_equations_minimize_the_energy(dimension: int, varies: bool) -> None:
+    simulation, rng = (
+        blob(dimension, own_viscosity=100.0 if varies else None),
+        np.random.default_rng(3),
+    )
     grid, viscosity = simulation.grid, simulation.viscosity
     relative = [rng.uniform(0.1, 5.0, grid.shape).astype(np.float32) for _ in viscosity.relative]
     for field, values in zip(viscosity.relative, relative, strict=True):
         field.assign(values)
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
-    there = [field.numpy() > 0.0 for field in viscosity.multigrid.levels[0].diagonal]
-    u = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in there]
+    nonzero = [field.numpy() > 0.0 for field in viscosity.multigrid.levels[0].diagonal]
+    u = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in nonzero]
     expected, _ = force_of_energy(
         simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, relative or None
     )
@@ -118,7 +121,7 @@ def test_the_equations_are_the_energys(dimension: int, varies: bool) -> None:
     viscosity.multigrid.product(p, q)
     for axis, found in enumerate(viscosity.multigrid.components(q)):
         assert (
-            np.abs(np.where(there[axis], expected[axis], 0.0) - found.numpy()).max()
+            np.abs(np.where(nonzero[axis], expected[axis], 0.0) - found.numpy()).max()
             < 1e-5 * np.abs(expected[axis]).max()
         )
 
@@ -139,13 +142,13 @@ def test_rigid_motions_stay_and_momenta_are_kept(dimension: int) -> None:
     _, volume = force_of_energy(simulation, before, 1.0)
     assert result.converged and result.dissipated > 0.0
     after = [field.numpy() for field in simulation.velocity]
-    kept = [sum((volume[a] * x[a]).sum() for a in (0,)) for x in (before, after)]
+    momenta = [sum((volume[a] * x[a]).sum() for a in (0,)) for x in (before, after)]
     spin = [
         (volume[1] * at[1][0] * x[1]).sum() - (volume[0] * at[0][1] * x[0]).sum()
         for x in (before, after)
     ]
     size = sum(np.abs(volume[a] * before[a]).sum() for a in range(dimension))
-    assert abs(kept[1] - kept[0]) < 1e-4 * size
+    assert abs(momenta[1] - momenta[0]) < 1e-4 * size
     assert abs(spin[1] - spin[0]) < 1e-4 * size * grid.counts[0]
     energy = [
         sum((volume[a] * np.square(x[a])).sum() for a in range(dimension)) for x in (before, after)
@@ -538,7 +541,7 @@ def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
 
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_solids_bear_what_the_liquid_loses(dimension: int, solids: str) -> None:
+def test_viscous_momentum_of_the_liquid_goes_to_solids(dimension: int, solids: str) -> None:
     """Forces of pressure and stresses on solids against the liquid's momentum."""
     ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.15}
     liquid = box(
@@ -570,10 +573,10 @@ def test_solids_bear_what_the_liquid_loses(dimension: int, solids: str) -> None:
         assert borne == pytest.approx(-change, abs=3e-3 * start)
 
 
-@pytest.mark.parametrize("own", [None, 1.0])
-def test_a_resumed_run_goes_on_with_the_same_bits(own: float | None) -> None:
+@pytest.mark.parametrize("own_viscosity", [None, 1.0])
+def test_a_resumed_run_goes_on_with_the_same_bits(own_viscosity: float | None) -> None:
     def fresh():
-        return blob(2, own=own, physics={"gravity": [0.0, -9.81]})
+        return blob(2, own_viscosity=own_viscosity, physics={"gravity": [0.0, -9.81]})
 
     first, second = fresh(), fresh()
     advance(first, 0.1)
@@ -584,7 +587,7 @@ def test_a_resumed_run_goes_on_with_the_same_bits(own: float | None) -> None:
     assert np.array_equal(first.particles.position.numpy(), second.particles.position.numpy())
 
 
-def test_the_log_tells_heat_and_rows_are_finite() -> None:
+def test_the_log_has_finite_rows_and_the_heat() -> None:
     simulation = create(
         scene(
             size=[1.0, 0.5],
@@ -611,7 +614,7 @@ def test_a_step_that_cannot_be_solved_may_be_tried_again(monkeypatch: pytest.Mon
         simulation.step(0.01)
 
 
-def test_a_solve_that_gets_no_nearer_is_said_to_stagnate() -> None:
+def test_a_solve_without_progress_stagnates() -> None:
     simulation = blob(2)
     simulation.viscosity.tolerance = 1e-14  # unreachable in float32
     speed = np.random.default_rng(8).standard_normal(simulation.grid.shape)
@@ -664,9 +667,9 @@ def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.Monkey
     assert row["viscous_iterations"] >= 8
 
 
-@pytest.mark.parametrize("own", [100.0, 1e4])
-def test_one_viscosity_of_all_liquids_is_that_of_the_table(own: float) -> None:
-    first, second = blob(2, viscosity=own), blob(2, own=own)
+@pytest.mark.parametrize("own_viscosity", [100.0, 1e4])
+def test_one_viscosity_of_all_liquids_is_that_of_the_table(own_viscosity: float) -> None:
+    first, second = blob(2, viscosity=own_viscosity), blob(2, own_viscosity=own_viscosity)
     for simulation in (first, second):
         simulation.particles.velocity.assign(
             np.random.default_rng(0)
@@ -726,15 +729,16 @@ def test_differing_viscosities_lose_energy_beside_walls(dimension: int, spread: 
     for field in viscosity.relative:
         field.assign(spread ** rng.uniform(0.0, 1.0, grid.shape).astype(np.float32))
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
-    there = np.concatenate(
+    nonzero = np.concatenate(
         [(field.numpy() > 0.0).ravel() for field in viscosity.multigrid.levels[0].diagonal]
     )
     x, y = (
-        np.where(there, rng.standard_normal(len(there)), 0.0).astype(np.float32) for _ in range(2)
+        np.where(nonzero, rng.standard_normal(len(nonzero)), 0.0).astype(np.float32)
+        for _ in range(2)
     )
 
     def product(x):
-        p, q = (wp.zeros(len(there), dtype=wp.float32, device="cpu") for _ in range(2))
+        p, q = (wp.zeros(len(nonzero), dtype=wp.float32, device="cpu") for _ in range(2))
         p.assign(x)
         viscosity.multigrid.product(p, q)
         return q.numpy().astype(float)
@@ -773,7 +777,7 @@ def test_thick_liquid_from_a_source_stays_thick() -> None:
     assert simulation.particles.kept.numpy().min() == 1.0
 
 
-def test_without_the_table_there_is_nothing() -> None:
+def test_without_the_table_there_is_no_viscosity() -> None:
     simulation = create(scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.0, 0.0], [0.4, 0.4])]))
     assert simulation.viscosity is None
     assert simulation.particles.kept is None
@@ -802,6 +806,6 @@ def test_without_the_table_there_is_nothing() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_said(tables, complaint: str) -> None:
+def test_invalid_settings_are_refused(tables, complaint: str) -> None:
     with pytest.raises(ValidationError, match=complaint):
         scene(size=[1.0, 1.0], resolution=8, **{"liquid": [box([0.0, 0.0], [0.5, 0.5])], **tables})

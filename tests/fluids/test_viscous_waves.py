@@ -81,14 +81,14 @@ def tank(wave: StandingWave, cells: int, viscosity: float, **tables: Any) -> Liq
     Positions and velocities of the particles are those of the wave.
     """
     liquid = [box([0.0, 0.0], [LONG, DEPTH])]
-    given = {
+    defaults = {
         "wall": "free-slip",
         "cfl": 20.0,
         "viscosity": {"value": viscosity},
         "solver": {"tolerance": 1e-6},
     }
     simulation = create(
-        scene(size=[LONG, 0.625], resolution=cells, liquid=liquid, **given, **tables)
+        scene(size=[LONG, 0.625], resolution=cells, liquid=liquid, **defaults, **tables)
     )
     p = simulation.particles
     at = p.position.numpy().astype(np.float64)

@@ -260,7 +260,7 @@ def test_walls_at_any_angle_drag_by_their_area(dimension: int, degrees: float) -
     assert abs(force @ up[:dimension]) < 0.01 * expected
 
 
-def test_what_liquid_loses_walls_get() -> None:
+def test_drag_momentum_of_the_liquid_goes_to_walls() -> None:
     """Momentum that liquid loses and walls get.
 
     Momentum of the particles, which only the floor takes, and energy of the faces.
@@ -271,16 +271,16 @@ def test_what_liquid_loses_walls_get() -> None:
     def momentum() -> float:
         return float(mass * simulation.particles.velocity.numpy()[:, 0].sum(dtype=np.float64))
 
-    start, given, work, power = momentum(), 0.0, 0.0, 0.0
+    start, impulse, work, power = momentum(), 0.0, 0.0, 0.0
     while simulation.time < 0.3:
         row = simulation.step(min(simulation.stable_dt(), 0.01))
         force = simulation.measured["forces"]["domain_fx"]
-        given += force * simulation.kick_dt
+        impulse += force * simulation.kick_dt
         work += row["drag_work"]
         power += force * simulation.kick_dt * middle(simulation)
         assert row["drag_work"] > 0.0
-    assert given > 0.03 * start
-    assert start - momentum() == pytest.approx(given, rel=0.05)
+    assert impulse > 0.03 * start
+    assert start - momentum() == pytest.approx(impulse, rel=0.05)
     assert work == pytest.approx(power, rel=0.15), (
         "force times speed, that of the cells beside the floor is less than the mean"
     )
@@ -314,7 +314,7 @@ def test_momentum_and_energy_of_any_flow(seed: int) -> None:
     def watched(sums: Any, window: Any, velocity: Any, *rest: Any) -> Any:
         before = [field.numpy().astype(np.float64) for field in velocity]
         work, impulses = act(sums, window, velocity, *rest)
-        fluid, lost, energy, sizes = (
+        fluid, lost_momentum, energy, sizes = (
             (projection.kind.numpy() == 1).astype(float),
             np.zeros(3),
             0.0,
@@ -325,11 +325,14 @@ def test_momentum_and_energy_of_any_flow(seed: int) -> None:
             assert (np.abs(now) <= np.abs(u)).all()
             free = boundary.open[axis].numpy() if boundary.open else 1.0
             m = mass * free * 0.5 * (fluid + np.roll(fluid, 1, 2 - axis))
-            lost[axis], energy = (m * (u - now)).sum(), energy + 0.5 * (m * (u**2 - now**2)).sum()
+            lost_momentum[axis], energy = (
+                (m * (u - now)).sum(),
+                energy + 0.5 * (m * (u**2 - now**2)).sum(),
+            )
             sizes += (m * np.abs(u)).sum(), (m * u**2).sum()
         # Faces are float32.
         assert (
-            np.abs(impulses[:, :3].sum(axis=0) - lost).max()
+            np.abs(impulses[:, :3].sum(axis=0) - lost_momentum).max()
             <= 1e-5 * np.abs(impulses).max() + 1e-7 * sizes[0]
         )
         assert work == pytest.approx(energy, rel=1e-5, abs=1e-7 * sizes[1])
@@ -388,15 +391,20 @@ def test_the_strongest_drag_stops_and_does_not_turn(dimension: int) -> None:
                 wall_drag={"coefficient": 1e6},
             )
         )
-        taken: list[tuple[np.ndarray, np.ndarray]] = []
+        recorded: list[tuple[np.ndarray, np.ndarray]] = []
         act = simulation.wall_drag.act
 
         def watched(
-            sums: Any, window: Any, velocity: Any, *rest: Any, act: Any = act, taken: Any = taken
+            sums: Any,
+            window: Any,
+            velocity: Any,
+            *rest: Any,
+            act: Any = act,
+            recorded: Any = recorded,
         ) -> Any:
             before = [field.numpy().copy() for field in velocity]
             done = act(sums, window, velocity, *rest)
-            taken.extend(
+            recorded.extend(
                 (u, field.numpy().copy()) for u, field in zip(before, velocity, strict=True)
             )
             return done
@@ -405,16 +413,16 @@ def test_the_strongest_drag_stops_and_does_not_turn(dimension: int) -> None:
         rows = advance(simulation, 0.3)
         assert all(row["drag_work"] >= 0.0 for row in rows)
         assert all(
-            (np.abs(now) <= np.abs(u)).all() and (now * u >= -1e-6).all() for u, now in taken
+            (np.abs(now) <= np.abs(u)).all() and (now * u >= -1e-6).all() for u, now in recorded
         )
-        assert max(np.abs(now).max() for _, now in taken) < 10.0
+        assert max(np.abs(now).max() for _, now in recorded) < 10.0
         solids = [
             solids[0] | {"radius": 0.07},
             box([0.8, -1.0, -1.0][:dimension], [0.83, 9.0, 9.0][:dimension]),
         ]
 
 
-def test_liquid_that_leaves_its_wall_is_not_held() -> None:
+def test_drag_does_not_hold_liquid_that_leaves_a_wall() -> None:
     """Liquid that leaves its wall, without drag.
 
     Thrown off the floor it is RELEASED; held by a free-slip ceiling it would not be.
@@ -432,7 +440,7 @@ def test_liquid_that_leaves_its_wall_is_not_held() -> None:
     row = simulation.step(0.01)
     assert row["active"] > 0
     assert row["drag_work"] == simulation.measured["forces"]["domain_fx"] == 0.0
-    held = create(
+    stuck = create(
         scene(
             size=[2.0, 1.0],
             resolution=40,
@@ -441,7 +449,7 @@ def test_liquid_that_leaves_its_wall_is_not_held() -> None:
             wall="free-slip",
         )
     )
-    assert held.step(0.01)["drag_work"] > 0.0
+    assert stuck.step(0.01)["drag_work"] > 0.0
 
 
 def test_bodies_are_dragged_along() -> None:
@@ -492,7 +500,7 @@ def test_no_coefficient_no_change(tables: dict[str, Any]) -> None:
     assert not np.array_equal(dragged.state()["velocity"], states[0]["velocity"])
 
 
-def test_a_restored_run_goes_on_alike() -> None:
+def test_a_restored_run_continues_identically() -> None:
     through, resumed = sheet(1.5, 0.1, floor=1.3), sheet(1.5, 0.1, floor=1.3)
     advance(through, 0.1)
     resumed.restore(through.state())

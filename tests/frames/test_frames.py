@@ -261,7 +261,7 @@ def test_a_writer_holds_few_frames(tmp_path):
     release.join()
 
 
-def test_a_writer_s_error_comes_back_every_time_and_no_later_frame_is_written(tmp_path):
+def test_a_writer_error_is_raised_every_time_and_stops_later_frames(tmp_path):
     folder = SlowFolder(tmp_path, fails=1)
     folder.gate.release(10)
     writer = FrameWriter(folder)
@@ -296,7 +296,7 @@ def test_another_error_is_not_hidden_by_the_writer_s(tmp_path):
         (b"<UnstructuredGrid>", b"<UnstructuredGrid><Piece/></UnstructuredGrid><UnstructuredGrid>"),
     ],
 )
-def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, old, new):
+def test_a_frame_with_impossible_sizes_is_refused(tmp_path, old, new):
     write_vtu(
         tmp_path / "a.vtu",
         Points(

@@ -96,23 +96,23 @@ def same(found: Mesh, expected: Mesh, *, bare: bool) -> None:
 
 @pytest.mark.parametrize("name", SUFFIXES)
 @pytest.mark.parametrize("part", PARTS)
-def test_what_a_format_holds_comes_back(tmp_path, name, part):
+def test_supported_data_round_trip_in_every_format(tmp_path, name, part):
     """Round trip of a part through each format.
 
     Without messages that would spoil a terminal, except meshio's warnings about the format.
     """
     if name == "med" and importlib.util.find_spec("h5py") is None:
         pytest.skip("needs h5py")
-    given, held = PARTS[part], holds(name, *kind_of(PARTS[part]))
-    file = tmp_path / f"{given.name}_000001.{SUFFIXES[name]}"
+    source_part, held = PARTS[part], holds(name, *kind_of(PARTS[part]))
+    file = tmp_path / f"{source_part.name}_000001.{SUFFIXES[name]}"
     assert FRAME_FILE.fullmatch(file.name)
     if held.dress is None:
         assert name not in WHOLE
         with pytest.raises(ValueError, match="cannot store"):
-            write_meshio(file, given, name)
+            write_meshio(file, source_part, name)
         assert list(tmp_path.iterdir()) == []
         return
-    write_meshio(file, given, name)
+    write_meshio(file, source_part, name)
     assert list(tmp_path.iterdir()) == [file]
     if name in WHOLE:
         assert held.dress is not Dress.BARE
@@ -123,26 +123,29 @@ def test_what_a_format_holds_comes_back(tmp_path, name, part):
             read_meshio(file, name)
     if name == "stl":  # it holds triangles one by one, without shared points
         np.testing.assert_allclose(
-            found.points[found.corners], given.points[given.corners], rtol=1e-6, atol=1e-7
+            found.points[found.corners],
+            source_part.points[source_part.corners],
+            rtol=1e-6,
+            atol=1e-7,
         )
     else:
-        same(found, mesh_of(given), bare=bare)
+        same(found, mesh_of(source_part), bare=bare)
     if held.empty:
-        write_meshio(file, without(given), name)
+        write_meshio(file, without(source_part), name)
         assert (
             len(from_meshio(getattr(meshio, MODULES.get(name, name)).read(str(file))).points) == 0
         )
 
 
 @pytest.mark.parametrize("name", ["xdmf", "vtk", "gmsh", "ply"])
-def test_nothing_is_said(tmp_path, capfd, name):
+def test_meshio_prints_nothing(tmp_path, capfd, name):
     holds.cache_clear()
     part = PARTS["triangles"]
     write_meshio(tmp_path / f"surface_000001.{SUFFIXES[name]}", part, name)
     assert capfd.readouterr() == ("", "")
 
 
-def test_every_format_of_meshio_is_there_or_cannot_be():
+def test_every_meshio_format_is_supported_or_known_to_be_unsuitable():
     """Formats of meshio: all are listed, or cannot be.
 
     Left out: other versions of a listed format, another format with the suffix of gmsh's, and
@@ -167,8 +170,8 @@ def test_formats_left_out_hold_no_part(monkeypatch, name):
 
 @pytest.mark.parametrize("part", PARTS)
 def test_a_part_as_a_mesh(tmp_path, part):
-    given = PARTS[part]
-    mesh = to_meshio(given)
+    source_part = PARTS[part]
+    mesh = to_meshio(source_part)
     assert isinstance(mesh, meshio.Mesh)
     assert (
         mesh.cells[0].type
@@ -180,14 +183,14 @@ def test_a_part_as_a_mesh(tmp_path, part):
             "squares": "quad",
         }[part]
     )
-    same(from_meshio(mesh), mesh_of(given), bare=False)
-    assert bool(mesh.cell_data) == isinstance(given, Cells)
-    write_vtu(tmp_path / f"{given.name}_000000.vtu", given)
-    read = meshio.read(tmp_path / f"{given.name}_000000.vtu")
+    same(from_meshio(mesh), mesh_of(source_part), bare=False)
+    assert bool(mesh.cell_data) == isinstance(source_part, Cells)
+    write_vtu(tmp_path / f"{source_part.name}_000000.vtu", source_part)
+    read = meshio.read(tmp_path / f"{source_part.name}_000000.vtu")
     np.testing.assert_array_equal(read.points, mesh.points)
     np.testing.assert_array_equal(read.cells[0].data, mesh.cells[0].data)
     mesh.write(tmp_path / "again.vtk")
-    same(from_meshio(meshio.read(tmp_path / "again.vtk")), mesh_of(given), bare=False)
+    same(from_meshio(meshio.read(tmp_path / "again.vtk")), mesh_of(source_part), bare=False)
 
 
 def test_a_volume_is_its_active_voxels():
@@ -279,7 +282,7 @@ def test_a_run_in_a_format_that_is_not_read_back_goes_on(scene_file, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["xdmf", "vtk", "gmsh", "ply", "stl"])
-def test_the_bytes_of_a_frame_are_foretold(tmp_path, name):
+def test_the_bytes_of_a_frame_are_estimated(tmp_path, name):
     part = ball([0.0, 0.0, 0.0], 1.0)
     (file,) = FrameFolder(tmp_path, frame_format=name).write(0, 0.0, [part])
     assert (
@@ -382,7 +385,7 @@ def test_a_format_that_does_not_hold_the_parts_is_refused_before_any_work(
     assert not (tmp_path / "out").exists()
 
 
-def test_what_else_is_refused(scene_file, tmp_path):
+def test_other_invalid_formats_are_refused(scene_file, tmp_path):
     with pytest.raises(SceneError, match=r"output.format"):
         load_scene(scene_file, ["output.format=doc"])
     with pytest.raises(SceneError, match="surface_ply"):
@@ -396,7 +399,7 @@ def test_what_else_is_refused(scene_file, tmp_path):
             check_scene(str(scene_file), ["output.format=exodus"])
 
 
-def test_fields_that_a_format_does_not_hold_are_told(scene_file, tmp_path):
+def test_fields_unsupported_by_a_format_are_reported(scene_file, tmp_path):
     scene = load_scene(scene_file, ["time.duration=0.1", "output.format=permas"])
     record = run_into(scene, tmp_path / "out", observer=quiet())
     assert record.warnings == [

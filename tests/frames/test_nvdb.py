@@ -138,7 +138,7 @@ def test_the_header_byte_by_byte(tmp_path):
     assert leaves == np.count_nonzero(tiles.min(axis=(1, 3, 5)) < BAND)
 
 
-def test_what_is_far_inside_takes_no_room(tinyvdb, tmp_path):
+def test_cells_far_inside_take_no_room(tinyvdb, tmp_path):
     z, y, x = np.ogrid[:70, :80, :300]  # the ball fills two lower nodes along x
     values = (np.sqrt((x - 160.0) ** 2 / 9 + (y - 40.0) ** 2 + (z - 35.0) ** 2) - 30.0).astype(
         np.float32
@@ -169,7 +169,7 @@ def test_an_empty_volume_and_a_full_one(tinyvdb, tmp_path):
 
 
 @pytest.mark.parametrize("values", [np.full(SHAPE, np.nan), np.zeros((4, 4))])
-def test_what_is_no_volume_is_refused(tmp_path, values):
+def test_invalid_volumes_are_refused(tmp_path, values):
     with pytest.raises(ValueError, match="'density' must hold finite values of a 3-D grid"):
         write_nvdb(tmp_path / "a.nvdb", Volume("density", values, SPACING))
     assert list(tmp_path.iterdir()) == []

@@ -91,7 +91,7 @@ def test_a_frame_changes_nothing_of_the_run():
         assert np.array_equal(with_it.state()[name], value), name
 
 
-def test_off_is_nothing(monkeypatch):
+def test_without_surface_output_nothing_is_written(monkeypatch):
     """Without the option no surface, no field, no kernel."""
     launched = []
     monkeypatch.setattr(particle_frames, "faces_from_particles", lambda *a: launched.append(a))

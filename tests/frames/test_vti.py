@@ -113,7 +113,7 @@ def test_a_file_cut_short_is_refused(tmp_path):
         (b"<ImageData", b"<!-- --><ImageData"),
     ],
 )
-def test_files_that_say_what_cannot_be(tmp_path, old, new):
+def test_files_with_impossible_sizes_are_refused(tmp_path, old, new):
     write_vti(tmp_path / "a.vti", some_cells(3))
     whole = (tmp_path / "a.vti").read_bytes()
     assert old in whole

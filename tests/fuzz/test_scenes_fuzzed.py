@@ -159,7 +159,9 @@ def test_mutated_scenes(data: bytes) -> None:
         ),
     ],
 )
-def test_what_once_ended_in_a_traceback_is_refused(text: str, message: str, tmp_path: Path) -> None:
+def test_scenes_that_once_raised_a_traceback_are_refused(
+    text: str, message: str, tmp_path: Path
+) -> None:
     file = tmp_path / "scene.toml"
     file.write_text(text if "[scene]" in text else f'{text}\n[scene]\nsimulator = "fluids"\n')
     with pytest.raises(SceneError) as caught:

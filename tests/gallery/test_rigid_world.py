@@ -54,7 +54,7 @@ def tumbling():
     return world
 
 
-def test_what_is_fixed_stays_and_answers_to_no_impulse():
+def test_fixed_bodies_stay_and_ignore_impulses():
     world = tumbling()
     energy, stepper = world.energy(), ContactStepper(world, dt=0.01)
     for _ in range(200):

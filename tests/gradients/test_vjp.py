@@ -185,8 +185,8 @@ def test_stencils_of_arrays_and_numbers(name, outside):
     varying, numbers, center, periodic = STENCILS[name]
     shape = (6, 7) if len(center_of(numbers)) == 2 else (3, 4, 5)
     cells, data = random_grid(shape, 67)
-    rng, given = np.random.default_rng(68), {n: data[n] for n in ("b", "lower", "upper", "shift")}
-    given |= (
+    rng, inputs = np.random.default_rng(68), {n: data[n] for n in ("b", "lower", "upper", "shift")}
+    inputs |= (
         {o: -rng.uniform(0.2, 1.0, shape) for o in varying}
         | numbers
         | {center_of(numbers): np.full(shape, center)}
@@ -203,10 +203,10 @@ def test_stencils_of_arrays_and_numbers(name, outside):
     def of_offsets(**data):
         return make(
             *(data.pop(n) for n in ("b", "lower", "upper", "shift")),
-            {o: data[str(o)] for o in given if str(o) in data},
+            {o: data[str(o)] for o in inputs if str(o) in data},
         )
 
-    named = {str(o): v for o, v in given.items()}
+    named = {str(o): v for o, v in inputs.items()}
     result, g = solved(of_offsets, named), rng.standard_normal(shape)
     found = wl.vjp(result, g, stopping=wl.StoppingCriteria(rtol=1e-12))
     assert not result.problem.A.symmetric
@@ -436,7 +436,7 @@ def test_bounds_that_are_equal_move_x_with_them():
     assert found.lower.numpy()[3] + found.upper.numpy()[3] == pytest.approx(expected, rel=1e-6)
 
 
-def test_of_two_bounds_that_are_equal_the_one_holds_that_y_pushes_against():
+def test_y_selects_the_active_one_of_two_equal_bounds():
     """Two equal bounds: the active one is the one against which y pushes.
 
     Nothing is free, so that the derivative of g.x by a bound is g's entry; at y = 0 it is the lower
@@ -512,7 +512,7 @@ def test_a_floating_component_is_defined_but_for_a_constant():
     assert abs(found.b.numpy()[inside].mean()) < 1e-10
 
 
-def test_what_is_refused():
+def test_invalid_arguments_are_refused():
     A = np.array([[2.0, -1.0], [-1.0, 2.0]])
     problem = wl.LCP(A, np.array([0.5, -2.5]))
     result, g = wl.solve(problem), np.ones(2)
@@ -599,7 +599,7 @@ def test_the_residual_of_the_linear_solve_is_one_of_float64():
     assert found.relative_residual < 1e-11
 
 
-def test_what_a_cotangent_has_off_the_unknowns_does_not_count():
+def test_cotangents_off_the_unknowns_are_ignored():
     cells, data = random_grid((7, 8), 113)
     result = solved(grid_problem(cells), data)
     g = np.random.default_rng(114).standard_normal(cells.shape)
@@ -630,7 +630,7 @@ def test_memory_does_not_grow_with_the_iterations():
     assert abs(peaks[1] - peaks[0]) < 8 * cells.size
 
 
-def test_nothing_is_left_out_on_the_host_or_device(device):
+def test_gradients_are_arrays_on_the_operators_device(device):
     cells, data = random_grid((6, 6), 109)
     A = wl.GridPoisson(cells, device=device, shift=0.1)
     result = wl.solve(wl.LCP(A, data["b"], data["lower"]))

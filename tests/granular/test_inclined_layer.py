@@ -8,7 +8,7 @@ import pytest
 from warp_lcp.benchmarks.validation import inclined
 
 
-def test_a_layer_rests_and_runs_as_its_friction_angle_says_and_the_box_does_not() -> None:
+def test_the_cone_slides_at_the_friction_angle_and_the_box_does_not() -> None:
     trial = inclined.layer(16, angles=(27.5,))
     assert trial.failures() == []
     assert trial.findings[-1].control

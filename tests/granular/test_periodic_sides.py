@@ -215,7 +215,7 @@ def test_the_same_in_three_dimensions() -> None:
         assert distance.max() < 2e-3 * DX
 
 
-def test_nothing_is_lost_on_the_way_round() -> None:
+def test_mass_is_conserved_across_the_sides() -> None:
     """Conservation on the way around.
 
     A layer that slides on a smooth floor keeps its mass, momentum and height for two rounds.
@@ -255,7 +255,7 @@ def test_a_floor_goes_on_across_the_sides() -> None:
     position, wind = wp.array(points, dtype=wp.vec3), simulation.grid.faces()
     wind[0].fill_(1.0)
     simulation.boundary.advect(wind, 0.5 * DX, simulation.time, position)
-    assert simulation.boundary.met() == (0, 0, 0)
+    assert simulation.boundary.collision_counts() == (0, 0, 0)
     assert np.unwrap(position.numpy()[:, 0], period=8 * DX) - points[:, 0] == pytest.approx(
         0.5 * DX, abs=1e-7
     )
@@ -274,14 +274,14 @@ def test_a_floor_goes_on_across_the_sides() -> None:
         ({"density_correction": {}}, "cannot be combined with density_correction"),
     ],
 )
-def test_what_does_not_go_together_is_refused(tables: dict[str, Any], message: str) -> None:
+def test_contradicting_settings_are_refused(tables: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneError, match=message):
         validate(
             SandScene, scene((8, 8), block([0, 0], [8, 4], 8, 0, [0.0, 0.0]), **tables), "scene"
         )
 
 
-def test_a_domain_with_sides_has_none_of_it() -> None:
+def test_a_domain_with_walls_has_no_periodic_data() -> None:
     simulation = create(
         (8, 8), block([0, 0], [8, 4], 8, 0, [0.0, 0.0]), domain={"periodic": [False, False]}
     )

@@ -140,7 +140,7 @@ def test_both_methods_find_the_same_velocity() -> None:
         (GROWS | {"grain_size": 0.0}, "friction.grain_size = 0.0: must be greater than 0"),
     ],
 )
-def test_what_is_missing_or_too_much_is_named(friction: dict[str, object], expected: str) -> None:
+def test_missing_or_superfluous_keys_are_named(friction: dict[str, object], expected: str) -> None:
     tables = {
         "domain": {"size": [1.0, 0.5], "resolution": 16},
         "time": {"duration": 1.0},

@@ -89,7 +89,7 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
             solids, size=[0.6, 0.4], depth=0.2, resolution=48, domain={"friction": 0.0}
         )
         advance(simulation, 0.3, simulation.scene.time.dt_max)
-        floor, given = [], []
+        floor, pushes = [], []
         for _ in range(20):
             simulation.step(simulation.scene.time.dt_max)
             # The load on the floor is p - s_yy = p + a.
@@ -101,9 +101,9 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
                 / simulation.stress.kick_dt
             )
             if simulation.carried is not None:
-                given.append(simulation.carried.impulses()[0] / simulation.stress.kick_dt)
+                pushes.append(simulation.carried.impulses()[0] / simulation.stress.kick_dt)
         loads.append(float(np.mean(floor)))
-        forces += [np.mean(given, axis=0)] if given else []
+        forces += [np.mean(pushes, axis=0)] if pushes else []
         simulations.append(simulation)
     weight = 2.0 * DENSITY * 0.2 * 0.1 * G
     assert loads[0] - loads[1] == pytest.approx(weight, rel=0.05)
@@ -318,7 +318,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
         ({"domain": {"periodic": [True, False]}}, "periodic"),
     ],
 )
-def test_scenes_that_bodies_do_not_go_with(table: dict[str, Any], key: str) -> None:
+def test_scenes_unsupported_with_bodies_are_refused(table: dict[str, Any], key: str) -> None:
     with pytest.raises(ValidationError, match=key):
         start(
             [ball([0.3, 0.27], 0.05, density=3000.0)],

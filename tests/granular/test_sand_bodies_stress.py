@@ -148,7 +148,7 @@ def beside_bodies(case: Case, axis: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
+def test_momentum_of_sand_goes_to_bodies(dimension: int) -> None:
     """Momentum that a body gets and sand loses.
 
     Momentum and angular momentum of sand and two bodies stay constant under any stresses that reach
@@ -172,8 +172,8 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
     case.stress.residual()
     assert case.bodies is not None
     # As momenta of the grid, in units of a full face's mass.
-    given = case.bodies.impulses() / (DENSITY * grid.cell_volume)
-    assert (np.abs(given) > 1e-4).all()  # [m/s, m^2/s]: both bodies are pushed and turned
+    impulses = case.bodies.impulses() / (DENSITY * grid.cell_volume)
+    assert (np.abs(impulses) > 1e-4).all()  # [m/s, m^2/s]: both bodies are pushed and turned
     push, turn = np.zeros(3), np.zeros(3)
     for axis, u in enumerate(case.stress.checked.u):
         free, mass = case.packing.inverse[axis].numpy() > 0.0, case.packing.mass[axis].numpy()
@@ -186,12 +186,12 @@ def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
         )
     for number, center in enumerate(case.centers):
         force, torque = np.zeros(3), np.zeros(3)
-        force[:dimension] = given[number, :dimension]
-        torque[(3 - (1 if dimension == 2 else 3)) :] = given[number, dimension:]
+        force[:dimension] = impulses[number, :dimension]
+        torque[(3 - (1 if dimension == 2 else 3)) :] = impulses[number, dimension:]
         push, turn = push + force, turn + torque + np.cross(center, force)
     # Sums of float32 masses.
-    assert np.abs(push).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
-    assert np.abs(turn).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
+    assert np.abs(push).max() < 2e-7 * np.abs(impulses).max() * grid.size**0.5
+    assert np.abs(turn).max() < 2e-7 * np.abs(impulses).max() * grid.size**0.5
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

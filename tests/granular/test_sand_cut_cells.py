@@ -215,7 +215,7 @@ def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
     )
     case.solve(1e-5)
     now, p, cells = case.stress.now.numpy().astype(float), case.packing, case.walls.cells.numpy()
-    traction, slip, lost = (
+    traction, slip, lost_momentum = (
         np.zeros((case.walls.count, 3)),
         np.zeros((case.walls.count, 3)),
         np.zeros(3),
@@ -234,9 +234,11 @@ def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
         volume = (case.walls.volume.numpy() - 0.5 * (low + high)).ravel()[cells]
         missing += case.walls.normal[:, axis] * gravity[axis] * DT * volume / area
         inverse = p.inverse[axis].numpy()
-        lost[axis] = ((u - p.start[axis].numpy())[inverse > 0.0] / inverse[inverse > 0.0]).sum()
+        lost_momentum[axis] = (
+            (u - p.start[axis].numpy())[inverse > 0.0] / inverse[inverse > 0.0]
+        ).sum()
     given = (area[:, None] * (traction - pressure[:, None] * case.walls.normal)).sum(axis=0)
-    assert lost == pytest.approx(given, rel=1e-4, abs=1e-4 * np.abs(given).max())
+    assert lost_momentum == pytest.approx(given, rel=1e-4, abs=1e-4 * np.abs(given).max())
     slip -= (slip * case.walls.normal).sum(axis=1)[:, None] * case.walls.normal
     sliding = (pressure > 0.2 * G * DT) & (np.linalg.norm(slip, axis=1) > 0.02 * G * DT)
     assert sliding.sum() >= 3 ** (dimension - 1)

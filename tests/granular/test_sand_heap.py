@@ -45,7 +45,7 @@ def test_a_wedge_twice_as_steep_as_its_friction_slumps() -> None:
     assert center > 0.05
 
 
-def test_a_wedge_and_a_dome_are_told_apart_wherever_they_stand() -> None:
+def test_a_wedge_and_a_dome_are_distinguished_at_any_position() -> None:
     x = np.arange(0.0, 1.2, 0.0125)
     steep = math.tan(math.radians(33.0))
     wedge = np.maximum(0.2 - np.abs(x - 0.5037) * steep, 0.0)

@@ -95,7 +95,7 @@ def test_sand_that_touches_a_wall_or_a_body_is_not_in_flight() -> None:
         )
 
 
-def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
+def test_momentum_correction_acts_on_airborne_sand_only() -> None:
     """Conservation for airborne sand alone.
 
     A block over a heap: the heap keeps the result of the stresses, the block falls rigidly.
@@ -114,7 +114,7 @@ def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
     assert np.abs(velocity[~low] - velocity[~low].mean(axis=0)).max() < 1e-3
 
 
-def test_sand_on_an_endless_axis_has_no_bodies_that_end() -> None:
+def test_connected_sand_on_a_periodic_axis_is_no_fragment() -> None:
     assert (
         create(
             scene(

@@ -41,15 +41,15 @@ DISC = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
 )
 def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
     model = load_scene(name, [*overrides, *FAST])
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_into(model, whole, observer=StepCounter()).status == "finished"
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run_into(model, uninterrupted, observer=StepCounter()).status == "finished"
     watch = StepCounter()
     assert (
         run_into(model, parts, observer=watch, stop=lambda: watch.steps >= 13).status == "stopped"
     )
     second = run_into(model, parts, observer=StepCounter(), resume=True)
     assert (second.status, second.resumed_from_step) == ("finished", 13)
-    assert written_files(whole) == written_files(parts)
+    assert written_files(uninterrupted) == written_files(parts)
 
 
 @pytest.mark.parametrize(

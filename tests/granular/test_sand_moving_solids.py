@@ -186,7 +186,7 @@ def test_solids_that_close_the_domain_end_no_run() -> None:
     assert math.isfinite(rows[-1]["kinetic_energy"])
 
 
-def test_sand_that_a_wall_turns_is_not_taken_for_faster() -> None:
+def test_sand_deflected_by_a_wall_is_not_counted_as_accelerated() -> None:
     """Sand stopped by a wall at a high speed.
 
     A wall removes the component -1e6 m/s. float32 ends the solve far above g dt, and the energy

@@ -45,7 +45,7 @@ def test_the_log_has_the_columns_of_sand(folder: Path) -> None:
     assert "flow_rate" not in rows[0]
 
 
-def test_frames_have_what_sand_bears(folder: Path) -> None:
+def test_frames_have_the_stresses_of_sand(folder: Path) -> None:
     last = sorted(folder.glob("frames/particles_*.vtu"))[-1]
     points = meshio.read(last)
     assert points.point_data.keys() >= {"velocity", "speed", "fraction", "pressure", "yield_ratio"}
@@ -73,7 +73,7 @@ def test_the_profile_has_the_stages_of_a_step(folder: Path) -> None:
         (Color.PRESSURE, "pressure [Pa]"),
     ],
 )
-def test_images_may_show_what_sand_bears(folder: Path, color: Color, label: str) -> None:
+def test_images_may_show_the_stresses_of_sand(folder: Path, color: Color, label: str) -> None:
     recording = Recording(folder, color)
     points, values = recording.read(recording.numbers[-1])
     assert len(points) == len(values) > 0
@@ -105,7 +105,7 @@ def test_scenes_schema_and_check_know_sand() -> None:
     assert "stresses" in checked
 
 
-def test_a_solid_that_no_cell_feels_is_told() -> None:
+def test_a_solid_without_effect_on_cells_is_reported() -> None:
     """Of whole cells it holds nothing; with cut cells it is a wall, and nothing is said."""
     plate, sand = box([0.2, 0.19], [0.8, 0.21]), [box([0.0, 0.3], [1.0, 0.5])]
     for solids, told in (("voxel", True), ("cut-cell", False)):

@@ -73,7 +73,7 @@ def test_a_solid_that_moves_sweeps_the_fraction_before_it() -> None:
     np.testing.assert_array_equal(plane(packing.start[1])[1, :2], [0.5, 0.5])
 
 
-def test_what_is_too_dense_has_its_mass_and_pushes_nothing_out() -> None:
+def test_overfull_cells_keep_their_mass_and_push_nothing_out() -> None:
     packing = packed(["+", "+"])
     assert plane(packing.fraction)[0, 0] == pytest.approx(1.5)
     assert plane(packing.mass[1])[1, 0] == pytest.approx(1.5)

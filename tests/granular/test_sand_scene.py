@@ -92,7 +92,7 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("liquid=[]", "--set liquid=[]: must read section.key=value"),
     ],
 )
-def test_what_is_refused(tmp_path: Any, overrides: str, expected: str) -> None:
+def test_invalid_settings_are_refused(tmp_path: Any, overrides: str, expected: str) -> None:
     assert expected in complaint(tmp_path, overrides)
 
 
@@ -221,7 +221,7 @@ def test_a_cone_that_would_bear_tension_is_refused() -> None:
     assert 0.0 < 1.0 - axial < 0.01
 
 
-def test_the_plan_tells_material_and_friction() -> None:
+def test_the_plan_lists_material_and_friction() -> None:
     plan = dict(load_scene("column-collapse-2d").plan())
     assert plan["material"].startswith("dry-sand, friction angle 30 degrees")
     assert plan["friction"] == "cone, on walls 0.577"

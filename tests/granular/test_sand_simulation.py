@@ -80,7 +80,7 @@ def test_a_block_falls_freely(dimension: int) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_sand_lets_go_of_a_ceiling(dimension: int) -> None:
+def test_sand_separates_from_a_ceiling(dimension: int) -> None:
     """Separation of sand from a ceiling; a negative pressure would hold it."""
     sand = [box([0.0, 0.25, 0.0][:dimension], [0.5, 0.5, 0.5][:dimension])]
     simulation = create(scene(size=[0.5] * dimension, resolution=16, sand=sand, friction=0.0))
@@ -106,7 +106,7 @@ def settled(dimension: int, **tables: object) -> tuple[SandSimulation, list[dict
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
+def test_each_layer_bears_the_weight_above(dimension: int) -> None:
     """Load of each layer.
 
     Smooth walls bear no weight, so that the load of a row of cells is exactly the weight of the
@@ -159,7 +159,7 @@ def test_the_floor_bears_the_weight(dimension: int) -> None:
     ],
 )
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
+def test_every_step_keeps_its_invariants(dimension: int, model: str, method: str) -> None:
     """Invariants of every step.
 
     Mass is exact; pressure only pushes; friction only dissipates; no cell is predicted to be too

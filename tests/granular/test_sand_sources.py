@@ -51,7 +51,7 @@ def test_a_source_that_has_stopped_leaves_no_velocity_behind() -> None:
     assert all(not field.numpy().any() for field in simulation.solids.velocity)
 
 
-def test_what_a_drain_swallows_and_what_leaves_is_the_flow() -> None:
+def test_drained_and_outgoing_mass_equals_the_flow() -> None:
     tables = {"drain": [box([0.0, 0.0], [0.25, 0.0625])], "open": ["right"], "friction": 0.1}
     simulation = create(
         scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.0], [1.0, 0.25])], **tables)
@@ -101,7 +101,7 @@ def test_sand_that_fills_its_box_stops_no_run() -> None:
 
 @pytest.mark.parametrize("tables", [{}, {"particles": {"transfer": "flip"}}])
 def test_an_interrupted_pour_goes_on_bit_for_bit(tables: dict[str, Any]) -> None:
-    def made() -> Any:
+    def make() -> Any:
         return create(
             scene(
                 size=[1.0, 1.0],
@@ -113,7 +113,7 @@ def test_an_interrupted_pour_goes_on_bit_for_bit(tables: dict[str, Any]) -> None
             )
         )
 
-    through, resumed = made(), made()
+    through, resumed = make(), make()
     advance(through, 0.4)
     resumed.restore(through.state())
     for _ in range(10):

@@ -443,21 +443,21 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
             where=inverse > 0.0,
         )
         gained += float((force * u[axis]).sum())
-    taken = 0.0
+    work = 0.0
     for cell in interior(case):
         for axis in range(dimension):
-            taken += total_stress(case, axis)[cell] * (
+            work += total_stress(case, axis)[cell] * (
                 u[axis][at(cell, step_along(axis))] - u[axis][cell]
             )
         for shear, share in enumerate(case.field("share")):
             for copy in range(4):
                 edge = edge_of(cell, shear, copy)
-                taken += (
+                work += (
                     abs(share[edge])
                     * now[(first_copy(dimension, shear) + copy, *cell)]
                     * shear_rate(u, shear, edge)
                 )
-    assert gained == pytest.approx(-taken, rel=1e-4)
+    assert gained == pytest.approx(-work, rel=1e-4)
 
 
 @pytest.mark.parametrize(

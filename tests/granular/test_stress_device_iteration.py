@@ -73,7 +73,7 @@ class Twin:
         ]
         self.packing.update(wp.array(density.astype(np.float32), dtype=wp.float32), u, DT)
         gain = {"gain": 0.3, "halfway": 0.5} if self.rate else {}
-        self._given = (
+        self._scalars = (
             YieldSet(0.5, 0.1 * SCALE * (rng.random() < 0.3), **gain),
             np.array([0.0, -9.81, 0.0]),
             DT,
@@ -90,7 +90,7 @@ class Twin:
         stress = self.stress
         stress.now.assign(self._start)
         stress.kick_dt = self._last
-        stress.begin(*self._given)
+        stress.begin(*self._scalars)
         result = wl.solve(stress, method, workspace=work, **options)
         rows = [(r.iteration, r.residual, r.step) for r in result.history]
         memory = [
@@ -163,7 +163,7 @@ def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 @pytest.mark.parametrize("where", ["stress", "velocity"])
-def test_what_is_not_finite_ends_both_alike(
+def test_non_finite_values_end_host_and_device_solves_alike(
     wrong: float, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(7400)

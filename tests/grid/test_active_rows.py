@@ -121,7 +121,7 @@ def test_all_cells_that_particles_reach_are_near(grid: StaggeredGrid, small: Non
 
 
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
-def test_what_was_reached_goes_along_to_another_part_of_a_domain(small: None) -> None:
+def test_marks_are_kept_when_the_window_moves(small: None) -> None:
     old, new = (
         StaggeredGrid((32, 20, 12), 0.1, 3, "cpu", origin=at, whole=(80, 60, 40))
         for at in ((16, 8, 8), (24, 0, 16))

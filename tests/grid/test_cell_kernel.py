@@ -126,7 +126,7 @@ def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: StencilKernel
     assert fields["y"].numpy().sum() == 4.0 * 18
 
 
-def test_what_is_said_of_a_box_that_is_wrong(box_pass: StencilKernel) -> None:
+def test_errors_of_an_invalid_box_are_clear(box_pass: StencilKernel) -> None:
     x, sums = GRID.field(), wp.zeros(6, dtype=wp.float64, device="cpu")
     with pytest.raises(
         ValueError, match=r"tests.boxes.scaled: fields have the shapes \(5, 6, 6\), \(5, 6, 7\)"

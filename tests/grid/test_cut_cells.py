@@ -497,7 +497,7 @@ def test_slivers_are_dropped_and_counted():
     assert (cut.base.numpy()[1, 2, 1:7] == wl.SOLID).all()
 
 
-def test_solids_that_close_nothing_are_reported():
+def test_solids_without_effect_are_reported():
     cut = cut_cells(
         grid_of(2), Sphere(center=[0.45, 0.35], radius=0.03), Sphere(center=[0.4, 0.3], radius=0.03)
     )

@@ -236,16 +236,16 @@ def test_a_sphere_is_flown_around(grid: StaggeredGrid) -> None:
     distance = at_nodes(grid, sphere(tuple(center), 3.0))
     rows = np.array([0.1, 0.5, 1.5, 2.5, 3.5])
     start = center + np.stack([np.full(5, -4.0), rows, np.zeros(5)], axis=1)
-    points, met = start * grid.spacing, 0
+    points, hits = start * grid.spacing, 0
     for _ in range(22):
         points, stopped = move(
             grid, velocities(grid, (1.0, 0.0)), distance, 0.5 * grid.spacing, points
         )
         radius = np.linalg.norm(points / grid.spacing - center, axis=1)
         assert (radius > 2.9).all()  # between nodes a sphere is flatter
-        met += stopped
+        hits += stopped
     end = points / grid.spacing
-    assert met > 20
+    assert hits > 20
     assert (end[1:, 0] > center[0] + 1.0).all()
     assert np.linalg.norm((end - center)[1:4, 1:], axis=1) == pytest.approx(3.0, abs=0.1)
     assert end[4] == pytest.approx(start[4] + [11.0, 0.0, 0.0], abs=1e-3)
@@ -295,7 +295,7 @@ def test_a_ramp_on_the_floor_is_climbed() -> None:
     assert y == pytest.approx((x - 12.0) * 3**-0.5, abs=0.01)
 
 
-def test_who_slid_over_a_ledge_goes_on_along_it() -> None:
+def test_a_particle_that_slid_over_a_ledge_continues_along_it() -> None:
     """Slide over a ledge.
 
     The part of the way that the wall has removed stays removed where the wall ends.

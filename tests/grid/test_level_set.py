@@ -122,14 +122,16 @@ def test_phi_is_the_distance_to_a_plane_wherever_it_lies_in_a_cell(
             low[axis] = high[axis] - layers
         else:
             high[axis] = low[axis] + layers
-        made = level_set(grid, fill(grid, low, high, per_cell), per_cell**grid.dimension)
+        surface_level = level_set(grid, fill(grid, low, high, per_cell), per_cell**grid.dimension)
         expected = np.broadcast_to(
-            side * (centers(grid, axis) - surface), grid.interior(made.phi.numpy()).shape
+            side * (centers(grid, axis) - surface), grid.interior(surface_level.phi.numpy()).shape
         )
         near = np.abs(expected) < 0.9
         assert near.any()
-        assert grid.interior(made.phi.numpy())[near] == pytest.approx(expected[near], abs=1e-2)
-        assert (grid.interior(made.phi.numpy())[expected > 1.6] == 1.5).all()
+        assert grid.interior(surface_level.phi.numpy())[near] == pytest.approx(
+            expected[near], abs=1e-2
+        )
+        assert (grid.interior(surface_level.phi.numpy())[expected > 1.6] == 1.5).all()
 
 
 @GRIDS
@@ -208,7 +210,7 @@ def test_the_density_is_the_sum_of_the_particles_kernels(
     points[0] = 1e-3  # a corner
     points[1] = np.array(grid.counts) - 1e-3
     points[:, grid.dimension :] = 0.0
-    made = level_set(grid, points, 4, indexed=indexed)
+    surface_level = level_set(grid, points, 4, indexed=indexed)
     expected = np.ones((len(points), *grid.shape))
     for axis in range(grid.dimension):
         shape = [1, 1, 1, 1]
@@ -223,7 +225,7 @@ def test_the_density_is_the_sum_of_the_particles_kernels(
     expected = expected.sum(axis=0) / 4
     if grid.dimension == 2:
         expected[[0, 2]] = 0.0
-    assert made.density.numpy() == pytest.approx(expected, abs=2e-5)
+    assert surface_level.density.numpy() == pytest.approx(expected, abs=2e-5)
 
 
 @GRIDS
@@ -362,13 +364,19 @@ def test_a_ball_of_twelve_cells_has_its_volume(dimension: int, smoothing: int) -
     """
     grid = StaggeredGrid((36, 36, 1 if dimension == 2 else 36), 0.05, dimension)
     radius, center = 12.0, [18.2, 17.9, 18.1][:dimension]  # out of the walls' reach
-    made = level_set(grid, ball(grid, center, radius, 2, 99), 2**dimension, smoothing=smoothing)
+    surface_level = level_set(
+        grid, ball(grid, center, radius, 2, 99), 2**dimension, smoothing=smoothing
+    )
     exact = (
         np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3
     ) * grid.spacing**dimension
     lost = dimension * (dimension - 1) * (0.25 + 0.5 * smoothing) / (2 * radius**2)
-    assert made.volume(None, grid.everywhere) / exact == pytest.approx(1.0 - lost, abs=4e-3)
-    assert smoothing or made.volume(None, grid.everywhere) / exact == pytest.approx(1.0, abs=1e-2)
+    assert surface_level.volume(None, grid.everywhere) / exact == pytest.approx(
+        1.0 - lost, abs=4e-3
+    )
+    assert smoothing or surface_level.volume(None, grid.everywhere) / exact == pytest.approx(
+        1.0, abs=1e-2
+    )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -381,7 +389,7 @@ def test_volume_ends_at_a_wall_that_cuts_cells(dimension: int) -> None:
     nx, ny, nz = 16, 20, 1 if dimension == 2 else 14
     grid = StaggeredGrid((nx, ny, nz), 0.125, dimension)
     points = fill(grid, [0.0] * 3, [float(c) for c in grid.counts], 2)
-    made = level_set(grid, points, 2**dimension)
+    surface_level = level_set(grid, points, 2**dimension)
     k, j, i = np.meshgrid(*(np.arange(m) - 1.0 for m in grid.shape), indexing="ij")
     walls = np.minimum(np.minimum(i, nx - i), np.minimum(j, ny - j))
     if dimension == 3:
@@ -390,16 +398,16 @@ def test_volume_ends_at_a_wall_that_cuts_cells(dimension: int) -> None:
     cut = slope[0] * (i - nx / 2) + slope[1] * (j - ny / 2)
     distance = on_device(np.minimum(walls, cut).astype(np.float32))
     whole = nx * ny * nz * grid.cell_volume
-    assert made.volume(None, grid.everywhere) == pytest.approx(whole, rel=1e-6)
-    assert made.volume(on_device(walls.astype(np.float32)), grid.everywhere) == pytest.approx(
-        whole, rel=1e-6
-    )
+    assert surface_level.volume(None, grid.everywhere) == pytest.approx(whole, rel=1e-6)
+    assert surface_level.volume(
+        on_device(walls.astype(np.float32)), grid.everywhere
+    ) == pytest.approx(whole, rel=1e-6)
     # Some is lost where the plane meets the domain's walls: there the distance is not linear
     # between the nodes.
-    assert made.volume(distance, grid.everywhere) == pytest.approx(whole / 2, rel=6e-3)
+    assert surface_level.volume(distance, grid.everywhere) == pytest.approx(whole / 2, rel=6e-3)
     # Only the contents of the window.
-    assert made.volume(distance, grid.window((1, 1, 1), (8, 20, 14))) < whole / 2
-    assert made.volume(None, Window((0, 0, 0), (1, 1, 1), grid.device)) == 0.0
+    assert surface_level.volume(distance, grid.window((1, 1, 1), (8, 20, 14))) < whole / 2
+    assert surface_level.volume(None, Window((0, 0, 0), (1, 1, 1), grid.device)) == 0.0
 
 
 def test_smoothing_quiets_a_surface_and_keeps_its_place() -> None:

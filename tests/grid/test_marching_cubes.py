@@ -70,7 +70,7 @@ def test_a_plane_is_exact():
 
 
 @GRIDS
-def test_what_fills_the_domain_is_cut_on_its_sides(grid):
+def test_a_surface_beyond_the_domain_is_cut_at_its_sides(grid):
     """Cut on the sides of a domain full of material.
 
     However deep the last cells are, the surface lies on the sides.

@@ -57,7 +57,7 @@ def degenerate(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (degenerate, "degenerate triangles (without area), the first at ["),
     ],
 )
-def test_what_can_be_healed_is_and_is_told(spoil, words: str, share: float) -> None:
+def test_repairable_defects_are_repaired_and_reported(spoil, words: str, share: float) -> None:
     some = CHANCE.random(len(TRIANGLES)) < share
     some[7] = True
     surface = close_surface(*spoil(some), "ball")
@@ -77,7 +77,7 @@ def two(shift: list[float], size: float = 1.0) -> ClosedSurface:
 @pytest.mark.parametrize(
     "shift", [[0.5, 0.5, 0.5], [0.3, 0.2, 0.1], [0.5, 0.0, 0.0], [0.9, 0.1, 0.1]]
 )
-def test_parts_that_overlap_are_their_union_and_are_told(shift: list[float]) -> None:
+def test_overlapping_parts_become_their_union_and_are_reported(shift: list[float]) -> None:
     surface = two(shift)
     overlap = np.prod(1.0 - np.array(shift))
     assert surface.crossings.count > 0 and surface.crossings.inverted == 0.0
@@ -118,7 +118,7 @@ def test_parts_that_touch_are_no_crossing(shift: list[float], size: float) -> No
     assert two(shift, size).crossings.place is None
 
 
-def test_a_part_inside_another_is_told() -> None:
+def test_a_part_inside_another_is_reported() -> None:
     surface = two([0.25, 0.25, 0.25], 0.5)
     assert surface.crossings.count == 0 and surface.crossings.doubled == pytest.approx(
         0.2, abs=0.02
@@ -144,7 +144,7 @@ def test_a_part_that_is_turned_out_of_itself_is_refused() -> None:
         repair_notes(TriangleMesh(surface=surface), "solid")
 
 
-def test_a_dent_is_fine_and_one_through_the_other_side_is_told() -> None:
+def test_a_dent_is_accepted_and_one_through_the_other_side_is_reported() -> None:
     for depth, crosses in ((0.5, False), (-1.5, True)):
         vertices = VERTICES.copy()
         vertices[5] *= depth

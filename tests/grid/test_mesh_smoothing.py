@@ -70,7 +70,7 @@ def test_a_drop_of_six_points_stays_a_drop():
     assert 0.05 * before < enclosed(mesh.points.numpy(), mesh.corners.numpy()) < 4.0 * before
 
 
-def test_nothing_stays_nothing():
+def test_an_empty_mesh_stays_empty():
     empty = DeviceMesh(
         wp.empty(0, dtype=wp.vec3, device="cpu"), wp.empty((0, 3), dtype=wp.int32, device="cpu")
     )

@@ -259,13 +259,13 @@ def test_smooth_turns_go_on_where_their_axis_stays():
     np.testing.assert_allclose(
         velocity(motion, 1.0), rigid(POINTS, [0, 0, 0], [0, 0, 120.0], [0, 0, 0]), atol=2e-4
     )
-    still = Keyframes(
+    fixed_axis = Keyframes(
         times=[0.0, 1.0, 2.0],
         rotate=[[0, 0, 10], [0, 0, 10], [0, 0, 40]],
         center=[0, 0, 0],
         smooth=True,
     )
-    np.testing.assert_allclose(still.pose(0.5).rotation, turn([0, 0, 1], 10), atol=1e-14)
+    np.testing.assert_allclose(fixed_axis.pose(0.5).rotation, turn([0, 0, 1], 10), atol=1e-14)
 
 
 @pytest.mark.parametrize(

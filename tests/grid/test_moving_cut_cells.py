@@ -107,7 +107,7 @@ def test_moving_solids_are_as_if_placed_there(dimension, which):
     """
     grid = grid_of(dimension, (12, 9, 7), 0.1)
     geometry, motion = MOVING[dimension][which]
-    still = [
+    resting = [
         placed(
             Box(lower=[0.3, 0.0, 0.0][:dimension], upper=[1.3, 0.1, 0.7][:dimension]),
             name="slab of one cell",
@@ -118,19 +118,19 @@ def test_moving_solids_are_as_if_placed_there(dimension, which):
         ),
     ]
     moving = CutCells(
-        grid, [still[0], placed(geometry, motion=motion), still[1]], wall_separating=True
+        grid, [resting[0], placed(geometry, motion=motion), resting[1]], wall_separating=True
     )
-    alone = CutCells(grid, still, wall_separating=True)
+    alone = CutCells(grid, resting, wall_separating=True)
     for time in (0.5, 2.2, 1.0):
         moving.move(time, 0.1)
-        there = CutCells(
+        placed_cells = CutCells(
             grid,
-            [still[0], placed(geometry.moved(motion.pose(time))), still[1]],
+            [resting[0], placed(geometry.moved(motion.pose(time))), resting[1]],
             wall_separating=True,
         )
-        for one, other in zip(fields_of(moving), fields_of(there), strict=True):
+        for one, other in zip(fields_of(moving), fields_of(placed_cells), strict=True):
             np.testing.assert_array_equal(one, other)
-        assert moving.dropped == there.dropped
+        assert moving.dropped == placed_cells.dropped
         for velocity, wall, open_, before in zip(
             moving.velocity, moving.wall, moving.open, alone.open, strict=True
         ):
@@ -162,7 +162,7 @@ def test_a_solid_may_come_in_later():
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_a_moving_solid_covers_of_a_resting_one_does_not_move(dimension):
+def test_parts_of_a_resting_solid_under_a_moving_one_have_no_velocity(dimension):
     """No motion of the part of a resting solid that a moving one covers.
 
     A piston slides over a floor 0.37 cells above faces: 0.63 of its front's lowest faces displace

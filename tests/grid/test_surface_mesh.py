@@ -118,7 +118,7 @@ def test_a_box_in_a_corner_touches_its_walls(corner):
 
 @GRIDS
 @pytest.mark.parametrize("per_axis", [1, 2, 3])
-def test_a_particle_alone_is_a_drop_wherever_it_is(grid, per_axis):
+def test_a_single_particle_is_a_drop_at_any_position(grid, per_axis):
     rng = np.random.default_rng(SEED)
     ranges = [range(3, n - 3, 5) if n > 1 else [0] for n in grid.counts]
     x = np.array(list(itertools.product(*ranges))) + rng.random(

@@ -196,7 +196,7 @@ def test_particles_slide_along_the_true_surface(shape):
         assert above.any() and np.allclose(ends[above, 0], (points + ways)[above, 0], atol=1e-6)
 
 
-def test_a_wall_takes_along_what_it_meets():
+def test_a_moving_wall_carries_particles_that_it_hits():
     walls = thin_walls(
         grid(2),
         [Box(lower=(0.2, 0.0), upper=(0.202, 1.0))],
@@ -209,7 +209,7 @@ def test_a_wall_takes_along_what_it_meets():
     assert np.allclose(ends[1], points[1], atol=1e-6)
 
 
-def test_what_starts_inside_is_put_outside():
+def test_particles_that_start_inside_are_moved_outside():
     walls = thin_walls(grid(2), [Box(lower=(0.2, 0.5), upper=(0.8, 0.51))])
     ends = flung(walls, np.array([[0.5, 0.508, 0.0], [0.5, 0.502, 0.0]]), np.zeros((2, 3)))
     assert ends[0, 1] > 0.51 and ends[1, 1] < 0.5
@@ -227,7 +227,7 @@ def test_points_near_thin_walls_are_not_admitted():
     assert walls.admits(points).tolist() == [False, False, True, False, True]
 
 
-def test_what_is_thin():
+def test_thin_solids_are_recognized():
     device = wp.get_device("cpu")
     thin = Box(lower=(0.0, 0.0), upper=(1.0, 0.04))
     assert is_thin(thin, 0.05, device) and not is_thin(thin, 0.04, device)

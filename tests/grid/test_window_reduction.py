@@ -21,7 +21,7 @@ def test_windows_are_added_up(counts: tuple[int, int, int]) -> None:
     base = rng.choice(np.array([AIR, FLUID, SOLID], dtype=np.int8), grid.shape)
     density, capacity = (rng.uniform(0.0, 2.0, grid.shape).astype(np.float32) for _ in range(2))
     fields = {"base": base, "density": density, "capacity": capacity}
-    given = {name: wp.array(field, device=grid.device) for name, field in fields.items()}
+    arrays = {name: wp.array(field, device=grid.device) for name, field in fields.items()}
     crowd, all, count = (
         WindowTally(CROWD, grid),
         WindowTally(CROWD, grid, grid.domain),
@@ -32,9 +32,9 @@ def test_windows_are_added_up(counts: tuple[int, int, int]) -> None:
         window = grid.window(corners[0], corners[1], grow=1).common(grid.domain)
         assert window is not None
         box = tuple(map(slice, window.low, window.high))
-        crowd.take(window, **given, most=1.2)
-        all.take(window, **given, most=1.2)
-        count.take(window, kind=given["base"])
+        crowd.take(window, **arrays, most=1.2)
+        all.take(window, **arrays, most=1.2)
+        count.take(window, kind=arrays["base"])
         has = (base[box] != SOLID) & (density[box] > 0.0)
         over = np.where(has, density[box] - np.float32(1.2) * capacity[box], 0.0)
         expected = [

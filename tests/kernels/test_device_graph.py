@@ -124,7 +124,7 @@ def test_a_list_may_be_replaced_and_grow():
     assert not program.fits()  # it must be captured again
 
 
-def test_what_a_graph_cannot_hold_is_refused():
+def test_unsupported_launches_are_refused_in_a_graph():
     program, array = DeviceGraph(DEVICE), wp.zeros(3, dtype=wp.float32, device=DEVICE)
     Slot().point_to(array)
     with pytest.raises(NotRecordable, match="replaced"):

@@ -230,14 +230,14 @@ def test_an_error_leaves_nothing_that_waits(chain: Chain) -> None:
 def test_graphs_go_with_their_stretches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LaunchGraph, "on_device", True)
     module._sequences.clear()
-    made: Any = Chain([2.0, 3.0, 4.0])
+    chain: Any = Chain([2.0, 3.0, 4.0])
     for _ in range(4):
         with joined(DEVICE):
             for i in range(3):
-                made.take(i, 1.0)
-        made.reading.numpy()
+                chain.take(i, 1.0)
+        chain.reading.numpy()
     assert len(module._sequences) == 1
-    del made
+    del chain
     gc.collect()
     assert not module._sequences
 

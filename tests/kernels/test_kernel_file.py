@@ -202,7 +202,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_what_is_wrong_names_file_and_line(header, what):
+def test_errors_name_file_and_line(header, what):
     source, line, why = WRONG[what]
     path = header(source)
     with pytest.raises(ValueError, match=re.escape(f"{path}:{line}: ") + ".*" + re.escape(why)):

@@ -205,7 +205,7 @@ def test_variants_are_recorded_for_themselves():
     assert calls == [False, True, True]
 
 
-def test_a_recording_outlives_its_team():
+def test_a_recording_outlives_its_thread_pool():
     """Recording after a change of the thread pool.
 
     The number of threads changes and changes back: the recording is valid, the pool is another one.

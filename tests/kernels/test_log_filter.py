@@ -42,7 +42,7 @@ def messages() -> tuple[KernelMessages, Said, io.StringIO]:
     return KernelMessages(said, stream), said, stream
 
 
-def test_a_script_hears_of_its_kernels_once_and_its_compiler_warns_of_none(tmp_path: Path) -> None:
+def test_a_script_has_one_message_of_its_kernels_and_no_compiler_warning(tmp_path: Path) -> None:
     for compiles in (1, 0):
         done = subprocess.run(
             [sys.executable, "-c", SCRIPT],
@@ -71,7 +71,7 @@ def test_a_script_hears_of_its_kernels_once_and_its_compiler_warns_of_none(tmp_p
         ),
     ],
 )
-def test_nothing_is_said_of_a_driver_that_is_not_there(made: str, stream: str) -> None:
+def test_a_missing_driver_is_not_mentioned(made: str, stream: str) -> None:
     script = (
         f"import os, numpy as np, warp_lcp as wl; {'os.close(2); ' * (stream == 'closed')}{made}"
     )
@@ -82,7 +82,7 @@ def test_nothing_is_said_of_a_driver_that_is_not_there(made: str, stream: str) -
 
 
 def test_one_line_a_device_and_only_for_what_is_compiled() -> None:
-    heard, said, stream = messages()
+    heard, log, stream = messages()
     with wp.ScopedLogLevel(wp.LOG_INFO):
         heard.info(BANNER)
         heard.info(MODULE.format("warp_lcp.sweep", "cpu", "cached"))
@@ -92,13 +92,13 @@ def test_one_line_a_device_and_only_for_what_is_compiled() -> None:
         assert stream.getvalue().count("\n") == 1
         heard.info(MODULE.format("warp_lcp.sweep", "cuda:0", "compiled"))
         assert stream.getvalue().count("\n") == 2
-    assert said.messages == []
+    assert log.messages == []
 
 
 @pytest.mark.parametrize(
     "message", [MODULE.format("__main__", "cpu", "compiled"), "mine took 3.00 ms", "fluids are wet"]
 )
-def test_what_is_not_of_the_library_passes(message: str) -> None:
+def test_messages_of_other_libraries_pass(message: str) -> None:
     heard, said, stream = messages()
     with wp.ScopedLogLevel(wp.LOG_INFO):
         heard.info(message)
@@ -108,7 +108,7 @@ def test_what_is_not_of_the_library_passes(message: str) -> None:
     assert stream.getvalue() == ""
 
 
-def test_who_wants_to_debug_hears_everything() -> None:
+def test_at_debug_level_all_messages_pass() -> None:
     heard, said, stream = messages()
     everything = [BANNER, MODULE.format("warp_lcp.sweep", "cpu", "compiled")]
     with wp.ScopedLogLevel(wp.LOG_DEBUG):

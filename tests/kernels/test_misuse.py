@@ -109,7 +109,7 @@ def test_a_kernel_takes_the_members_of_structs_that_it_declares(double):
 @pytest.mark.parametrize(
     "absent", [None, zeros(0), zeros(20)[5:5]], ids=["None", "empty", "a slice of nothing"]
 )
-def test_what_is_absent_has_no_address(double, absent):
+def test_absent_arrays_have_no_address(double, absent):
     y = zeros(10)
     double.bind(Rows.flat(10, CPU), x=absent, y=y).launch()
     assert (y.numpy() == -1).all()
@@ -178,7 +178,7 @@ def test_names_are_checked_when_a_pass_is_declared(row_pass, declared, name):
         row_pass("wrong", ";", writes={"y": "S"}, **declared)
 
 
-def test_what_else_cannot_be_declared(row_pass):
+def test_other_invalid_declarations_are_refused(row_pass):
     with pytest.raises(ValueError, match=r"misuse\.my-pass: \['my-pass'\]"):
         row_pass("my-pass", ";", writes={"y": "S"})
     with pytest.raises(
@@ -217,7 +217,7 @@ def test_constants_keep_their_fractions_and_numbers_their_range(row_pass):
             half.bind(rows, y=y, v=wrong)
 
 
-def test_a_number_that_is_called_places_moves_no_sums(row_pass):
+def test_a_number_named_places_does_not_move_sums(row_pass):
     source = "T a = 0, b = 0; " + EACH + "{ a += x[k]; b += 2*x[k]; }"
     sums = row_pass("sums", source, reads={"x": "S"}, numbers={"places": int}, sums=("a", "b"))
     x, rows = array(np.arange(20_000.0)), Rows.flat(20_000, CPU)
@@ -228,7 +228,7 @@ def test_a_number_that_is_called_places_moves_no_sums(row_pass):
     )
 
 
-def test_a_header_that_is_written_anew_is_read_anew(row_pass):
+def test_a_rewritten_header_is_read_again(row_pass):
     y = zeros(3)
     for value in (1, 2):
         fill = row_pass("anew", EACH + f"y[k] = {value};", writes={"y": "S"})
@@ -256,7 +256,7 @@ def test_grids_without_cells_are_left_alone(add, row_pass):
 
 
 @pytest.mark.cpu_form("how many cells a thread takes")
-def test_rows_that_cannot_be(double):
+def test_invalid_rows_are_refused(double):
     with pytest.raises(ValueError, match=r"rows: counts \(1, 1, 2147483648\)"):
         Rows.flat(1 << 31, CPU)
     with pytest.raises(ValueError, match=r"spans has shape \(2, 2\): expected \(4, 4\)"):
@@ -269,7 +269,7 @@ def test_rows_that_cannot_be(double):
     assert [one.beside(other, (f, 1, 1)).single.fx for f in (2, 1, 2)] == [2, 1, 2]
 
 
-def test_waves_reach_all_planes_whatever_is_left_out(add):
+def test_fused_kernels_reach_all_planes_with_any_member_left_out(add):
     rows = Rows.of(Padding((5, 3, 3)), CPU)
     y = zeros(rows.size)
     for lags in ((0, 1, 2), (0, 1, 0)):
@@ -286,7 +286,7 @@ def test_waves_reach_all_planes_whatever_is_left_out(add):
 
 
 @pytest.mark.parametrize("planes", [1, 3, 4, 5])
-def test_a_wave_visits_a_coarse_plane_once(add, row_pass, planes):
+def test_a_fused_kernel_visits_a_coarse_plane_once(add, row_pass, planes):
     """Wave that visits each coarse plane once.
 
     The last stage is so far behind that the wave continues after the last fine plane.
@@ -308,7 +308,7 @@ def test_a_wave_visits_a_coarse_plane_once(add, row_pass, planes):
 
 
 @pytest.mark.cpu_form("waves are the CPU's")
-def test_what_a_wave_cannot_take(add):
+def test_kernels_that_cannot_be_fused_are_refused(add):
     for stages in ((), ((add, 0),) * 5, ((add, 1), (add, 0)), ((add, 0), (add, -1))):
         with pytest.raises(ValueError, match=r"misuse\.wrong: expected 1 to 4 passes"):
             FusedKernel("test_misuse.wrong", *stages)

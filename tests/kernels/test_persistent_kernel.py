@@ -70,7 +70,7 @@ def test_stages_follow_each_other(passes, cells, threads):
 
 
 @pytest.mark.cpu_form("how many cells a thread takes")
-def test_what_a_sequence_cannot_take(passes, tmp_path):
+def test_unsupported_members_are_refused(passes, tmp_path):
     rows, x = Rows.flat(8, wp.get_device("cpu")), wp.zeros(8, dtype=wp.float64, device="cpu")
     (tmp_path / "sum.h").write_text("T s = 0; for (int k = 0; k < n; ++k) s += x[k];\n")
     total = StencilKernel(

@@ -159,7 +159,7 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     assert (stored == 7.0).all()
 
 
-def test_a_wave_is_its_passes_one_after_another(product, tmp_path):
+def test_a_fused_kernel_equals_its_kernels_in_sequence(product, tmp_path):
     add = row_pass(
         tmp_path,
         "add",
@@ -266,7 +266,7 @@ def test_a_wrong_launch_is_named(product, change, error, message):
         )
 
 
-def test_a_changed_header_is_compiled_anew(tmp_path):
+def test_a_changed_header_is_compiled_again(tmp_path):
     """Recompilation of a changed header.
 
     Headers are inserted as text, so that Warp's hash covers included ones; the compiler still

@@ -103,7 +103,7 @@ def passes(folder) -> tuple[StencilKernel, StencilKernel, StencilKernel]:
 
 
 @pytest.mark.parametrize("planes", [3, 22, 23, 47, 64])
-def test_slabs_of_a_wave_are_one_stream(planes, tmp_path, small_pieces):
+def test_slabs_of_a_fused_kernel_are_one_stream(planes, tmp_path, small_pieces):
     """Slabs of a wave as one stream.
 
     Whole numbers, so that a missed, repeated or early plane shows.
@@ -230,7 +230,7 @@ first = digest()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
-def test_a_forked_child_has_a_team_of_its_own():
+def test_a_forked_child_has_its_own_thread_pool():
     done = run_python(
         SOLVE
         + """
@@ -244,7 +244,7 @@ print(os.waitpid(child, 0)[1])
     assert (done.returncode, done.stdout.strip()) == (0, "0"), done.stderr
 
 
-def test_the_interpreter_ends_with_the_team():
+def test_the_interpreter_exits_with_running_threads():
     done = run_python(SOLVE + "print(wl.get_threads())")
     assert (done.returncode, done.stdout.strip()) == (0, "2"), done.stderr
 
@@ -329,7 +329,7 @@ def test_a_table_keeps_no_arrays_once_it_is_gone():
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize("control", [False, True])
-def test_threads_race_for_nothing(control, tmp_path):
+def test_threads_have_no_data_races(control, tmp_path):
     """Races of threads, by ThreadSanitizer.
 
     It finds none in the pool, and finds the race of slabs without gaps between them.

@@ -60,7 +60,7 @@ def test_a_body_falls_and_turns_in_air_as_mechanics_says(simulator: str) -> None
     assert np.hypot(i / 16 - row["body0_x"], j / 16 - row["body0_y"]) < 0.08
 
 
-def test_what_no_scene_asks_for_is_not_there() -> None:
+def test_without_bodies_a_scene_has_no_body_data() -> None:
     simulation = make()
     row = simulation.step(0.004)
     assert simulation.bodies is None

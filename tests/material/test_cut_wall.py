@@ -105,13 +105,13 @@ class Slope:
         n = 16
         samples = (np.arange(n) + 0.5) / n
         total = np.zeros(self.grid.shape)
-        others = [d for d in range(self.grid.dimension) if d != axis]
+        other_axes = [d for d in range(self.grid.dimension) if d != axis]
         for b in samples:
-            for c in samples if len(others) == 2 else samples[:1]:
+            for c in samples if len(other_axes) == 2 else samples[:1]:
                 offset = np.zeros(3)
-                offset[others] = [b, c][: len(others)]
+                offset[other_axes] = [b, c][: len(other_axes)]
                 total += self.signed(points(self.grid, offset)) > 0
-        return (total / n ** len(others)).astype(np.float32)
+        return (total / n ** len(other_axes)).astype(np.float32)
 
     def extend(
         self,
@@ -122,7 +122,9 @@ class Slope:
         weights: Faces = (),
     ) -> list[np.ndarray]:
         grid = self.grid
-        given = [wp.array(w, dtype=wp.float32, device="cpu") for w in weights] or grid.faces()
+        weight_arrays = [
+            wp.array(w, dtype=wp.float32, device="cpu") for w in weights
+        ] or grid.faces()
         fields, known = [], []
         for axis, fraction in enumerate(self.open):
             fields.append(
@@ -138,7 +140,7 @@ class Slope:
         extend_velocity_cut(
             grid.everywhere,
             fields,
-            given,
+            weight_arrays,
             known,
             wp.array(self.kind, device="cpu"),
             wp.array(self.contact, device="cpu"),
@@ -268,9 +270,7 @@ def test_released_liquid_is_pushed_by_a_wall_that_overtakes_it() -> None:
 
 
 @pytest.mark.parametrize(("contact", "speed"), [(RELEASED, -1.0), (HELD, 0.0)])
-def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(
-    contact: int, speed: float
-) -> None:
+def test_separation_at_a_sliver_depends_on_the_sliver_itself(contact: int, speed: float) -> None:
     """Released sliver decides, not the cell behind it.
 
     The wall cell under a ceiling is open for a fifth, and the cell below it touches no wall:
@@ -385,7 +385,7 @@ def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
 
 @pytest.mark.parametrize(("grid", "normal"), SLOPES)
 @pytest.mark.parametrize("contact", [HELD, RELEASED])
-def test_what_rests_at_a_cut_wall_is_not_thrown_after_what_leaves_it(
+def test_liquid_at_rest_at_a_cut_wall_does_not_follow_liquid_that_leaves(
     grid: StaggeredGrid, normal: tuple[float, float, float], contact: int
 ) -> None:
     """Material at rest on a cut wall is not dragged along by leaving liquid.

@@ -187,7 +187,9 @@ def test_an_over_full_cell_pushes_its_neighbors_outward(dimension: int, indexed:
 
 
 @pytest.mark.parametrize("solid", [[], [BALL]])
-def test_nobody_moves_more_than_half_a_cell_or_into_a_wall(solid: list[dict[str, Any]]) -> None:
+def test_no_particle_moves_more_than_half_a_cell_or_into_a_wall(
+    solid: list[dict[str, Any]],
+) -> None:
     """Displacements of at most half a cell, and not into a wall.
 
     There are ten times too many particles on the floor and around a ball.
@@ -259,7 +261,7 @@ def test_a_closed_room_that_is_too_full_is_left_alone() -> None:
     assert np.array_equal(particles.position.numpy().copy(), before)
 
 
-def test_a_closed_pocket_that_is_too_full_stops_nobody_else() -> None:
+def test_an_overfull_closed_pocket_does_not_stop_the_correction_elsewhere() -> None:
     """Closed pocket that is too full, without effect on others.
 
     Where solids cut cells the problem of a pocket without a way out is solvable too.
@@ -291,7 +293,7 @@ def pool(**tables: Any) -> Any:
     )
 
 
-def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
+def test_the_automatic_correction_acts_only_in_overfull_cells() -> None:
     """Default correction only where particles are too dense.
 
     A collapsing column needs it. A pool at rest does not and keeps its bits: no solve, no field, no
@@ -316,7 +318,7 @@ def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
     assert "density_correction" in crowded.state()
 
 
-def test_what_it_lifts_by_itself_is_in_proportion_to_the_step() -> None:
+def test_the_automatic_correction_is_proportional_to_the_step() -> None:
     """Displacement by default: in proportion to the step.
 
     A tenth of the step gives a tenth of the way, at most all of it. With a table the scene decides
@@ -416,8 +418,8 @@ def test_voids_inside_close_where_the_material_keeps_its_volume(even: bool) -> N
     assert after > 0.9 if even else after == pytest.approx(before, abs=0.01)
 
 
-@pytest.mark.parametrize("lets_go", [True, False])
-def test_liquid_that_lets_go_of_a_wall_is_not_drawn_back(lets_go: bool) -> None:
+@pytest.mark.parametrize("walls_separate", [True, False])
+def test_liquid_that_separates_from_a_wall_is_not_drawn_back(walls_separate: bool) -> None:
     """Liquid that separates from a wall is not drawn back.
 
     A gap of 0.3 cells under a ceiling: a holding wall has a void there, a separating one a surface.
@@ -426,12 +428,14 @@ def test_liquid_that_lets_go_of_a_wall_is_not_drawn_back(lets_go: bool) -> None:
     points = lattice(grid, boundary)
     points = points[points[:, 1] > 0.4] - [0.0, 0.3 * grid.spacing, 0.0]
     particles = particles_of(grid, points)
-    contact = wp.full(grid.shape, RELEASED if lets_go else HELD, dtype=wp.uint8, device=grid.device)
+    contact = wp.full(
+        grid.shape, RELEASED if walls_separate else HELD, dtype=wp.uint8, device=grid.device
+    )
     corrected = correction(grid, boundary, even=True)
     for _ in range(4):
         corrected.apply(particles, grid.everywhere, contact=contact)
     risen = (particles.position.numpy()[:, 1].max() - points[:, 1].max()) / grid.spacing
-    assert risen < 0.01 if lets_go else risen > 0.05
+    assert risen < 0.01 if walls_separate else risen > 0.05
 
 
 @pytest.mark.parametrize(
@@ -464,13 +468,13 @@ def test_a_scene_without_it_launches_none_of_its_kernels(
     monkeypatch.setattr(program, "prepared", note_prepared)
     simulation = dam(**tables)
     advance(simulation, 0.2)
-    own = {
+    own_launches = {
         name
         for name in launched
         if name.startswith(("warp_lcp.material.density_correction", "warp_lcp.material.reseeding"))
     }
     assert any(name.startswith("warp_lcp.grid.density") for name in launched)
-    assert own == (
+    assert own_launches == (
         {"warp_lcp.material.density_correction", "warp_lcp.material.reseeding"}
         if "particles" in tables
         else set()

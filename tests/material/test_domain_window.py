@@ -84,7 +84,7 @@ def run(simulation: ParticleSimulation, steps: int) -> list[Mapping[str, Any]]:
 
 
 @pytest.mark.parametrize("name", chosen(CASES, CASES[::3]))
-def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small: None) -> None:
+def test_a_moving_window_has_the_results_of_the_whole_domain(name: str, small: None) -> None:
     """Moving window against a grid of the domain.
 
     Sums have another order on grids of other sizes, and coarse levels of the solver may differ:
@@ -106,7 +106,7 @@ def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small:
 
 
 @pytest.mark.parametrize("name", chosen(CASES, CASES[2::3]))
-def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, small: None) -> None:
+def test_a_moving_window_resumes_bit_for_bit_and_on_the_whole_grid(name: str, small: None) -> None:
     through, later, whole = (
         made(name, follow=True),
         made(name, follow=True),
@@ -136,9 +136,7 @@ def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, sm
 
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
 @pytest.mark.parametrize("name", chosen(CASES, CASES[1::3]))
-def test_visiting_what_particles_reach_leaves_the_same_bits(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_active_rows_leave_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = made(name, follow=False)
     # Segments end beyond a small box.
     for setting, value in {"LEAST_CELLS": 0, "MOST": 9.0}.items():
@@ -151,7 +149,7 @@ def test_visiting_what_particles_reach_leaves_the_same_bits(
         assert part.window(part.particles.totals()).near is not None
 
 
-def test_it_pays_for_what_there_is() -> None:
+def test_cost_scales_with_the_material() -> None:
     """Number of cells of the same liquid in 512 times the domain: equal."""
     sizes = []
     for n in (64, 512):
@@ -166,7 +164,7 @@ def test_it_pays_for_what_there_is() -> None:
     assert sizes[1] <= sizes[0]
 
 
-def test_grids_are_laid_where_the_material_leaves_them() -> None:
+def test_grids_are_rebuilt_where_the_material_leaves_them() -> None:
     laid = DomainWindow(DOMAIN)
     first = laid.around([40, 40, 20], [70, 60, 40])
     assert all(low % module.ALIGNED == 0 for low in first.origin)
@@ -191,7 +189,7 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
         laid.at(np.array([[0, 0, 0], [201, 9, 9]]))
 
 
-def test_fields_go_along_where_both_grids_know_them() -> None:
+def test_fields_are_copied_where_old_and_new_grid_overlap() -> None:
     """Transfer of fields where both grids have them, including domain rings."""
     old = StaggeredGrid((32, 96, 64), 0.1, 3, "cpu", origin=(16, 0, 0), whole=DOMAIN.counts)
     new = StaggeredGrid((32, 96, 32), 0.1, 3, "cpu", origin=(32, 0, 16), whole=DOMAIN.counts)
@@ -207,7 +205,7 @@ def test_fields_go_along_where_both_grids_know_them() -> None:
     assert (found[0] == -1).all()  # the new grid's own ring
 
 
-def test_a_domain_without_far_ends() -> None:
+def test_an_unbounded_domain() -> None:
     data = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 1.0},

@@ -32,7 +32,9 @@ def test_draws_are_the_same_again() -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_passes(kind: str, simulator: str, dimension: int, seed: int) -> None:
+def test_no_particle_passes_a_thin_wall(
+    kind: str, simulator: str, dimension: int, seed: int
+) -> None:
     if kind == "mesh" and dimension == 2:
         pytest.skip("meshes are 3-D")
     check(seed, kind, simulator, dimension)

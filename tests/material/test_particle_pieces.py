@@ -32,21 +32,21 @@ def cut(piece, at):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_pieces_make_the_state_that_they_come_from(dimension):
+def test_checkpoint_parts_restore_their_state(dimension):
     simulation = dam(dimension)
     advance(simulation, 0.06)
     state = simulation.state()
     pieces = cut(piece_of(state), 5)
     assert min(len(piece["position"]) for piece in pieces) > 10
-    for given in (pieces, pieces[::-1], [piece_of(state)]):
-        again = dam(dimension)
-        found = state_of(given, again.state())
+    for parts in (pieces, pieces[::-1], [piece_of(state)]):
+        restored = dam(dimension)
+        found = state_of(parts, restored.state())
         assert found.keys() == state.keys()
         for name, values in state.items():
             np.testing.assert_array_equal(found[name], values, err_msg=name)
             assert found[name].dtype == values.dtype
-        again.restore_pieces(given)
-        assert advance(again, 0.08) == advance_copy(dimension, state)
+        restored.restore_pieces(parts)
+        assert advance(restored, 0.08) == advance_copy(dimension, state)
 
 
 def advance_copy(dimension, state):
@@ -55,7 +55,7 @@ def advance_copy(dimension, state):
     return advance(simulation, 0.08)
 
 
-def test_what_is_missing_is_named():
+def test_incomplete_checkpoint_parts_are_named():
     simulation = dam(2)
     state = simulation.state()
     pieces = cut(piece_of(state), 5)

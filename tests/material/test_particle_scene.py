@@ -84,7 +84,7 @@ def build(**tables: Any) -> GrainScene:
 complaint = partial(scene_error, build)
 
 
-def test_its_own_tables_take_the_place_of_the_general_ones() -> None:
+def test_own_tables_replace_the_general_ones() -> None:
     scene = build(
         domain={"friction": 0.25, "periodic": [True, False]},
         solid=[{**BOX, "friction": 0.75, "wall": "free-slip"}],
@@ -136,7 +136,7 @@ def test_its_plan_counts_its_own_memory() -> None:
     assert list(plain.memory_parts())[:2] == ["grid", "grains"]
 
 
-def test_it_is_made_of_the_shared_parts() -> None:
+def test_a_minimal_scene_uses_the_shared_parts() -> None:
     """Shared parts of a scene, with counts and owners by arithmetic.
 
     16 x 16 cells of the first box, 8 x 16 more of the second, the rest of which the first covers.

@@ -107,7 +107,7 @@ def make(resolution: int = 16, **tables: Any) -> Dust:
     )
 
 
-def test_it_falls_as_a_stone_does() -> None:
+def test_material_falls_freely() -> None:
     """Free fall, whatever the steps.
 
     The center falls by g t^2 / 2, and v = -g t in the middle of the last step, exactly, in every
@@ -135,7 +135,7 @@ def test_it_falls_as_a_stone_does() -> None:
     assert tuple(row) == simulation.columns()
 
 
-def test_it_is_what_the_driver_asks_for() -> None:
+def test_the_simulation_implements_the_driver_protocol() -> None:
     simulation = make()
     assert isinstance(simulation, Profiled)
     assert isinstance(simulation, Resampled)
@@ -144,7 +144,7 @@ def test_it_is_what_the_driver_asks_for() -> None:
     assert simulation.notes() == ["128 particles, 16 x 16 cells of 0.0625 m"]
 
 
-def test_it_goes_on_from_a_state_bit_for_bit() -> None:
+def test_a_simulation_resumes_bit_for_bit() -> None:
     tables = {
         "particles": {"transfer": "flip", "reseed": {"every": 1}},
         "density_correction": {"every": 2},
@@ -172,7 +172,7 @@ def test_solids_of_another_scene_are_refused() -> None:
         make().restore(make(solid=[wall], domain={"solids": "voxel"}).state())
 
 
-def test_it_goes_on_on_a_finer_grid() -> None:
+def test_a_simulation_resumes_on_a_finer_grid() -> None:
     coarse, fine = make(), make(32)
     for _ in range(3):
         coarse.step(0.02)
@@ -191,7 +191,7 @@ def test_it_goes_on_on_a_finer_grid() -> None:
         ("position", 2.0, "position is outside the domain"),
     ],
 )
-def test_what_cannot_be_ends_the_run(name: str, value: float, message: str) -> None:
+def test_non_finite_values_end_the_run(name: str, value: float, message: str) -> None:
     simulation = make()
     array = simulation.particles.arrays()[name]
     host = array.numpy()
@@ -203,7 +203,7 @@ def test_what_cannot_be_ends_the_run(name: str, value: float, message: str) -> N
         simulation.step(0.01)
 
 
-def test_it_tells_when_something_starts_or_stops() -> None:
+def test_start_and_stop_times_are_reported() -> None:
     source = {
         "shape": "box",
         "min": [0.0, 0.9],

@@ -57,7 +57,7 @@ def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
     )
 
 
-def test_nothing_is_sought_beyond_an_open_side(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_particle_is_drawn_from_beyond_an_open_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search for neighbors beside an open side.
 
     The ring there is open as cells are, and its neighbors would lie outside the memory.
@@ -169,7 +169,7 @@ def test_runs_are_repeatable() -> None:
         assert np.array_equal(array, found[1][name])
 
 
-def test_only_a_scene_that_asks_for_it_has_one() -> None:
+def test_only_a_scene_with_the_setting_has_reseeding() -> None:
     assert dam().rearrangement.reseeding is None
     assert "reseeded" not in dam().columns()
     simulation = dam(particles={"reseed": {"every": 4}})

@@ -115,7 +115,7 @@ def pour(
 @pytest.mark.parametrize(
     ("low", "high"), [([0.25, 0.5], [0.28125, 0.625]), ([0.125, 0.5], [0.25, 0.59375])]
 )
-def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(
+def test_inflow_is_exact_for_any_sequence_of_steps(
     low: list[float], high: list[float], cells: float
 ) -> None:
     """Exact inflow, whatever the time steps.
@@ -131,18 +131,18 @@ def test_what_comes_in_is_exact_however_the_time_is_cut_into_steps(
     )
     simulation = pour(draw, source, cells / 32 / speed, source["stop"] + 0.5 * cells / 32 / speed)
     places = simulation.particles.position.numpy()[:, :2] - [speed * (simulation.time - start), 0.0]
-    taken = np.floor(places / distance).astype(int)
+    emitted_places = np.floor(places / distance).astype(int)
     (left, bottom), (right, top) = np.round(np.array([low, high]) / distance).astype(int)
     expected = {(x, y) for x in range(left - rows, right) for y in range(bottom, top)}
-    assert len(taken) == len(expected)
-    assert set(map(tuple, taken.tolist())) == expected
+    assert len(emitted_places) == len(expected)
+    assert set(map(tuple, emitted_places.tolist())) == expected
     # A jet flies on.
     np.testing.assert_allclose(
-        simulation.particles.velocity.numpy(), [[speed, 0.0, 0.0]] * len(taken), atol=1e-4
+        simulation.particles.velocity.numpy(), [[speed, 0.0, 0.0]] * len(emitted_places), atol=1e-4
     )
 
 
-def test_what_comes_in_askew_does_not_depend_on_the_steps() -> None:
+def test_oblique_inflow_does_not_depend_on_the_steps() -> None:
     source = box([0.3125, 0.3125], [0.4375, 0.375], velocity=[1.2, 0.7], start=0.013, stop=0.157)
     counts = {
         pour(np.random.default_rng(seed), source, longest, 0.17).particles.count
@@ -264,7 +264,7 @@ def test_a_source_in_a_pool_pushes_its_volume_in_and_draws_nothing_from_behind()
     assert rows[-1]["volume"] - rows[0]["volume"] == pytest.approx(0.125 * 0.25, rel=0.35)
 
 
-def test_it_runs_between_its_times_only() -> None:
+def test_a_source_runs_between_its_times_only() -> None:
     simulation = tap([{**TAP, "start": 0.1, "stop": 0.3}], liquid=[box([0.0, 0.0], [1.0, 0.1])])
     start = simulation.particles.count
     rows = [row for end in (0.2, 0.4, 0.5) for row in to_frame(simulation, end)]
@@ -281,12 +281,12 @@ def test_cells_that_are_full_already_are_not_filled() -> None:
     assert tap(liquid=[box([0.0, 0.0], [1.0, 0.75])]).particles.count == 4 * 32 * 24
 
 
-@pytest.mark.parametrize(("there", "comes"), [(1, 4), (2, 0), (3, 0)])
-def test_cells_are_filled_that_hold_fewer_than_half(there: int, comes: int) -> None:
+@pytest.mark.parametrize(("present", "comes"), [(1, 4), (2, 0), (3, 0)])
+def test_cells_less_than_half_full_are_filled(present: int, comes: int) -> None:
     source = box([0.5, 0.5], [0.53125, 0.53125], velocity=[1.0, 0.0], start=0.01)
     simulation = tap([source], physics={"gravity": [0.0, 0.0]})
     simulation.particles.append(
-        np.full((there, 3), [0.51, 0.51, 0.0], np.float32), np.zeros((there, 3), np.float32)
+        np.full((present, 3), [0.51, 0.51, 0.0], np.float32), np.zeros((present, 3), np.float32)
     )
     assert simulation.step(0.011)["emitted"] == comes
 
@@ -357,7 +357,7 @@ def test_arrays_of_different_lengths_are_refused() -> None:
         ({"liquid": []}, r"no \[\[source\]\] either"),
     ],
 )
-def test_what_they_may_not_be(tables: dict[str, Any], message: str) -> None:
+def test_invalid_sources_are_refused(tables: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         scene(
             size=[1.0, 1.0],

@@ -29,7 +29,7 @@ def with_drops(points: list[list[float]], velocity: list[float], **tables: Any) 
     return simulation
 
 
-def test_it_flies_along_its_parabola_and_nothing_is_lost() -> None:
+def test_spray_follows_its_parabola_and_keeps_its_mass() -> None:
     simulation = with_drops([[2.5, 1.5, 0.0], [4.0, 1.0, 0.0]], [1.0, 3.0, 0.0])
     count, start = (
         simulation.particles.count,
@@ -47,7 +47,7 @@ def test_it_flies_along_its_parabola_and_nothing_is_lost() -> None:
     assert np.sort(found.points[-2:], axis=0) == pytest.approx(np.sort(exact, axis=0), abs=2e-5)
 
 
-def test_energy_is_that_of_a_run_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_energy_equals_that_of_a_run_without_spray(monkeypatch: pytest.MonkeyPatch) -> None:
     drops = [[2.5 + 0.4 * n, 1.0 + 0.2 * n, 0.0] for n in range(6)]
     off_grid = with_drops(drops, [0.5, 2.0, 0.0])
     monkeypatch.setattr(spray, "FEW", 0)
@@ -72,7 +72,7 @@ def test_energy_is_that_of_a_run_without_it(monkeypatch: pytest.MonkeyPatch) -> 
     ],
     ids=["liquid", "floor", "wall", "solid"],
 )
-def test_it_comes_back_before_it_meets_something(start, velocity, solids):
+def test_spray_returns_to_the_grid_before_a_collision(start, velocity, solids):
     simulation = with_drops([[*start, 0.0]], velocity, solid=solids)
     count = simulation.particles.count
     flying = []
@@ -90,7 +90,7 @@ def test_it_comes_back_before_it_meets_something(start, velocity, solids):
     assert flying[-1] == 0
 
 
-def test_it_goes_on_from_a_state_and_leaves_through_open_sides() -> None:
+def test_spray_resumes_from_a_state_and_leaves_through_open_sides() -> None:
     tables: dict[str, Any] = {}
     through, later = (
         with_drops([[2.5, 1.5, 0.0], [5.0, 1.5, 0.0]], [2.0, 3.0, 0.0], **tables) for _ in range(2)
@@ -107,7 +107,7 @@ def test_it_goes_on_from_a_state_and_leaves_through_open_sides() -> None:
     assert all(np.array_equal(value, found[name]) for name, value in through.state().items())
 
 
-def test_drains_take_it() -> None:
+def test_drains_remove_spray() -> None:
     drain = {"drain": [box([2.0, 1.0], [3.0, 3.0])]}
     simulation = with_drops([[2.5, 1.5, 0.0], [4.5, 1.5, 0.0]], [0.0, 1.0, 0.0], **drain)
     row = simulation.step(0.01)

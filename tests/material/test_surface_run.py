@@ -51,20 +51,20 @@ def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):
 
 def test_an_interrupted_run_writes_the_same_surfaces(tmp_path):
     (tmp_path / "dam.toml").write_text(SCENE)
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    run_scene_file(tmp_path / "dam.toml", whole)
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    run_scene_file(tmp_path / "dam.toml", uninterrupted)
     run_scene_file(tmp_path / "dam.toml", parts, last_frame=1)
     run_scene_file(tmp_path / "dam.toml", parts, resume=True)
     for index in range(3):
         file = f"frames/surface_{index:06d}.vtu"
-        assert (parts / file).read_bytes() == (whole / file).read_bytes()
+        assert (parts / file).read_bytes() == (uninterrupted / file).read_bytes()
 
 
-def test_a_run_that_shows_nothing_asks_for_no_frame(dots, scene_file, tmp_path, monkeypatch):
-    asked = []
+def test_a_run_without_output_computes_no_frame(dots, scene_file, tmp_path, monkeypatch):
+    frame_times = []
     kind = type(dots.create(load_scene(scene_file), device="cpu", folder=tmp_path))
-    monkeypatch.setattr(kind, "frame", lambda self: asked.append(self.time) or [])
+    monkeypatch.setattr(kind, "frame", lambda self: frame_times.append(self.time) or [])
     run_scene_file(scene_file, tmp_path / "out", "output.particles=false", "output.grid=false")
-    assert asked == []
+    assert frame_times == []
     run_scene_file(scene_file, tmp_path / "more", "output.grid=false")
-    assert len(asked) > 5
+    assert len(frame_times) > 5

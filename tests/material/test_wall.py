@@ -113,7 +113,7 @@ def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("separating", "state", "weight", "own", "expected"),
+    ("separating", "state", "weight", "own_speed", "expected"),
     [
         (1, RELEASED, 4.6, 0.06, 0.06),  # not the speed of the leaving liquid
         (1, RELEASED, 4.6, -0.06, 0.0),  # but not into the wall
@@ -122,13 +122,13 @@ def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
         (0, RELEASED, 4.6, 0.06, 0.0),
     ],
 )
-def test_what_rests_at_a_wall_is_not_thrown_after_what_leaves_it(
-    separating: int, state: int, weight: float, own: float, expected: float
+def test_liquid_at_rest_at_a_wall_does_not_follow_liquid_that_leaves(
+    separating: int, state: int, weight: float, own_speed: float, expected: float
 ) -> None:
     air = Air(cells((0, 0)), (3.0, 0.0))
     air.separating.fill_(separating)
     air.contact.fill_(state)
-    air.velocity[0][1, 1, 1:2].fill_(own)
+    air.velocity[0][1, 1, 1:2].fill_(own_speed)
     air.weights[0][1, 1, 1:2].fill_(weight)
     u, _ = air.extend()
     assert u[1, 2] == 3.0

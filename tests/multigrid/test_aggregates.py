@@ -123,7 +123,7 @@ def test_a_matrix_may_change_and_so_may_the_fields():
 
 @pytest.mark.parametrize("method", [wl.MinimumMapNewton, wl.PrimalDualActiveSet])
 @pytest.mark.parametrize("wind", [0.0, 40.0, 1000.0])
-def test_newton_does_not_creep(wind, method, device):
+def test_newton_does_not_change_one_layer_per_step(wind, method, device):
     """Number of Newton steps from a cold start.
 
     Without cycles the boundary of the active set moved by a row per step: 14 to 32 steps at 65^2,

@@ -59,7 +59,7 @@ def iterations(matrix, free, shift, device, real=wp.float64):
 
 
 @pytest.mark.parametrize("convection", [0.0, 0.4])
-def test_products_are_galerkins(convection, device):
+def test_coarse_matrices_are_galerkin_products(convection, device):
     n = 23 * 20
     drift = scipy.sparse.diags_array([-convection, convection], offsets=[-1, 1], shape=(20, 20))
     matrix = (poisson(23, 20) + scipy.sparse.kron(scipy.sparse.eye_array(23), drift)).tocsr()
@@ -147,17 +147,17 @@ def test_iterations_do_not_grow_with_the_grid(dimension, sizes, device):
     for size in sizes:
         matrix, rng = poisson(*[size] * dimension), np.random.default_rng(11)
         n = matrix.shape[0]
-        everything = np.ones(n, dtype=bool)
+        all_rows = np.ones(n, dtype=bool)
         axes = np.meshgrid(*[np.linspace(-1, 1, size)] * dimension, indexing="ij")
         blob = (np.cos(5 * axes[0]) * np.sin(7 * axes[1] + 0.5)).ravel() < 0.2
-        counts["all"].append(iterations(matrix, everything, None, device))
+        counts["all"].append(iterations(matrix, all_rows, None, device))
         counts["random mask"].append(iterations(matrix, rng.random(n) < 0.8, None, device))
         counts["half held"].append(iterations(matrix, blob, None, device))
         counts["wide shift"].append(
-            iterations(matrix, everything, 10 ** rng.uniform(-6, 8, n), device)
+            iterations(matrix, all_rows, 10 ** rng.uniform(-6, 8, n), device)
         )
         counts["few stiff"].append(
-            iterations(matrix, everything, np.where(rng.random(n) < 0.02, 1e8, 0.0), device)
+            iterations(matrix, all_rows, np.where(rng.random(n) < 0.02, 1e8, 0.0), device)
         )
         counts["single"].append(iterations(matrix, blob, None, device, wp.float32))
     for kind, found in counts.items():

@@ -236,7 +236,7 @@ def layers(shape):
 
 
 @pytest.mark.parametrize("faces", [lognormal, checkerboard, slivers, surface, constant, layers])
-def test_what_turns_nowhere_keeps_its_hierarchy(faces):
+def test_isotropic_problems_keep_the_single_hierarchy(faces):
     for shape in ((40, 44), (128, 96)):
         A = wl.GridPoisson(framed(shape), **faces(shape), device="cpu")
         assert turns(A.stencil) == []
@@ -244,7 +244,7 @@ def test_what_turns_nowhere_keeps_its_hierarchy(faces):
     assert turns(wl.GridPoisson(framed((64, 64)), face_x=1e-3, device="cpu").stencil) == []
 
 
-def test_ways_found():
+def test_directions_of_strong_coupling_are_detected():
     A = wl.GridPoisson(framed((128, 128)), **faces_of((128, 128), halves(1e-3)), device="cpu")
     found = sorted(turns(A.stencil))
     np.testing.assert_allclose([way[:2] for way in found], [[1e-3, 1.0], [1.0, 1e-3]], rtol=1e-5)

@@ -76,7 +76,7 @@ METHODS = [
         count=4 * len(METHODS),
     ),
 )
-def test_methods_that_need_products_only_take_it(name, kind, symmetric):
+def test_methods_that_need_only_products_accept_a_linear_operator(name, kind, symmetric):
     if name == "quadratic-program":
         pytest.importorskip("piqp")
     A, b = matrix(symmetric), np.random.default_rng(17).standard_normal(N)
@@ -228,7 +228,7 @@ def shaped(image, **options):
         (lambda: wl.LCP(lambda x: x, np.ones(3)), "A is a function: pass wl.LinearOperator"),
     ],
 )
-def test_what_is_refused(make, message):
+def test_invalid_operators_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -241,7 +241,7 @@ def test_operators_without_a_product_cannot_be_made():
         Empty()
 
 
-def test_what_stops_being_finite_is_said():
+def test_non_finite_products_are_reported():
     calls = []
 
     def product(x):

@@ -82,7 +82,7 @@ def test_other_entries_are_taken():
     assert abs(operator.renumbered()[1].matrix() - 2 * first.matrix()).max() == 0
 
 
-def test_wrong_guesses_and_limits_are_told_as_elsewhere():
+def test_wrong_guesses_and_limits_have_the_usual_messages():
     A, b, lower, _ = shuffled()
     problem = wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower)
     with pytest.raises(ValueError, match="x0"):

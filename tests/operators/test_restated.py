@@ -41,15 +41,15 @@ def test_solutions_and_starts_are_those_of_the_given_problem(name, seed, monkeyp
     n, dense = A.shape[0], A.toarray() if scipy.sparse.issparse(A) else A
     b, low = rng.standard_normal(n), -rng.random(n)
     high = low + rng.uniform(0.1, 2, n)
-    given = wl.LCP(A, b, low, high)
-    restated = form(given)
+    problem = wl.LCP(A, b, low, high)
+    restated = form(problem)
     assert restated is not None
     stopping = wl.StoppingCriteria(rtol=1e-9, max_iterations=200)
     found = restated.result(
         wl.solve(restated.problem, wl.MinimumMapNewton(precision="double"), stopping=stopping)
     )
     x = found.x.numpy()
-    assert found.problem is given
+    assert found.problem is problem
     assert x.shape == (n,)
     first = natural_residual(dense, b, low, high, np.clip(np.zeros(n), low, high))
     assert natural_residual(dense, b, low, high, x) <= 1.01e-9 * first

@@ -31,7 +31,7 @@ def random_matrix(n, seed, density=0.1):
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 @pytest.mark.parametrize("n", [1, 2, 83])
-def test_products_are_scipys(n, dtype, real, device):
+def test_products_agree_with_scipy(n, dtype, real, device):
     matrix = random_matrix(n, 3)
     A = wl.SparseOperator(matrix, device=device, dtype=dtype)
     x = np.random.default_rng(5).standard_normal(n)
@@ -175,7 +175,7 @@ def test_problems_take_scipy_and_numpy_matrices(kind):
     np.testing.assert_allclose(result.x.numpy(), lemke(dense, b), atol=1e-8)
 
 
-def test_what_is_no_matrix_is_named():
+def test_arguments_that_are_no_matrix_are_named():
     with pytest.raises(ValueError, match="A is a list"):
         wl.LCP([[1.0]], np.ones(1))
 

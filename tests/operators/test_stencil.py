@@ -99,18 +99,18 @@ def test_sides_towards_solid_and_air_have_the_coefficients_given(device):
     Between the two cells the coefficients are equal, so that A is symmetric; at the sides they are
     not.
     """
-    given = {
+    coefficients = {
         (0, 0): np.full((1, 2), 20.0),
         (0, 1): np.array([[-1.0, -5.0]]),
         (0, -1): np.array([[-3.0, -1.0]]),
     }
     options = {"device": device, "dtype": wp.float64}
-    closed = wl.Stencil(np.ones((1, 2), dtype=int), given, **options)
+    closed = wl.Stencil(np.ones((1, 2), dtype=int), coefficients, **options)
     assert closed.symmetric
     np.testing.assert_array_equal(closed.diagonal().numpy(), [[17.0, 15.0]])
-    term = wl.Stencil(np.ones((1, 2), dtype=int), given, outside=wl.AIR, **options).boundary_term(
-        np.pad([[0.0, 0.0]], 1, constant_values=2.0)
-    )
+    term = wl.Stencil(
+        np.ones((1, 2), dtype=int), coefficients, outside=wl.AIR, **options
+    ).boundary_term(np.pad([[0.0, 0.0]], 1, constant_values=2.0))
     np.testing.assert_array_equal(term.numpy(), [[-6.0, -10.0]])
 
 

@@ -141,7 +141,7 @@ def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
 
 
 @pytest.mark.parametrize("felt", [(), (0,), (1,), (0, 2), (0, 1, 2)])
-def test_chambers_that_a_body_feels_do_not_float(felt, device):
+def test_chambers_coupled_to_a_body_do_not_float(felt, device):
     """Chambers coupled to a body do not float.
 
     Of three closed chambers, the null space is the constants of those that no column touches.
@@ -188,7 +188,7 @@ def test_an_unsymmetric_sum_in_a_solver(device):
     np.testing.assert_allclose(result.x.numpy(), lemke(dense, b), atol=1e-7)
 
 
-def test_what_does_not_fit_is_refused(cells):
+def test_mismatched_terms_are_refused(cells):
     U = np.ones((*cells.shape, 1))
     sparse = wl.SparseOperator(scipy.sparse.eye_array(4), device="cpu")
     with pytest.raises(ValueError, match="B has shape"):

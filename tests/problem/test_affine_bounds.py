@@ -60,7 +60,7 @@ def enumerate_contacts(A, b, mu):
     Each normal force is 0 or its contact touches; each friction force sticks, or is at -mu n or at
     mu n.
     """
-    n, found = len(b), []
+    n, solutions = len(b), []
     for touching in itertools.product((False, True), repeat=CONTACTS):
         for sliding in itertools.product((-1, 0, 1), repeat=CONTACTS):
             T, r = A.copy(), -b.copy()
@@ -83,9 +83,9 @@ def enumerate_contacts(A, b, mu):
                 np.abs(friction - mu * normal) <= 1e-9,
             )
             ok &= (np.abs(slip) <= 1e-9) | (at_low & (slip >= 0)) | (at_high & (slip <= 0))
-            if ok.all() and not any(np.allclose(x, other, atol=1e-7) for other in found):
-                found.append(x)
-    return found
+            if ok.all() and not any(np.allclose(x, other, atol=1e-7) for other in solutions):
+                solutions.append(x)
+    return solutions
 
 
 @pytest.mark.parametrize(("name", "sparse"), covering(list(SWEEPING), [True, False]))

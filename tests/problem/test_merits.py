@@ -96,31 +96,31 @@ def test_on_a_grid_cells_that_are_no_unknowns_do_not_count(device):
     problem = wl.LCP(wl.GridPoisson(cells, device=device, dtype=wp.float64), b)
     place = problem.layout.places()[fluid]
     for method in (wl.ProjectedMultigrid(), wl.MPRGP(), wl.ProjectedSOR()):
-        work, found = method.init(problem), []
+        work, iterates = method.init(problem), []
 
-        def note(record, work=work, found=found):
+        def note(record, work=work, found=iterates):
             found.append(work.x.numpy()[place].copy())
 
         result = wl.solve(problem, method, stopping=ASKED, workspace=work, callback=note)
-        for record, x in zip(result.history, found, strict=True):
+        for record, x in zip(result.history, iterates, strict=True):
             y = A[np.ix_(fluid, fluid)] @ x + b.ravel()[fluid]
             expected = np.abs(x).max(), abs(x @ y), x @ np.abs(y)
             own = record.merits.largest, record.merits.complementarity, record.merits.absolute
             np.testing.assert_allclose(own, expected, rtol=1e-10, atol=1e-12)
 
 
-def test_none_are_recorded_unless_asked_for_and_residuals_stay_as_they_are():
+def test_merits_are_recorded_on_request_only_and_do_not_change_residuals():
     A, b = (
         scipy.sparse.csr_array(spd(30, 5123, 0.5)),
         np.random.default_rng(5129).standard_normal(30),
     )
-    plain, asked = (
+    plain, with_merits = (
         wl.solve(wl.LCP(A, b), stopping=wl.StoppingCriteria(rtol=1e-8, merits=merits))
         for merits in (False, True)
     )
     assert all(record.merits is None for record in plain.history)
-    assert all(record.merits is not None for record in asked.history)
-    np.testing.assert_array_equal(plain.x.numpy(), asked.x.numpy())
+    assert all(record.merits is not None for record in with_merits.history)
+    np.testing.assert_array_equal(plain.x.numpy(), with_merits.x.numpy())
     assert [record.residual for record in plain.history] == [
-        record.residual for record in asked.history
+        record.residual for record in with_merits.history
     ]

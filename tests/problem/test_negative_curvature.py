@@ -91,7 +91,7 @@ def test_the_message_asks_for_the_sign(n, status):
     assert found.status == status
 
 
-def test_products_alone_tell_too():
+def test_negative_curvature_is_detected_from_products_alone():
     for seed in range(6221, 6251):
         A = drawn(seed)
         b = np.full(A.shape[0], -1.0)

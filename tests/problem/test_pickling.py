@@ -94,11 +94,11 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.parametrize("again", [again_by_pickle, copy.deepcopy, copy.copy])
+@pytest.mark.parametrize("make_copy", [again_by_pickle, copy.deepcopy, copy.copy])
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_problems(name, again, device):
+def test_problems(name, make_copy, device):
     problem = PROBLEMS[name](device)
-    twin = again(problem)
+    twin = make_copy(problem)
     assert twin.device == problem.device
     assert (type(twin.A), twin.A.dtype, twin.A.shape) == (
         type(problem.A),
@@ -115,13 +115,13 @@ def test_problems(name, again, device):
     assert first.history[-1].residual == second.history[-1].residual
     np.testing.assert_array_equal(first.x.numpy(), second.x.numpy())
     twin.b.fill_(7.0)
-    assert (problem.b.numpy() == 7.0).any() == (again is copy.copy)
+    assert (problem.b.numpy() == 7.0).any() == (make_copy is copy.copy)
 
 
-@pytest.mark.parametrize("again", [again_by_pickle, copy.deepcopy])
-def test_results(again, device):
+@pytest.mark.parametrize("make_copy", [again_by_pickle, copy.deepcopy])
+def test_results(make_copy, device):
     result = wl.solve(PROBLEMS["grid"](device))
-    twin = again(result)
+    twin = make_copy(result)
     assert twin
     assert twin.x.device == result.x.device
     assert twin.x.ptr != result.x.ptr
@@ -135,11 +135,11 @@ def test_results(again, device):
         "history",
     ):
         assert getattr(twin, name) == getattr(result, name)
-    batch = again(wl.enumerate_batch(np.eye(2)[None], -np.ones((1, 2)), device=device))
+    batch = make_copy(wl.enumerate_batch(np.eye(2)[None], -np.ones((1, 2)), device=device))
     np.testing.assert_array_equal(batch.x.numpy(), [[1.0, 1.0]])
 
 
-def test_statuses_go_by_their_names():
+def test_statuses_are_pickled_by_name():
     """Statuses by their names, since their messages may change between versions."""
     for status in wl.SolveStatus:
         assert again_by_pickle(status) is status
@@ -154,11 +154,11 @@ def test_a_device_that_is_missing_becomes_the_cpu(device):
     assert pickle.loads(elsewhere).x.device == wp.get_device("cpu")
 
 
-def test_what_is_not_pickled_says_what_to_do(device):
+def test_objects_that_cannot_be_pickled_name_an_alternative(device):
     A = grid(device)
     with pytest.raises(TypeError, match="pickle the operator it was made from, and mask it again"):
         pickle.dumps(A.masked(np.ones(CELLS.shape)))
-    A.layout.across = SimpleNamespace()
+    A.layout.comm = SimpleNamespace()
     with pytest.raises(
         TypeError,
         match="GridPoisson is distributed over ranks and cannot be pickled: pickle its cells and "

@@ -87,21 +87,21 @@ def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
         HasCells: (HasCells, HasLayout),
         HasColumns: (HasColumns, HasCells, HasLayout),
     }.get(capability, (capability,))
-    matrix, own = dense(A), Least(A, *with_it)
+    matrix, operator = dense(A), Least(A, *with_it)
     b = np.random.default_rng(7).standard_normal(A.shape)
-    problem = wl.LCP(own, b)
+    problem = wl.LCP(operator, b)
     asked = getattr(cls, "supports", ())
     if asked and capability not in asked:
-        assert not takes(cls, own)
+        assert not takes(cls, operator)
         with pytest.raises(
             ValueError,
             match=f"^{cls.__name__} needs an operator with .*; Least has none: use "
             "MinimumMapNewton",
         ):
             wl.solve(problem, cls())
-        assert own.products == 0
+        assert operator.products == 0
         return
-    assert takes(cls, own)
+    assert takes(cls, operator)
     result = wl.solve(problem, cls(), stopping=STOPPING)
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy().ravel(), lemke(matrix, b.ravel()), atol=1e-6)
@@ -130,18 +130,18 @@ def test_methods_that_messages_name_ask_for_nothing():
     MinimumMapNewton, and ProjectedJacobi for bounds affine in x: also what is used and recommended
     by default.
     """
-    own = Least(shown(None, 3))
-    assert takes(wl.MinimumMapNewton, own)
+    operator = Least(shown(None, 3))
+    assert takes(wl.MinimumMapNewton, operator)
     constant, friction = (
-        wl.LCP(own, -np.ones(3)),
-        wl.LCP(own, -np.ones(3), *wl.AffineBounds.friction([-1, 0, 0], 0.5)),
+        wl.LCP(operator, -np.ones(3)),
+        wl.LCP(operator, -np.ones(3), *wl.AffineBounds.friction([-1, 0, 0], 0.5)),
     )
     assert isinstance(wl.default_method(constant), wl.MinimumMapNewton)
     assert isinstance(wl.default_method(friction), wl.ProjectedJacobi)
     for problem in (constant, friction):
         advice = wl.recommend(problem)
         assert wl.solve(problem, advice.method, stopping=STOPPING), advice
-        assert all(takes(wl.METHODS[name], own) for name in advice.alternatives)
+        assert all(takes(wl.METHODS[name], operator) for name in advice.alternatives)
 
 
 def test_rows_are_the_operator_s_own():

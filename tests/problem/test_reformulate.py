@@ -85,7 +85,7 @@ def test_boxed_as_quadratic_program(seed):
     program = form.boxed_to_quadratic_program(A, b, lower, upper)
     limits = scipy.optimize.Bounds(lower, upper)
     start = np.clip(np.zeros(7), lower, upper)
-    found = scipy.optimize.minimize(
+    reference = scipy.optimize.minimize(
         program.objective,
         start,
         jac=lambda z: A @ z + b,
@@ -93,8 +93,8 @@ def test_boxed_as_quadratic_program(seed):
         method="L-BFGS-B",
         options={"ftol": 1e-15, "gtol": 1e-11},
     )
-    np.testing.assert_allclose(found.x, x, atol=1e-6)
-    assert program.objective(x) <= found.fun + 1e-12
+    np.testing.assert_allclose(reference.x, x, atol=1e-6)
+    assert program.objective(x) <= reference.fun + 1e-12
     again = form.quadratic_program_to_boxed(program, device="cpu")
     np.testing.assert_array_equal(again.A, A)
     with pytest.raises(ValueError, match="not symmetric"):
@@ -128,7 +128,7 @@ def test_quadratic_program_with_general_constraints(sparse):
         {"type": "eq", "fun": lambda x: C @ x - d},
     ]
     limits = scipy.optimize.Bounds(program.lower, program.upper)
-    found = scipy.optimize.minimize(
+    reference = scipy.optimize.minimize(
         lambda x: 0.5 * x @ Q @ x + c @ x,
         np.zeros(n),
         bounds=limits,
@@ -136,8 +136,8 @@ def test_quadratic_program_with_general_constraints(sparse):
         method="SLSQP",
         options={"ftol": 1e-14},
     )
-    assert found.success
-    np.testing.assert_allclose(new.back(z), found.x, atol=1e-5)
+    assert reference.success
+    np.testing.assert_allclose(new.back(z), reference.x, atol=1e-5)
     with pytest.raises(ValueError, match="h is missing"):
         form.quadratic_program_to_boxed(
             form.QuadraticProgramData(Q, c, program.lower, program.upper, G)

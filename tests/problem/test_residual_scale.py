@@ -82,7 +82,7 @@ def unscaled(M, b, x):
 @pytest.mark.parametrize(
     "method", [n for n, cls in wl.METHODS.items() if families(cls) and n != "blocked-gauss-seidel"]
 )
-def test_a_tiny_diagonal_hides_nothing(method, kind):
+def test_a_tiny_diagonal_does_not_hide_other_rows(method, kind):
     M, b = TINY
     try:
         problem = wl.LCP(operator_of(M, kind), b)

@@ -38,7 +38,7 @@ def planted(seed, *, largest, form="dense"):
 
 
 @pytest.mark.parametrize("largest", [1e3, 1e8, 1e13, 1e16, 1e30, 1e100])
-def test_large_rows_that_are_held_hide_no_others(largest):
+def test_large_rows_at_bounds_do_not_hide_others(largest):
     for seed in range(6101, 6116):
         A, b, x = planted(seed, largest=largest)
         for form in (A, scipy.sparse.csr_array(A)):
@@ -66,7 +66,7 @@ def test_no_method_calls_the_start_a_solution(name):
     "name", ["minimum-map-newton", "projected-multigrid", "mprgp", "psor", "fischer-newton"]
 )
 @pytest.mark.parametrize("kind", ["poisson", "stencil"])
-def test_nor_on_grids(name, kind):
+def test_no_method_calls_the_start_a_solution_on_grids(name, kind):
     cells = np.ones((6, 7), dtype=int)
     cells[0] = wl.AIR
     five = np.array([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]])

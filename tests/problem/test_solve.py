@@ -202,7 +202,7 @@ def test_own_operator_through_the_protocol():
     np.testing.assert_allclose(result.x.numpy(), lemke(dense, b), atol=1e-8)
 
 
-def test_without_a_method_the_fastest_is_taken():
+def test_the_default_method_is_the_fastest_suitable():
     A, b = poisson()
     dense = wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3))
     assert isinstance(wl.default_method(wl.LCP(A, b)), wl.ProjectedMultigrid)
@@ -220,7 +220,7 @@ def test_without_a_method_the_fastest_is_taken():
         wl.solve(dense, workspace=wl.MinimumMapNewton().init(dense))
 
 
-def test_methods_refuse_what_they_cannot_take():
+def test_methods_refuse_unsupported_problems():
     with pytest.raises(ValueError, match="ProjectedSOR needs an operator with a sweep"):
         wl.solve(wl.LCP(Ring(5), -np.ones(5)), wl.ProjectedSOR())
     zero = wl.DenseOperator(np.array([[0.0, 1.0], [1.0, 1.0]]), device="cpu")

@@ -61,7 +61,7 @@ def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
 
     They differ in the shift too, where it is drawn.
     """
-    made = []
+    problems = []
     for _ in range(count):
         cells = rng.choice([wl.FLUID] * 6 + [wl.AIR, wl.SOLID], shape).astype(np.int8)
         cells[:, -int(rng.integers(1, 4)) :] = wl.AIR
@@ -70,14 +70,14 @@ def drawn_problems(rng, shape, bounds, coefficients, count=3, **options):
         cells[0, 0, :2] = wl.FLUID
         shift = {"shift": rng.random(shape)} if coefficients == "shift" else {}
         A = wl.GridPoisson(cells, device="cpu", **shift, **options)
-        made.append(
+        problems.append(
             wl.LCP(
                 A,
                 rng.standard_normal(shape) * 10.0 ** rng.integers(-2, 3),
                 *sides_of(rng, shape, bounds),
             )
         )
-    return made
+    return problems
 
 
 def bits_of(result):
@@ -120,16 +120,16 @@ def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
         rng.standard_normal(shape) if rng.random() < 0.3 else None,
     )
     wl.set_threads(1 + seed % 2)
-    taken = []
+    reused = []
     take = LCP.take
-    monkeypatch.setattr(LCP, "take", lambda self, other: [take(self, other), taken.append(other)])
+    monkeypatch.setattr(LCP, "take", lambda self, other: [take(self, other), reused.append(other)])
     problems = drawn_problems(rng, shape, bounds, coefficients, dtype=dtype, **options)
     stopping = wl.StoppingCriteria(rtol=1e-3)  # above the floor of single precision
     for problem in [*problems, *problems[::-1], *problems]:
         kept, new = both(problem, method, x0=x0, stopping=stopping)
         assert kept == new
     # All except the first two, and those after a solve that does not converge.
-    assert len(taken) >= 5
+    assert len(reused) >= 5
 
 
 def test_problems_of_other_forms_have_workspaces_of_their_own():
@@ -219,12 +219,12 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
     problems = drawn_problems(rng, (6, 7, 9), "fields", "uniform")
     guess = wp.array(np.zeros((8, 9, 11)), dtype=wp.float64, device="cpu")
     results = [wl.solve(problem, method, x0=guess) for problem in problems]
-    kept = (
+    references = (
         [weakref.ref(p) for p in problems]
         + [weakref.ref(p.A) for p in problems]
         + [weakref.ref(p.b) for p in problems]
     )
-    kept += [weakref.ref(guess)]
+    references += [weakref.ref(guess)]
     work = KEPT.workspace.work
     held = sum(a.capacity for a in (work.x, work.problem.b, work._p)) + work.hierarchy.nbytes
     assert held < 140 * work.problem.layout.size
@@ -234,7 +234,7 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
     for result in results:
         object.__setattr__(result, "problem", None)
     gc.collect()
-    assert [ref() for ref in kept] == [None] * len(kept)
+    assert [ref() for ref in references] == [None] * len(references)
     ready(drawn_problems(rng, (7, 7, 9), "fields", "uniform")[0], method)  # replaces it
     gc.collect()
     assert work() is None

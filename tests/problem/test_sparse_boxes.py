@@ -53,7 +53,7 @@ def solves(up, method, *, in_place):
     b, lower = data(levels[0], 61)
     fields = [stored(v) if in_place else v for v in (b, lower)]
     problem = wl.LCP(A, *fields)
-    work, found, x0 = method.init(problem), [], None
+    work, results, x0 = method.init(problem), [], None
     for cells in levels:
         A.update(wp.array(cells, device="cpu"))
         if in_place:
@@ -62,10 +62,10 @@ def solves(up, method, *, in_place):
         for guess in (x0, None):
             result = wl.solve(problem, method, stopping=STOPPING, x0=guess, workspace=work)
             assert result
-            found.append((result.x.numpy().copy(), [r.residual for r in result.history]))
+            results.append((result.x.numpy().copy(), [r.residual for r in result.history]))
         # Of cells without liquid, too.
-        x0 = np.random.default_rng(71).standard_normal(found[-1][0].shape) * 0.01
-    return A, found
+        x0 = np.random.default_rng(71).standard_normal(results[-1][0].shape) * 0.01
+    return A, results
 
 
 @pytest.mark.cpu_form("boxes that are partly in use are the CPU's")

@@ -110,7 +110,7 @@ def check(family, kind, seed, dtype=wp.float32):
 
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_converged_is_so_for_the_coefficients_that_were_given(family, kind):
+def test_convergence_holds_for_the_unrounded_coefficients(family, kind):
     for seed in range(6):
         found = check(family, kind, seed)
         # Its center is a sum.
@@ -148,7 +148,7 @@ def test_the_rounding_is_the_largest_relative_one():
     assert A.storage_rounding() == 0.0
 
 
-def test_arrays_of_float32_are_what_was_given():
+def test_float32_arrays_are_stored_unrounded():
     """Arrays of float32 are not rounded.
 
     A simulator's arrays on the device: the stored A meets tolerances below float32, and the status

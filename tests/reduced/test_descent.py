@@ -50,7 +50,7 @@ def test_pressure_far_from_air_is_that_of_the_linear_system(name):
     [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")],
     ids=lambda p: p.name,
 )
-def test_boundaries_of_contact_do_not_creep(problem, method):
+def test_contact_boundaries_move_more_than_one_layer_per_step(problem, method):
     result = wl.solve(problem.lcp(), wl.METHODS[method]())
     assert result, result.status
     assert result.linear_iterations <= 2 * equality(problem)
@@ -67,7 +67,7 @@ def test_boundaries_of_contact_do_not_creep(problem, method):
     ],
     ids=["torsion-1000", "torsion-2000", "dam-1025", "dam-4097"],
 )
-def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
+def test_contact_boundaries_move_more_than_one_layer_per_step_on_large_grids(make):
     result = wl.solve(make().lcp())
     assert result, result.status
     assert result.iterations <= 15
@@ -211,7 +211,7 @@ def test_runs_of_projected_steps_double():
     assert descent.due(3) == 0
 
 
-def test_calls_against_creeping_wait_longer_where_they_are_in_vain():
+def test_unsuccessful_descent_calls_become_rarer():
     descent, called = Descent(EPS), []
     descent.start(0.0, 1.0)
     for k in range(16):

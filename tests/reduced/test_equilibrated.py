@@ -105,7 +105,7 @@ def test_no_solution_is_proved(b, kind, precision):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_is_no_solution_is_not_called_infeasible_where_there_is_one(seed):
+def test_solvable_problems_are_not_called_infeasible(seed):
     """False INFEASIBLE is excluded for solvable problems.
 
     Indefinite matrices, for which the method gives no guarantee; enumeration decides.
@@ -139,13 +139,13 @@ def test_entries_bounds_and_b_may_change_in_place(kind):
             p.A.update(scipy.sparse.csr_array(values))
         b.assign(right)
         upper.assign(0.5 / units)
-        again = wl.solve(p, InteriorPoint(), workspace=work, stopping=TIGHT)
+        warm = wl.solve(p, InteriorPoint(), workspace=work, stopping=TIGHT)
         fresh = wl.solve(
             posed(values, right, kind, 0.0, 0.5 / units), InteriorPoint(), stopping=TIGHT
         )
-        assert again, again.status
-        assert again.iterations == fresh.iterations
-        np.testing.assert_allclose(again.x.numpy() * units, fresh.x.numpy() * units, atol=1e-6)
+        assert warm, warm.status
+        assert warm.iterations == fresh.iterations
+        np.testing.assert_allclose(warm.x.numpy() * units, fresh.x.numpy() * units, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])

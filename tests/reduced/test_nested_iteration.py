@@ -207,7 +207,7 @@ def test_band_factors_with_a_shift(width):
     assert not e[~free].any()
 
 
-def test_a_singular_block_is_told():
+def test_a_singular_block_is_reported():
     A = scipy.sparse.csr_array(np.array([[1.0, 1.0, 0], [1.0, 1.0, 0.0], [0.0, 0.0, 2.0]]))
     matrix = BandedMatrix(bands_of(SparseOperator(A, device="cpu"), 1))
     assert matrix.solve(np.ones(3, dtype=bool), np.ones(3)) is None

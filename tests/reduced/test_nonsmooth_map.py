@@ -62,13 +62,13 @@ def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
     and by `approximation`.
     """
     A, b, lower, upper, x = at_kinks(4001)
-    made, field, problem = device_map(A, b, lower, upper, x, form, 0.7, kink, device)
+    system_map, field, problem = device_map(A, b, lower, upper, x, form, 0.7, kink, device)
     f, p, q, kinks = PlainMap(form, A, b, lower, upper, share=0.7).rows(x)
     assert form == "natural" or 5 < kinks.sum() < 30
     fields = [problem.layout.zeros(t) for t in (wp.float64, wp.float64, wp.uint8, wp.float64)]
     shift, r, free, values = fields
-    merit = made.condense(field, shift, r, free, 0.25, 3)
-    made.values(field, values)
+    merit = system_map.condense(field, shift, r, free, 0.25, 3)
+    system_map.values(field, values)
     moves = ~kinks if kink is not Kink.PERTURBATION else np.ones(len(x), dtype=bool)
     q = np.maximum(q, LEAST_Q)
     np.testing.assert_allclose(values.numpy(), f, rtol=1e-13, atol=1e-12)
@@ -80,7 +80,7 @@ def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
     )
     np.testing.assert_array_equal(free.numpy(), moves)
     assert merit == pytest.approx(0.5 * f @ f, rel=1e-13)
-    assert made.merit(field) == pytest.approx(0.5 * f @ f, rel=1e-13)
+    assert system_map.merit(field) == pytest.approx(0.5 * f @ f, rel=1e-13)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -107,13 +107,13 @@ def test_the_map_on_the_host_is_that_of_the_definition(form, kink):
     A, b, lower, upper, x = at_kinks(4007)
     share = 1.0 if form == "fischer" else 0.7
     data = DenseProblem(np.arange(len(b)), A, b, lower, upper, 0.0)
-    made = HostMap(data, share, kink, np.random.default_rng(1))
+    system_map = HostMap(data, share, kink, np.random.default_rng(1))
     plain = PlainMap(form, A, b, lower, upper, share=share)
-    f, p, q, kinks = made.linearized(x)
+    f, p, q, kinks = system_map.linearized(x)
     for got, expected in zip((f, p, q), plain.rows(x), strict=False):
         np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-9)
     np.testing.assert_array_equal(kinks, plain.rows(x)[3])
-    np.testing.assert_allclose(made.jacobian(p, q), plain.jacobian(x), rtol=1e-8, atol=1e-7)
+    np.testing.assert_allclose(system_map.jacobian(p, q), plain.jacobian(x), rtol=1e-8, atol=1e-7)
 
 
 def towards_kinks(seed, n=400):
@@ -147,15 +147,15 @@ def test_host_and_device_agree_step_by_step_at_the_kink(share, seed, device):
     """
     d, b, lower, upper, x = towards_kinks(seed)
     form = "fischer" if share == 1 else "penalized"
-    made, field, problem = device_map(
+    system_map, field, problem = device_map(
         np.diag(d), b, lower, upper, x, form, share, Kink.PERTURBATION, device
     )
     y, values, by_x, by_y = (
-        made.residual.y.numpy(),
+        system_map.residual.y.numpy(),
         *(problem.layout.zeros(wp.float64) for _ in range(3)),
     )
-    made.values(field, values)
-    made._half_sum(WEIGHTED, field, MapWeights(by_x, by_y))
+    system_map.values(field, values)
+    system_map._half_sum(WEIGHTED, field, MapWeights(by_x, by_y))
     data = DenseProblem(np.arange(len(b)), np.diag(d), b, lower, upper, 0.0)
     f, p, q, kinks = HostMap(data, share, Kink.PERTURBATION, np.random.default_rng(1)).linearized(
         x, y

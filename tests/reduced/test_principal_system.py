@@ -45,7 +45,7 @@ def families(device):
     ).tocsr()
     B = rng.standard_normal((20, 20))
     low = rng.standard_normal((225, 2)) * 0.3
-    everything = {n: np.ones(n, dtype=bool) for n in (225, 80, 20)}
+    all_free = {n: np.ones(n, dtype=bool) for n in (225, 80, 20)}
     sparse = lambda m: wl.SparseOperator(m, device=device)  # noqa: E731
     rank = wl.LowRankOperator(low, [0.5, 1.0], device=device)
     return {
@@ -62,15 +62,15 @@ def families(device):
             stencil + u @ np.diag([1.0, 3.0]) @ u.T,
             fluid,
         ),
-        "sparse symmetric": (sparse(laplace), laplace.toarray(), everything[225]),
-        "sparse convection": (sparse(laplace + wind), (laplace + wind).toarray(), everything[225]),
-        "sparse wild": (sparse(wild), wild.toarray(), everything[80]),
+        "sparse symmetric": (sparse(laplace), laplace.toarray(), all_free[225]),
+        "sparse convection": (sparse(laplace + wind), (laplace + wind).toarray(), all_free[225]),
+        "sparse wild": (sparse(wild), wild.toarray(), all_free[80]),
         "sum unsymmetric": (
             wl.SumOperator(sparse(laplace + wind), rank),
             (laplace + wind).toarray() + low @ np.diag([0.5, 1.0]) @ low.T,
-            everything[225],
+            all_free[225],
         ),
-        "dense": (wl.DenseOperator(B, device=device), B, everything[20]),
+        "dense": (wl.DenseOperator(B, device=device), B, all_free[20]),
     }
 
 
@@ -147,13 +147,13 @@ def test_a_grids_iterations_stay_few_for_any_shift(device):
 def test_the_methods_suit_the_matrices():
     found = families("cpu")
 
-    def of(name):
+    def system_of(name):
         problem = wl.LCP(found[name][0], np.zeros(found[name][0].shape))
         return principal_system(problem, wp.float64, bounded=False)
 
-    assert isinstance(of("grid and body"), CoupledGridSystem)
-    assert isinstance(of("sum unsymmetric"), DiagonalSystem)
-    assert isinstance(of("sparse wild").preconditioner, IncompleteFactors)
+    assert isinstance(system_of("grid and body"), CoupledGridSystem)
+    assert isinstance(system_of("sum unsymmetric"), DiagonalSystem)
+    assert isinstance(system_of("sparse wild").preconditioner, IncompleteFactors)
     assert suits_multigrid(found["sparse convection"][0].matrix())
     assert not suits_multigrid(found["sparse wild"][0].matrix())
     assert not suits_multigrid(scipy.sparse.diags_array([1.0, 0.0]).tocsr())
@@ -196,7 +196,7 @@ def test_singular_blocks_still_get_factors():
     assert norm <= 1e-9
 
 
-def test_an_update_is_taken_and_lost_symmetry_is_told(device):
+def test_an_update_is_used_and_lost_symmetry_is_reported(device):
     matrix = families(device)["sparse symmetric"][0].matrix()
     A = wl.SparseOperator(matrix, device=device)
     problem = wl.LCP(A, np.zeros(225))

@@ -90,7 +90,7 @@ def test_a_step_by_the_protocol(form, direct, width, lengths):
         assert system.accept(3).active == np.count_nonzero(held)
 
 
-def test_which_operator_gets_which():
+def test_each_operator_has_its_reduced_system():
     grid, rows = (
         wl.GridPoisson(np.ones((6, 7), dtype=int), shift=1.0, device="cpu"),
         wl.DenseOperator(np.eye(5), device="cpu"),

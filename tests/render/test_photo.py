@@ -223,23 +223,23 @@ def test_water_bodies_and_solids_are_described(dots, tmp_path):
     moved.fields["velocity"][:] = [0.0, 0.0, 2.0]
     folder = write_run(tmp_path / "run", [[water(), moved]], BODY + BLOCK, size=ROOM)
     scene = PhotoScenes(Recording(folder), 1.0).frame(0)
-    found = {mesh.name: mesh for mesh in scene.meshes}
-    assert set(found) == {"solid_0", "body_0", "liquid"}
+    meshes = {mesh.name: mesh for mesh in scene.meshes}
+    assert set(meshes) == {"solid_0", "body_0", "liquid"}
     assert (
-        found["liquid"].finish is Finish.LIQUID
-        and found["liquid"].color[0] > found["liquid"].color[2] > 0.0
+        meshes["liquid"].finish is Finish.LIQUID
+        and meshes["liquid"].color[0] > meshes["liquid"].color[2] > 0.0
     )
     # Cut at the domain.
     assert (
-        found["solid_0"].points[:, 0].max() < 1.01 and found["solid_0"].points[:, 2].min() > -0.01
+        meshes["solid_0"].points[:, 0].max() < 1.01 and meshes["solid_0"].points[:, 2].min() > -0.01
     )
     later = {mesh.name: mesh for mesh in displaced(scene, 0.05).meshes}
     np.testing.assert_allclose(
-        later["body_0"].points - found["body_0"].points,
+        later["body_0"].points - meshes["body_0"].points,
         [[0.0, 0.0, 0.1]] * len(moved.corners) * 3,
         atol=1e-6,
     )
-    np.testing.assert_array_equal(later["solid_0"].points, found["solid_0"].points)
+    np.testing.assert_array_equal(later["solid_0"].points, meshes["solid_0"].points)
 
 
 def test_particles_become_grains(dots, tmp_path):

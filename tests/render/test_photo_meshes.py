@@ -181,7 +181,7 @@ def test_convex_solids_are_cut_at_the_box(seed):
 
 
 @pytest.mark.parametrize("rounds", [0, 1])
-def test_grains_are_closed_irregular_and_told_by_their_seeds(rounds):
+def test_grains_are_closed_irregular_and_determined_by_their_seeds(rounds):
     centers = 3.0 * CUBE
     points, corners, own = grain_mesh(centers, 0.1, np.arange(8), rounds)
     assert points.dtype == np.float32 and len(corners) == 8 * 20 * 4**rounds

@@ -176,25 +176,25 @@ def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
     assert len(list((tmp_path / "elsewhere").glob("frame_*.png"))) == 4
 
 
-def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
-    folder, said = make_run([drops(5) for _ in range(4)]), []
+def test_the_duration_of_drawing_is_estimated_before_it_begins(pyvista, make_run):
+    folder, reported = make_run([drops(5) for _ in range(4)]), []
     looks, frames = Looks(size=(320, 240)), [0, 1, 2]
     drawn = render_run(
         folder,
         frames=frames,
         looks=looks,
-        estimated=said.append,
-        told=lambda done, of: said.append(done),
+        estimated=reported.append,
+        on_progress=lambda done, of: reported.append(done),
     )
     next(drawn)
     drawn.close()
-    assert said == [expected_seconds(Recording(folder), frames, looks), 0, 1]
+    assert reported == [expected_seconds(Recording(folder), frames, looks), 0, 1]
     more = [
         expected_seconds(Recording(folder), frames * 2, looks),
         expected_seconds(Recording(folder), frames, Looks(size=(640, 480))),
     ]
-    assert more[0] == 2 * said[0]
-    assert more[1] > said[0] > 0.0
+    assert more[0] == 2 * reported[0]
+    assert more[1] > reported[0] > 0.0
     result = invoke("render", folder, "--size", "320x240")
     assert result.stderr.startswith("drawing takes about 0:00:01 on one core")
     assert "takes about" not in invoke("render", folder, "--size", "320x240", "--frame", 0).stderr
@@ -204,7 +204,7 @@ def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
     ("simulator", "key", "expected"),
     [("fluids", "liquid", Show.SURFACE), ("granular", "sand", Show.PARTICLES)],
 )
-def test_sand_is_drawn_as_grains_and_liquid_as_its_surface_unless_told(
+def test_by_default_sand_is_drawn_as_grains_and_liquid_as_a_surface(
     simulator, key, expected, tmp_path
 ):
     """Default looks: sand as grains, liquid as its surface.
@@ -264,7 +264,7 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
 @pytest.mark.parametrize(
     ("rate", "label"), [(20, "t = 0.05 s"), (100, "t = 0.01 s"), (1000, "t = 0.001 s")]
 )
-def test_each_picture_tells_its_own_time(pyvista, make_run, monkeypatch, rate, label):
+def test_each_picture_shows_its_own_time(pyvista, make_run, monkeypatch, rate, label):
     folder = make_run([drops(1), drops(1)])
     text = folder / "scene.toml"
     text.write_text(
@@ -511,7 +511,7 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
     page.painter.close()
 
 
-def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
+def test_a_solid_in_a_room_is_drawn_in_every_frame(pyvista, make_run):
     motion = '{ kind = "translation", velocity = [0.0, 8.0, 0.0] }'
     text = f"[[solid]]\n{SOLIDS['sphere']}\nmotion = {motion}\n"
     folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])] * 4, text, size=ROOM, solids="cut-cell")

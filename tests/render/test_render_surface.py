@@ -175,7 +175,7 @@ def test_a_ball_that_turns_looks_otherwise_and_fills_the_same_place(
     assert is_orange(first).sum() == pytest.approx(is_orange(second).sum(), rel=0.1)
 
 
-def test_what_is_round():
+def test_round_bodies_are_recognized():
     for points, corners in (
         sphere(),
         (ball([0.4, 0.6], 0.1).points, ball([0.4, 0.6], 0.1).corners),

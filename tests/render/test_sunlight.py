@@ -16,7 +16,7 @@ RNG = np.random.default_rng(5519)
 WIDTH = 0.01
 
 
-def test_what_lies_behind_something_is_in_its_shadow():
+def test_points_behind_an_object_are_in_its_shadow():
     plate = np.stack(
         np.meshgrid(np.arange(0.3, 0.7, WIDTH), [0.5], np.arange(0.3, 0.7, WIDTH)), axis=-1
     ).reshape(-1, 3)
@@ -36,7 +36,7 @@ def test_what_lies_behind_something_is_in_its_shadow():
     assert (sun.reaches(plate - 2.0 * BEHIND * WIDTH * LIGHT) < 1.0).all()
 
 
-def test_nothing_casts_no_shadow():
+def test_an_empty_scene_has_no_shadow():
     np.testing.assert_array_equal(Sunlight([], WIDTH).reaches(RNG.uniform(size=(50, 3))), 1.0)
 
 

@@ -115,7 +115,7 @@ def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("shapes", ["balls", "boxes", "capsule and box"])
 def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes):
-    made = {
+    problem = {
         "balls": [Sphere(center=[0.3, 0.5], radius=0.1), Sphere(center=[0.7, 0.5], radius=0.15)],
         "boxes": [box([0.2, 0.4], [0.4, 0.6], 2), box([0.6, 0.45], [0.7, 0.55], 2)],
         "capsule and box": [
@@ -124,7 +124,7 @@ def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes)
         ],
     }[shapes]
     bodies = bodies_of(
-        made,
+        problem,
         2,
         open_sides=SIDES,
         restitution=restitution,
@@ -460,7 +460,7 @@ def test_a_step_undone_leaves_nothing():
         bodies.end_step(0.01)
 
 
-def test_a_step_begun_anew_knows_nothing_of_the_first():
+def test_a_restarted_step_is_independent_of_the_first_attempt():
     (bodies, body, weight), (once, _, _) = begun(), begun()
     body.apply_impulse(np.array([weight, weight, weight]))
     bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)

@@ -103,13 +103,13 @@ def test_islands_that_sweeps_solve_stay_as_they_are():
 
     The residual of the other groups is that of Newton's method.
     """
-    made = problem_of(3, 611)
+    problem = problem_of(3, 611)
     rough = StoppingCriteria(rtol=1e-9, max_iterations=16)
-    swept, before, _ = made.solve(rough)
-    better, after, _ = made.solve(rough, None, 1e-7)
+    swept, before, _ = problem.solve(rough)
+    better, after, _ = problem.solve(rough, None, 1e-7)
     assert before > 1e-7
     assert after <= 1e-9
-    alone = np.flatnonzero(made.first == 3)
+    alone = np.flatnonzero(problem.first == 3)
     np.testing.assert_array_equal(better[alone], swept[alone])
 
 
@@ -130,19 +130,19 @@ def test_a_toppling_column_is_solved():
 
 
 def test_a_part_has_its_own_bodies():
-    made = problem_of(2, 29)
-    part = made.part(np.array([3, 1]))
+    problem = problem_of(2, 29)
+    part = problem.part(np.array([3, 1]))
     assert part.first.tolist() == [2, 1]
     assert part.second.tolist() == [1, 0]
     assert part.bodies == 3
-    np.testing.assert_array_equal(part.b, made.b[[3, 1]])
+    np.testing.assert_array_equal(part.b, problem.b[[3, 1]])
     whole, _, _ = ContactProblem(
-        made.first[[2]],
-        made.second[[2]],
-        made.one[[2]],
-        made.other[[2]],
-        made.b[[2]],
-        made.friction[[2]],
+        problem.first[[2]],
+        problem.second[[2]],
+        problem.one[[2]],
+        problem.other[[2]],
+        problem.b[[2]],
+        problem.friction[[2]],
         4,
     ).solve(EXACT)
-    np.testing.assert_allclose(made.part(np.array([2])).solve(EXACT)[0], whole, rtol=1e-12)
+    np.testing.assert_allclose(problem.part(np.array([2])).solve(EXACT)[0], whole, rtol=1e-12)

@@ -104,7 +104,7 @@ def test_contacts_that_part_need_no_impulse():
     assert relative == 0.0
 
 
-def test_too_few_iterations_are_told():
+def test_too_few_iterations_are_reported():
     x, relative, _ = problem_of(3, 611).solve(StoppingCriteria(rtol=1e-12, max_iterations=2))
     assert relative > 1e-12
     assert (x[:, 0] >= 0.0).all()
@@ -151,7 +151,7 @@ def test_a_state_with_contacts_is_continued_bit_for_bit():
     assert np.count_nonzero(through.state()["body_contacts"][:, 0] >= 0) >= 12
 
 
-def test_a_warm_start_takes_what_the_last_step_found():
+def test_a_warm_start_uses_the_impulses_of_the_last_step():
     """Warm start from the impulses of the last step.
 
     The impulses from the floor bear the weight of the stack before any solve.

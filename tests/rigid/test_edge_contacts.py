@@ -123,7 +123,7 @@ def across(kind, bottom):
         ("mesh", "edge"),
     ],
 )
-def test_what_falls_across_two_others_comes_to_rest_on_them(falling, standing):
+def test_a_capsule_dropped_across_two_others_comes_to_rest(falling, standing):
     """Rest of a body that falls across two others.
 
     Away from the ends and middles of both, where points of a coarse sample lie.

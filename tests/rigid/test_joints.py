@@ -108,7 +108,7 @@ def test_a_double_pendulum_goes_as_lagrange_says(dimension):
 
     Half the step gives a quarter of the error. The energy is conserved, and anchors stay together.
     """
-    wanted, errors = double_pendulum(0.4, dimension), []
+    expected, errors = double_pendulum(0.4, dimension), []
     for dt in (0.016, 0.008):
         bodies = system(chain(2), 2, dimension=dimension)
         energies, apart = [], 0.0
@@ -117,7 +117,7 @@ def test_a_double_pendulum_goes_as_lagrange_says(dimension):
             apart = max(apart, bodies.row()["joint_error"])
         angles = np.array([joint.angle(bodies.bodies) for joint in bodies.joints])
         angles[1] += angles[0]
-        errors.append(np.abs(np.angle(np.exp(1j * (angles - wanted)))).max())
+        errors.append(np.abs(np.angle(np.exp(1j * (angles - expected)))).max())
         fallen = max(energies) - bodies.potential_energy(DOWN)
         assert np.ptp(energies) < 40.0 * dt**2 * fallen
         assert apart < 1e-7
@@ -195,7 +195,7 @@ def test_a_fixed_bar_stays_and_a_ball_lets_it_turn_about_any_axis():
         assert bodies.bodies[0].position[1] < -0.01
 
 
-def test_a_limit_holds_a_bar_and_lets_go_of_it():
+def test_a_limit_stops_a_bar_and_releases_it():
     """Limit of a bar that holds and releases it.
 
     It falls to -0.5 rad, rests there, and leaves when gravity points up; the other limit then holds
@@ -328,7 +328,7 @@ def test_rows_are_derivatives_of_errors(seed):
     check_rows(seed)
 
 
-def test_what_does_not_collide():
+def test_joined_bodies_do_not_collide():
     """Pairs without collision.
 
     Bodies of a joint, and bodies of one rigid group of fixed ones; a hinge to a group has no effect

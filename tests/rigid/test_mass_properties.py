@@ -241,7 +241,7 @@ def test_the_surface_of_a_shape_encloses_it(dimension):
         (box_mesh([0, 0, 1], [1, 1, 2]), {"mass": 1.0}, "z = 0"),
     ],
 )
-def test_what_has_no_mass_is_refused(shape, given, says):
+def test_shapes_without_mass_are_refused(shape, given, says):
     with pytest.raises(ValueError, match=says):
         mass_properties(shape, 2, **given)
 

@@ -107,7 +107,7 @@ def test_motion_is_that_of_plain_numpy(seed):
     close(states.values, expected)
 
 
-def test_motion_of_no_time_and_of_what_is_not_finite():
+def test_motion_with_zero_time_and_non_finite_values():
     states = drawn_states(np.random.default_rng(5), flat=False)
     before = states.values.copy()
     states.advance(0.0)
@@ -269,17 +269,17 @@ def stepped(seed, loops, steps):
         world.__init__(bodies, shapes, list(range(len(bodies))), obstacles, 2)
     if not loops:
         world._solve._planar = None
-    told = []
+    recorded = []
     for step in range(steps):
         world.begin_step(world.time, DT, GRAVITY, DT)
-        told.append([np.eye(3) if body.hold is None else body.hold for body in world.bodies])
+        recorded.append([np.eye(3) if body.hold is None else body.hold for body in world.bodies])
         if step % 2:
             world.bodies.apply_impulses(
                 0.01 * rng.standard_normal((len(bodies), 3)) * world.bodies.mass[:, None]
             )
         world.end_step(DT)
-        told += [world.bodies.values.copy(), world._solve.memory.values, [world.contacts]]
-    return told
+        recorded += [world.bodies.values.copy(), world._solve.memory.values, [world.contacts]]
+    return recorded
 
 
 @pytest.mark.parametrize("first", range(100, 112, 4))

@@ -81,13 +81,13 @@ def test_a_free_top_follows_a_fine_reference():
     reference = solve_ivp(rates, (0.0, end), start, method="DOP853", rtol=1e-12, atol=1e-12).y[
         :, -1
     ]
-    wanted = Rotation.from_quat(reference[3:]).as_matrix()
+    expected = Rotation.from_quat(reference[3:]).as_matrix()
     errors = []
     for steps in (400, 800):
         top = tumbling()
         for _ in range(steps):
             top.advance(end / steps)
-        errors.append(np.abs(top.rotation - wanted).max())
+        errors.append(np.abs(top.rotation - expected).max())
     assert errors[0] < 0.05
     assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.6)
     np.testing.assert_allclose(top.position, CENTER + end * np.array([1.0, 2.0, -0.5]), atol=1e-12)

@@ -90,7 +90,7 @@ def test_scenes_by_name_path_tables_and_object_are_the_same(tmp_path):
     by_command("dam-break-2d", tmp_path / "run")
     path.write_text((tmp_path / "run" / "scene.toml").read_text())
     scene = load_scene("dam-break-2d", ["time.duration=0.1", "domain.resolution=32"])
-    given = [
+    runs = [
         wl.Run("dam-break-2d", **SHORT),
         wl.Run("dam-break-2d", overrides={"time.duration": 0.1, "domain.resolution": 32}),
         wl.Run(path),
@@ -99,12 +99,12 @@ def test_scenes_by_name_path_tables_and_object_are_the_same(tmp_path):
         wl.Run(load_scene("dam-break-2d"), **SHORT),
         wl.Run(scene.model_dump(by_alias=True, exclude_none=True)),
     ]
-    assert all(run.scene == scene for run in given)
+    assert all(run.scene == scene for run in runs)
 
 
 def test_a_loop_that_is_left_resumes_bit_for_bit(tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    wl.Run(CRATE, folder=whole, device="cpu").finish()
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    wl.Run(CRATE, folder=uninterrupted, device="cpu").finish()
     for frame in wl.Run(CRATE, folder=parts, device="cpu"):
         if frame.index == 4:
             break
@@ -114,7 +114,7 @@ def test_a_loop_that_is_left_resumes_bit_for_bit(tmp_path):
         "stopped by the program after frame 4",
     )
     assert [frame.index for frame in wl.Run.resume(parts, device="cpu")] == [5, 6, 7, 8, 9, 10]
-    one, other = run_contents(whole), run_contents(parts)
+    one, other = run_contents(uninterrupted), run_contents(parts)
     assert {name: one[name] for name in other.keys() & one.keys() if "step" not in name} == {
         name: value for name, value in other.items() if "step" not in name
     }
@@ -152,10 +152,10 @@ def test_a_callback_that_fails_in_any_step_costs_no_frame(tmp_path):
 
     Some of the steps end a frame: the resumed run writes it and passes it to its loop.
     """
-    whole = tmp_path / "whole"
+    uninterrupted = tmp_path / "whole"
     steps = [
         (frame.index, frame.row["step"])
-        for frame in wl.Run(FINE, folder=whole, device="cpu", frames=3)
+        for frame in wl.Run(FINE, folder=uninterrupted, device="cpu", frames=3)
         if frame.index
     ]
     assert steps == [(1, 2), (2, 4), (3, 6)]
@@ -173,18 +173,18 @@ def test_a_callback_that_fails_in_any_step_costs_no_frame(tmp_path):
         assert seen == list(range(first, 4)), step
         assert run.record.resumed_from_step == step
         assert not [warning for warning in run.record.warnings if "missing" in warning]
-        assert without_checkpoints(out) == without_checkpoints(whole), step
+        assert without_checkpoints(out) == without_checkpoints(uninterrupted), step
 
 
 def test_a_frame_of_which_a_file_was_deleted_is_written_again(tmp_path):
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    for folder in (whole, out):
+    uninterrupted, out = tmp_path / "whole", tmp_path / "out"
+    for folder in (uninterrupted, out):
         wl.Run(FINE, folder=folder, device="cpu", frames=2).finish()
     (out / "frames" / "grid_000002.vtu").unlink()
     run = wl.Run.resume(out, device="cpu", frames=2)
     assert [frame.index for frame in run] == [2]
     assert not [warning for warning in run.record.warnings if "missing" in warning]
-    assert without_checkpoints(out) == without_checkpoints(whole)
+    assert without_checkpoints(out) == without_checkpoints(uninterrupted)
     (out / "frames" / "grid_000001.vtu").unlink()  # before the checkpoint: reported, as usual
     run = wl.Run.resume(out, device="cpu", frames=3)
     assert [frame.index for frame in run] == [3]
@@ -193,8 +193,8 @@ def test_a_frame_of_which_a_file_was_deleted_is_written_again(tmp_path):
 
 @pytest.mark.parametrize("step", [1, 2, 4])
 def test_ctrl_c_in_a_loop_stops_the_run_after_its_step(tmp_path, step):
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    wl.Run(FINE, folder=whole, device="cpu", frames=3).finish()
+    uninterrupted, out = tmp_path / "whole", tmp_path / "out"
+    wl.Run(FINE, folder=uninterrupted, device="cpu", frames=3).finish()
     handler = signal.getsignal(signal.SIGINT)
     run = wl.Run(FINE, folder=out, device="cpu", frames=3)
     run.on_step(failing_at(step, lambda: signal.raise_signal(signal.SIGINT)))
@@ -212,7 +212,7 @@ def test_ctrl_c_in_a_loop_stops_the_run_after_its_step(tmp_path, step):
         )
         assert (out / "checkpoints" / f"step_{step:06d}.npz").is_file()
     wl.Run.resume(out, device="cpu", frames=3).finish()
-    assert without_checkpoints(out) == without_checkpoints(whole)
+    assert without_checkpoints(out) == without_checkpoints(uninterrupted)
 
 
 def test_ctrl_c_in_a_step_waits_for_its_end(dots, scene_file, tmp_path):
@@ -422,7 +422,7 @@ def test_wrong_arguments_are_named_before_any_work(arguments, error, words):
         wl.Run(**{"scene": POOL, **arguments})
 
 
-def test_what_a_run_cannot_do_is_named(tmp_path):
+def test_unsupported_calls_are_named(tmp_path):
     run = wl.Run(CRATE, device="cpu", frames=1)
     with pytest.raises(RunError, match="has not started"):
         run.push(0, [1.0, 0.0])

@@ -69,7 +69,7 @@ def test_sources_count_later() -> None:
     assert dict(later.plan())["particles"].startswith("0 at the start, ")
 
 
-def test_what_does_not_fit_is_refused_unless_forced(
+def test_scenes_beyond_the_memory_are_refused_unless_forced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = load_scene("dam-break-2d")
@@ -102,7 +102,7 @@ def test_a_scene_of_unknown_memory_is_not_refused(
     assert scene.memory_estimate() == 0
 
 
-def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(
+def test_without_free_memory_figures_no_scene_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = devices.free_memory("cpu")

@@ -71,7 +71,7 @@ def written(
         ),
     ],
 )
-def test_what_a_run_refuses_at_its_start_check_refuses_with_the_same_words(
+def test_check_and_run_refuse_a_scene_with_the_same_message(
     tables: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     scene, out = written(tmp_path / "scene.toml", [LIQUID], **tables), tmp_path / "out"
@@ -164,7 +164,7 @@ def generated(chance: random.Random) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("seed", range(4420, 4430))
-def test_no_more_particles_than_foretold(seed: int, tmp_path: Path) -> None:
+def test_no_more_particles_than_estimated(seed: int, tmp_path: Path) -> None:
     tables = generated(random.Random(seed))
     assert_foretold(
         load_scene(written(tmp_path / "scene.toml", tables.pop("material"), **tables)), 3
@@ -173,11 +173,11 @@ def test_no_more_particles_than_foretold(seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", particle_scenes())
-def test_no_more_particles_than_foretold_in_built_in_scenes(name: str) -> None:
+def test_no_more_particles_than_estimated_in_built_in_scenes(name: str) -> None:
     assert_foretold(load_scene(name), 10)
 
 
-def test_a_narrow_band_is_foretold_about(tmp_path: Path) -> None:
+def test_particles_of_a_narrow_band_are_estimated(tmp_path: Path) -> None:
     lines = dict(check_scene("dam-break-2d", ["particles.narrow_band.width=4.0"])[1])
     assert lines["particles"].startswith("about ")
     assert dict(check_scene("dam-break-2d")[1])["particles"].startswith("at most 3,456, ")
@@ -216,7 +216,7 @@ def test_rotate_turns_about_the_origin_or_the_point_that_is_named(tmp_path: Path
         load_scene(written(tmp_path / "c.toml", [LIQUID], solid=[{**BEAM, "about": center}]))
 
 
-def test_a_shape_that_its_rotation_takes_out_of_the_domain_is_told(tmp_path: Path) -> None:
+def test_a_shape_rotated_out_of_the_domain_is_reported(tmp_path: Path) -> None:
     scene = load_scene(written(tmp_path / "scene.toml", [LIQUID], solid=[{**BEAM, "rotate": 45.0}]))
     (note,) = scene.notes()
     assert (
@@ -233,19 +233,19 @@ def test_a_shape_that_its_rotation_takes_out_of_the_domain_is_told(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("phase", "told"),
+    ("phase", "hint"),
     [(1.5708, "90"), (-3.1416, "-180"), (90.0, None), (-90.0, None), (0.0, None), (1.5, None)],
 )
-def test_a_phase_in_radians_is_told(phase: float, told: str | None, tmp_path: Path) -> None:
+def test_a_phase_in_radians_is_reported(phase: float, hint: str | None, tmp_path: Path) -> None:
     motion = {"kind": "sinusoid", "period": 1.0, "amplitude": [0.1, 0.0], "phase": phase}
     notes = load_scene(
         written(tmp_path / "scene.toml", [LIQUID], solid=[{**BEAM, "motion": motion}])
     ).notes()
     assert notes == (
         []
-        if told is None
+        if hint is None
         else [
-            f"solid[0].motion.phase = {phase:g} is in degrees; if radians were meant, it is {told}"
+            f"solid[0].motion.phase = {phase:g} is in degrees; if radians were meant, it is {hint}"
         ]
     )
 

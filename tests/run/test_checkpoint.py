@@ -49,7 +49,7 @@ def test_pruning_keeps_the_newest(folder):
     assert folder.steps() == [1_000_000]
 
 
-def test_what_is_set_aside_is_neither_read_nor_counted(folder):
+def test_checkpoints_set_aside_are_neither_read_nor_counted(folder):
     for step in (14, 16):
         folder.write(Checkpoint(step, 0.0, STATE))
     (folder.path(14)).write_text("broken")
@@ -178,7 +178,7 @@ def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
         {"format": None},
     ],
 )
-def test_what_a_checkpoint_says_must_be_of_the_right_type(folder, said):
+def test_checkpoint_entries_must_have_the_right_type(folder, said):
     arrays = dict(np.load(folder.path(12)))
     arrays["meta"] = np.array(json.dumps(json.loads(str(arrays["meta"])) | said))
     np.savez(folder.path(12), **arrays)

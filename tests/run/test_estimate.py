@@ -79,7 +79,7 @@ def test_surface_tension_shortens_the_steps() -> None:
     )
 
 
-def test_what_sources_add_counts_half_and_less_where_it_leaves() -> None:
+def test_source_inflow_counts_half_and_less_if_it_leaves() -> None:
     stream = {"shape": "box", "min": [0.1, 0.3], "max": [0.3, 0.4], "velocity": [0.0, -2.0]}
     full, leaks = (
         load_scene(POOL | {"source": [stream], "domain": POOL["domain"] | tables})
@@ -103,18 +103,18 @@ def test_what_sources_add_counts_half_and_less_where_it_leaves() -> None:
         (5e15, "5e+03 TB"),
     ],
 )
-def test_bytes_are_told_in_the_largest_unit_of_which_there_is_one(size: float, words: str) -> None:
+def test_bytes_are_shown_in_the_largest_unit_of_at_least_one(size: float, words: str) -> None:
     assert in_words(size) == words
 
 
-def test_a_usual_scene_raises_no_doubts() -> None:
+def test_a_usual_scene_has_no_warnings() -> None:
     assert told() == []
     for name in ("dam-break-2d", "splash-in-circle", "hourglass-2d", "floating-bodies-2d"):
         scene = load_scene(name)
         assert list(doubts(scene, start(scene, "cpu"))) == []
 
 
-def test_what_was_hardly_meant_is_told() -> None:
+def test_suspicious_settings_are_reported() -> None:
     assert told(time={"duration": 500.0}) == [
         "15,000 frames: time.duration 500 s at time.frames_per_second 30; is this intended?"
     ]
@@ -138,7 +138,7 @@ def test_what_was_hardly_meant_is_told() -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_a_mesh_is_told_with_its_repair(spoil, words, tmp_path: Path) -> None:
+def test_mesh_defects_are_reported_with_their_repair(spoil, words, tmp_path: Path) -> None:
     """Report of a defective mesh, with its repair.
 
     Flipped and repeated triangles are repaired by the run itself; self-intersecting surfaces have a

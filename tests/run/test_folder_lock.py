@@ -42,7 +42,7 @@ def end(process: subprocess.Popen) -> None:
     process.stdout.close()
 
 
-def test_the_file_says_who_and_goes_with_the_lock(tmp_path):
+def test_the_lock_file_names_its_owner_and_is_removed_with_the_lock(tmp_path):
     with locked(tmp_path) as remarks:
         assert remarks == []
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
@@ -83,7 +83,7 @@ def test_any_file_in_the_way_is_taken_over(tmp_path, text):
         assert len(remarks) == bool(text)
 
 
-def test_the_number_of_a_living_process_alone_keeps_nobody_out(tmp_path):
+def test_the_number_of_a_running_process_alone_is_no_lock(tmp_path):
     (tmp_path / LOCK).write_text(
         json.dumps({"pid": os.getpid(), "host": "here", "since": "yesterday"})
     )
@@ -106,21 +106,21 @@ def test_a_file_that_its_holder_removed_is_not_held(tmp_path, monkeypatch):
     """
     from warp_lcp.run import folder_lock
 
-    flock, taken = folder_lock.fcntl.flock, []
+    flock, descriptors = folder_lock.fcntl.flock, []
 
     def late(descriptor: int, operation: int) -> None:
-        if not taken:
+        if not descriptors:
             (tmp_path / LOCK).unlink()
-        taken.append(descriptor)
+        descriptors.append(descriptor)
         flock(descriptor, operation)
 
     monkeypatch.setattr(folder_lock.fcntl, "flock", late)
     with locked(tmp_path):
-        assert len(taken) == 2
-        assert os.path.samestat(os.fstat(taken[1]), os.stat(tmp_path / LOCK))
+        assert len(descriptors) == 2
+        assert os.path.samestat(os.fstat(descriptors[1]), os.stat(tmp_path / LOCK))
 
 
-def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch):
+def test_a_file_system_without_locks_is_reported(tmp_path, monkeypatch):
     from warp_lcp.run import folder_lock
 
     def none(descriptor: int, operation: int) -> None:

@@ -139,7 +139,7 @@ def test_a_second_ctrl_c_does_not_wait(dots, run, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows")
-def test_what_is_ignored_stays_ignored(dots, run, tmp_path):
+def test_ignored_signals_stay_ignored(dots, run, tmp_path):
     """Ignored signals stay ignored, as under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
@@ -160,13 +160,13 @@ def test_a_compiler_is_not_waited_for(monkeypatch):
         def _take(self, given: int, frame: Any) -> None:
             pass
 
-    said, ended = [], threading.Event()
+    messages, ended = [], threading.Event()
     monkeypatch.setattr(interruption, "GRACE", 0.01)
-    monkeypatch.setattr(os, "_exit", lambda code: (said.append(code), ended.set()))
-    with Compiling(said.append, last=said.append):
+    monkeypatch.setattr(os, "_exit", lambda code: (messages.append(code), ended.set()))
+    with Compiling(messages.append, last=messages.append):
         signal.raise_signal(signal.SIGINT)
         ended.wait()
-    assert said == ["SIGINT: stopping before the first step has ended", "SIGINT", 1]
+    assert messages == ["SIGINT: stopping before the first step has ended", "SIGINT", 1]
 
 
 def test_the_record_of_a_run_that_is_ended(run, tmp_path):
@@ -191,7 +191,7 @@ def test_ranks_wait_for_each_other():
         assert stop() == "SIGTERM"
 
 
-def test_those_who_call_the_library_need_not_name_a_signal(scene_file, tmp_path):
+def test_callers_of_the_library_need_not_name_a_signal(scene_file, tmp_path):
     from test_run import Watcher, load_scene
 
     assert (

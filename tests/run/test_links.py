@@ -292,7 +292,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe", "dangling link"])
 @pytest.mark.parametrize("writer", WRITERS)
-def test_what_lies_in_the_way_is_replaced(tmp_path, writer, kind):
+def test_files_in_the_way_are_replaced(tmp_path, writer, kind):
     folder, precious = tmp_path / "folder", tmp_path / "precious"
     folder.mkdir()
     precious.write_text(PRECIOUS)

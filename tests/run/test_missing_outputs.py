@@ -75,7 +75,7 @@ def contents(out: Path) -> dict[str, Any]:
     return found
 
 
-def test_nothing_is_missing_of_a_run_that_was_stopped(out):
+def test_a_stopped_run_has_no_missing_outputs(out):
     assert resumed(out) == []
     assert resumed(out) == []
 
@@ -95,7 +95,7 @@ def test_a_log_that_was_cut_or_deleted(out, share):
     assert steps(out)[: len(left) + 1] == [*left, STEP + 1]
 
 
-def test_what_is_missing_is_made_again_as_the_line_says(out, scene_file, tmp_path):
+def test_missing_outputs_are_rewritten_as_reported(out, scene_file, tmp_path):
     shutil.copytree(out, tmp_path / "whole")
     for _ in range(2):
         resumed(tmp_path / "whole")
@@ -136,7 +136,7 @@ def test_frames_without_checkpoints_and_log_are_not_thrown_away(out, scene_file)
         '{"mesh_files": [1]}',
     ],
 )
-def test_files_that_say_what_ran(out, scene_file, record):
+def test_scene_and_record_files_are_checked(out, scene_file, record):
     (out / "scene.toml").unlink()
     (out / "run.json").write_text(record)
     result = CliRunner().invoke(
@@ -169,7 +169,7 @@ def test_a_folder_in_the_place_of_a_file_or_a_file_in_that_of_a_folder(out, scen
         *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8806, 8900)),
     ],
 )
-def test_whatever_is_missing_is_named(out, seed):
+def test_all_missing_outputs_are_named(out, seed):
     """Names of whatever is missing.
 
     Missing rows and frames are those of the messages, and the collections list the existing frames.

@@ -90,20 +90,20 @@ def test_bar_shows_the_step():
 
 def test_a_count_has_a_line_now_and_then():
     stream, now = io.StringIO(), 0.0
-    with Count(Console(file=stream, width=200), "drawing", "images", lambda: now) as told:
-        told(0, 12)
+    with Count(Console(file=stream, width=200), "drawing", "images", lambda: now) as count:
+        count(0, 12)
         for done in range(1, 13):
             now += 2.0
-            told(done, 12)
+            count(done, 12)
     # Each 5 s later than the one before, and not the end, which has its own message.
     told_of = [3, 6, 9]
     lines = [f"drawing: {done} of 12 images  0:00:{2 * (12 - done):02d} left" for done in told_of]
     assert stream.getvalue().splitlines() == lines
     quiet = io.StringIO()
-    with Count(Console(file=quiet, quiet=True), "drawing", "images", lambda: now) as told:
-        told(0, 2)
+    with Count(Console(file=quiet, quiet=True), "drawing", "images", lambda: now) as count:
+        count(0, 2)
         now += 60.0
-        told(1, 2)
+        count(1, 2)
     assert quiet.getvalue() == ""
 
 

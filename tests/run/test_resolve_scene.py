@@ -61,7 +61,7 @@ def test_resume_without_repeating_set_is_the_same_run(scene_file, tmp_path, way)
     assert frames(out) == frames(tmp_path / "whole")
 
 
-def test_what_is_given_anew_changes_and_is_told(scene_file, tmp_path):
+def test_changed_overrides_take_effect_and_are_reported(scene_file, tmp_path):
     out = tmp_path / "out"
     assert (
         invoke(
@@ -154,27 +154,27 @@ TABLE = {"duration": "time", "dt_max": "time", "checkpoint_every": "output"}
 
 
 @pytest.mark.parametrize("seed", range(5200, 5240))
-def test_the_last_word_counts(dots, scene_file, tmp_path, seed):
+def test_the_last_override_counts(dots, scene_file, tmp_path, seed):
     """Last value of a key.
 
     Whatever was set or edited before, a key has its last value, by --set or in the file.
     """
     rng, source, out = random.Random(seed), str(scene_file), tmp_path / "out"
     in_file = {name: values[0] for name, values in VALUES.items()}
-    wanted, settled = dict(in_file), True
+    expected, settled = dict(in_file), True
     for part in range(8):
         route = "scene" if part == 0 else rng.choice(["scene", "scene", "own", "none"])
         if route == "scene" and settled:  # edits are read before anything else is set
             for name in rng.sample(list(VALUES), rng.choice([0, 0, 1])):
                 value = rng.choice(VALUES[name])
-                wanted[name] = wanted[name] if value == in_file[name] else value
+                expected[name] = expected[name] if value == in_file[name] else value
                 in_file[name] = value
             edit(scene_file, **in_file)
         given = {
             name: rng.choice(VALUES[name])
             for name in rng.sample(list(VALUES), rng.choice([0, 1, 2]))
         }
-        wanted |= given
+        expected |= given
         overrides = [f"{TABLE[name]}.{name}={value}" for name, value in given.items()]
         settled = route == "scene"
         named = {"scene": source, "own": str(out / "scene.toml"), "none": None}[route]
@@ -185,6 +185,6 @@ def test_the_last_word_counts(dots, scene_file, tmp_path, seed):
         )
         values = keys(found.scene)
         assert {name: float(values[f"{TABLE[name]}.{name}"]) for name in VALUES} == {
-            name: float(v) for name, v in wanted.items()
+            name: float(v) for name, v in expected.items()
         }, part
         ran(out, found)

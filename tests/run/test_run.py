@@ -152,17 +152,17 @@ def test_checkpoints_are_kept_sparingly(scene_file, tmp_path):
     assert names == [f"step_{step:06d}.npz" for step in sorted({last - 4, last, result.steps})]
 
 
-@pytest.mark.parametrize("kept", [1, 2, 6])
-def test_as_many_checkpoints_are_kept_as_the_scene_says(dots, scene_file, tmp_path, kept):
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_as_many_checkpoints_are_kept_as_the_scene_says(dots, scene_file, tmp_path, count):
     most = []
     dots.before_step = lambda simulation, dt: most.append(
         len(list(tmp_path.glob("out/checkpoints/step_*.npz")))
     )
-    result = go(scene_file, tmp_path / "out", f"output.checkpoints_kept={kept}")
+    result = go(scene_file, tmp_path / "out", f"output.checkpoints_kept={count}")
     names = sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir())
     every = [*range(0, result.steps, 4), result.steps]
-    assert names == [f"step_{step:06d}.npz" for step in every[-kept:]]
-    assert max(most) <= kept + 1  # a new one is written before an old one is deleted
+    assert names == [f"step_{step:06d}.npz" for step in every[-count:]]
+    assert max(most) <= count + 1  # a new one is written before an old one is deleted
     assert most[0] == 1  # a run can be resumed from its first step on
 
 
@@ -210,18 +210,18 @@ def test_output_can_be_turned_off(scene_file, tmp_path):
 
 @pytest.mark.parametrize("step", [1, 4, 5, 9, 17])
 def test_interrupted_and_resumed_equals_uninterrupted(scene_file, tmp_path, step):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    go(scene_file, whole)
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    go(scene_file, uninterrupted)
     stopped = go(scene_file, parts, stop=stop_at(step))
     assert (stopped.status, stopped.steps) == ("stopped", step)
     resumed = go(scene_file, parts, resume=True)
     assert (resumed.status, resumed.resumed_from_step) == ("finished", step)
-    assert contents(parts) == contents(whole)
+    assert contents(parts) == contents(uninterrupted)
 
 
 def test_a_killed_run_resumes_from_its_last_checkpoint(dots, scene_file, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    go(scene_file, whole)
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    go(scene_file, uninterrupted)
     dots.before_step = fail_on(15, error=KeyboardInterrupt)  # the second Ctrl-C
     with pytest.raises(KeyboardInterrupt):
         go(scene_file, parts)
@@ -231,7 +231,7 @@ def test_a_killed_run_resumes_from_its_last_checkpoint(dots, scene_file, tmp_pat
     )
     dots.before_step = lambda simulation, dt: None
     assert go(scene_file, parts, resume=True).resumed_from_step == 12
-    assert contents(parts) == contents(whole)
+    assert contents(parts) == contents(uninterrupted)
 
 
 def test_frames_of_interest_first_then_the_rest(scene_file, tmp_path):
@@ -260,8 +260,8 @@ def test_resuming_a_finished_run_changes_nothing(scene_file, tmp_path):
 
 
 def test_resume_reports_a_broken_checkpoint_and_takes_the_one_before(scene_file, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    go(scene_file, whole)
+    uninterrupted, parts = tmp_path / "whole", tmp_path / "parts"
+    go(scene_file, uninterrupted)
     go(scene_file, parts, stop=stop_at(10))
     broken = parts / "checkpoints" / "step_000010.npz"
     broken.write_bytes(broken.read_bytes()[:-40])
@@ -273,7 +273,7 @@ def test_resume_reports_a_broken_checkpoint_and_takes_the_one_before(scene_file,
     assert observer.notes[1].startswith("continuing from step 8 instead")
     assert (parts / "checkpoints" / "refused_000010.npz").is_file()
     (parts / "checkpoints" / "refused_000010.npz").unlink()
-    assert contents(parts) == contents(whole)
+    assert contents(parts) == contents(uninterrupted)
 
 
 def test_failed_steps_are_retried_with_half_the_step(dots, scene_file, tmp_path):
@@ -392,8 +392,8 @@ def test_no_checkpoint_is_ahead_of_its_frames(dots, scene_file, tmp_path, monkey
 def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(
     dots, scene_file, tmp_path, monkeypatch
 ):
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    go(scene_file, whole)
+    uninterrupted, out = tmp_path / "whole", tmp_path / "out"
+    go(scene_file, uninterrupted)
     slow_frames(monkeypatch, 0.01, fails=3)
     result = go(scene_file, out)
     assert (result.status, result.frames) == ("failed", 2)
@@ -407,7 +407,7 @@ def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(
         lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()],
     )
     assert go(scene_file, out, resume=True).status == "finished"
-    assert contents(out) == contents(whole)
+    assert contents(out) == contents(uninterrupted)
 
 
 def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(
@@ -477,8 +477,8 @@ def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_good_one(
     dots, scene_file, tmp_path, monkeypatch, code, reason
 ):
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    go(scene_file, whole)
+    uninterrupted, out = tmp_path / "whole", tmp_path / "out"
+    go(scene_file, uninterrupted)
     save, calls = np.savez, []
 
     def fails(file: Any, **arrays: Any) -> None:
@@ -498,10 +498,10 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_good_one(
     names = sorted(path.name for path in (out / "checkpoints").iterdir())
     assert names == [f"step_{step:06d}.npz" for step in (0, 4, 8)]
     assert go(scene_file, out, resume=True).resumed_from_step == 8
-    assert contents(out) == contents(whole)
+    assert contents(out) == contents(uninterrupted)
 
 
-def test_a_run_that_will_not_fit_does_not_begin(scene_file, tmp_path, monkeypatch):
+def test_a_run_that_exceeds_the_disk_does_not_begin(scene_file, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)._replace(free=20_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
     with pytest.raises(OutputError, match=r"the run needs about .* GB and 2e-05 GB are free"):
@@ -541,7 +541,7 @@ def test_notes_reach_the_user_and_the_record(dots, scene_file, tmp_path):
     assert observer.notes == dots.notes
 
 
-def test_a_run_says_how_many_steps_missed_their_tolerance(scene_file, dots, tmp_path):
+def test_a_run_reports_steps_above_their_tolerance(scene_file, dots, tmp_path):
     def before_step(simulation: Any, dt: float) -> None:
         dots.status = "STAGNATED" if simulation.step_count in (3, 5) else "CONVERGED"
 

@@ -75,7 +75,7 @@ def test_leftovers_of_a_killed_run_go_too(folder):
         ".git/config",
     ],
 )
-def test_force_never_deletes_what_is_no_runs(folder, name):
+def test_force_never_deletes_foreign_files(folder, name):
     fill(folder, [*RUN_FILES, name])
     with pytest.raises(OutputError, match="files that do not belong to a run"):
         folder.check_new(force=True)
@@ -129,7 +129,7 @@ def test_steps_without_a_checkpoint_are_not_thrown_away(folder):
         folder.resume()
 
 
-def test_a_run_killed_before_its_first_step_begins_anew(folder):
+def test_a_run_killed_before_its_first_step_restarts(folder):
     begun(folder)
     for left in ("nothing", "a header"):
         continued = folder.resume()
@@ -165,14 +165,14 @@ def changed(folder: RunFolder, scene_file: Path, *overrides: str) -> RunFolder:
 
 def test_another_scene_is_not_resumed(folder, scene_file):
     begun(folder)
-    asked = [
+    overrides = [
         "time.frames_per_second=25.0",
         "physics.density=900.0",
         "time.duration=9.0",
         "output.grid=false",
     ]
     with pytest.raises(OutputError) as caught:
-        changed(folder, scene_file, *asked).resume()
+        changed(folder, scene_file, *overrides).resume()
     text = str(caught.value)
     assert "time.frames_per_second: 20.0 before, 25.0 now" in text
     assert "physics.density: 1000.0 before, 900.0 now" in text
@@ -181,16 +181,16 @@ def test_another_scene_is_not_resumed(folder, scene_file):
     assert "may change: scene.name, scene.description, time.duration" in text
 
 
-def test_what_may_change_is_told_with_both_values(folder, scene_file):
+def test_allowed_changes_are_reported_with_both_values(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
-    asked = [
+    overrides = [
         "time.duration=9.0",
         "solver.tolerance=1e-3",
         "output.checkpoints_kept=5",
         "time.cfl=1.0",
         "scene.name=other",
     ]
-    continued = changed(folder, scene_file, *asked).resume()
+    continued = changed(folder, scene_file, *overrides).resume()
     assert continued.changed == [
         "output.checkpoints_kept: 3 before, 5 now",
         'scene.name: "dots" before, "other" now',
@@ -215,7 +215,7 @@ def test_a_duration_that_ends_before_the_checkpoint_would_lose_frames(folder, sc
     assert changed(folder, scene_file, "time.duration=0.4").resume().checkpoint is not None
 
 
-def test_another_resolution_is_told_from_the_checkpoint(folder, scene_file):
+def test_another_resolution_is_detected_from_the_checkpoint(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
     finer = changed(folder, scene_file, "domain.resolution=16")
     assert finer.resume().resampled_from == 8
@@ -269,7 +269,7 @@ def test_a_mesh_counts_by_what_is_in_it(dots, tmp_path):
     )
 
 
-def test_other_software_is_told(folder):
+def test_other_software_versions_are_reported(folder):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
     record = json.loads((folder.path / "run.json").read_text())
     record["versions"]["numpy"] = "1.2.3"
@@ -279,7 +279,7 @@ def test_other_software_is_told(folder):
     assert "may not be bitwise identical" in remark
 
 
-def test_going_on_clears_what_was_half_written(folder):
+def test_resuming_removes_unfinished_files(folder):
     begun(folder)
     for step in (4, 8, 12):
         folder.checkpoints.write(Checkpoint(step, step / 20, {}))
@@ -303,7 +303,7 @@ def test_going_on_clears_what_was_half_written(folder):
     folder.check_new(force=True)  # all files belong to a run
 
 
-def test_fingerprint_ignores_what_may_differ(scene_file: Path):
+def test_fingerprint_ignores_keys_that_may_differ(scene_file: Path):
     same = load_scene(
         scene_file,
         [

@@ -112,7 +112,7 @@ def hostile(text: str, folder: Path, scene: Path) -> None:
 @pytest.mark.parametrize(
     "text", [ALL, *[pytest.param(text, marks=pytest.mark.slow) for text in WAYS]], ids=ascii
 )
-def test_every_command_shows_what_is_hostile(scene_file, tmp_path, monkeypatch, text):
+def test_every_command_escapes_hostile_text(scene_file, tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     hostile(text, tmp_path / "x", scene_file)
 
@@ -151,7 +151,7 @@ def test_matrices(tmp_path, text):
 
 
 @pytest.mark.parametrize("text", [ALL.replace("/", ""), f"x\n{FORGED}"], ids=ascii)
-def test_what_lies_in_the_folder_of_a_run(scene_file, tmp_path, text):
+def test_hostile_names_in_a_run_folder_are_escaped(scene_file, tmp_path, text):
     """Files in the folder of a run, which may come from elsewhere."""
     out = tmp_path / "out"
     run = ["run", scene_file, "--out", out, "--device", "cpu", "--frames"]
@@ -214,7 +214,7 @@ def test_a_terminal_that_is_gone_ends_no_run(dots, scene_file, tmp_path, code):
     assert record.status == "finished"
 
 
-def test_what_prints_is_left_alone():
+def test_printable_text_is_unchanged():
     text = "Dammbruch über 3 m: \u6c34 \U0001f30a │ 12 %"
     assert visible(text) == one_line(text) == text
     assert visible("a\nb\tc") == "a\nb\tc"

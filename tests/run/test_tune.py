@@ -60,7 +60,7 @@ def test_the_distance_of_a_point_that_moves(moved: float, distance: float) -> No
     assert runs[1].front_error(runs[0]) == pytest.approx(moved)
 
 
-def test_runs_that_were_looked_at_otherwise_are_not_compared() -> None:
+def test_runs_with_other_sample_times_are_not_compared() -> None:
     scene = load_scene("dam-break-2d", SMALL)
     a, b = trial(scene, device="cpu", frames=2), trial(scene, device="cpu", frames=2, box=0.2)
     with pytest.raises(ValueError, match="in different boxes or at different times"):
@@ -172,7 +172,7 @@ class Blurred(Model):
         )
 
 
-def test_where_nothing_is_near_enough_the_nearest_is_chosen(
+def test_if_no_setting_is_accurate_enough_the_most_accurate_is_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = tuned(monkeypatch, Model(0.5))
@@ -193,7 +193,9 @@ def test_where_nothing_is_near_enough_the_nearest_is_chosen(
         tuned(monkeypatch, Model(0.5, fails=0.3))
 
 
-def test_what_shorter_steps_bring_tells_what_would_help(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gain_of_shorter_steps_suggests_the_next_change(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     falls = tuned(monkeypatch, Steps(0.0, 0.2)).verdict("standard")[-1]
     assert (
         falls == "the distance decreases with the step: shorter steps than those tried would help"
@@ -223,7 +225,7 @@ class Steps(Model):
 
 
 @pytest.mark.parametrize("distance", [0.019, 0.024, 0.035])
-def test_nothing_can_be_nearer_than_references_are_to_each_other(
+def test_accuracy_is_limited_by_the_distance_of_references(
     distance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No run nearer to the references than they are to each other.
@@ -287,7 +289,7 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
     assert f"time.cfl={scene.time.cfl:g}" in result.stdout
     comments = [line for line in out.read_text().splitlines() if line.startswith("#")]
     assert comments[0].startswith("# Tuned for preview accuracy on cpu:")
-    again = trial(scene, device="cpu", frames=4)
+    rerun = trial(scene, device="cpu", frames=4)
     reference = trial(
         load_scene(
             "dam-break-2d",
@@ -301,7 +303,7 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
         device="cpu",
         frames=4,
     )
-    assert again.distance(reference) <= price_table()["fluids"].presets["preview"].distance
+    assert rerun.distance(reference) <= price_table()["fluids"].presets["preview"].distance
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,9 @@ def made(*solids: dict[str, Any], **more: Any) -> Any:
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused(keys: dict[str, Any], message: str, simulator: str) -> None:
+def test_contradicting_body_keys_are_refused(
+    keys: dict[str, Any], message: str, simulator: str
+) -> None:
     with pytest.raises(SceneError) as caught:
         build({**BLOCK, **keys}, simulator=simulator)
     assert str(caught.value) == f"scene.toml: {message}"

@@ -37,7 +37,7 @@ def test_prices_add_up() -> None:
     )
 
 
-def test_a_line_tells_why_and_what_it_takes() -> None:
+def test_a_plan_line_has_reason_and_cost() -> None:
     models = [
         Model("walls", "asked for"),
         Model("surface", "there is none", built=False),
@@ -72,23 +72,23 @@ def test_every_model_that_is_measured_has_its_price(simulator: str, dimension: i
 
 
 @pytest.mark.parametrize("name", particle_scenes())
-def test_every_built_in_scene_says_which_models_it_has(name: str) -> None:
+def test_every_built_in_scene_lists_its_models(name: str) -> None:
     scene, lines = check_scene(name)
     assert isinstance(scene, ParticleScene)
-    said = [line.partition(":")[0] for word, line in lines if word == "model"]
-    assert said == [model.name for model in scene.models() if model.built]
-    assert ("rigid bodies" in said) == any(solid.is_body for solid in scene.solid)
-    assert "moving solids" in said or "rigid bodies" not in said, "a body moves, too"
+    names = [line.partition(":")[0] for word, line in lines if word == "model"]
+    assert names == [model.name for model in scene.models() if model.built]
+    assert ("rigid bodies" in names) == any(solid.is_body for solid in scene.solid)
+    assert "moving solids" in names or "rigid bodies" not in names, "a body moves, too"
     assert all(
         model.count == sum(solid.is_body for solid in scene.solid)
         for model in scene.models()
         if model.name == "rigid bodies"
     )
-    assert ("cut cells" in said) == (bool(scene.solid) and scene.domain.solids == "cut-cell")
+    assert ("cut cells" in names) == (bool(scene.solid) and scene.domain.solids == "cut-cell")
     assert sum(word == "step" for word, _ in lines) == 1
 
 
-def test_the_command_says_it_too() -> None:
+def test_the_command_prints_the_plan() -> None:
     shown = CliRunner().invoke(
         cli.app, ["check", "dam-break-2d", "--set", "density_correction.every=1"]
     )

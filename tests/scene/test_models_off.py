@@ -424,7 +424,7 @@ def test_a_closed_box_full_of_liquid_has_no_surface(monkeypatch: pytest.MonkeyPa
     assert {part.name for part in tapped.models() if part.built} >= {"ghost-fluid surface"}
 
 
-def test_walls_that_are_not_there_cannot_let_go() -> None:
+def test_open_sides_build_no_separating_walls() -> None:
     domain = {
         "size": [1.0, 0.5],
         "resolution": 16,

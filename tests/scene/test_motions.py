@@ -298,7 +298,7 @@ def test_a_scene_file_keeps_its_motions(dots, tmp_path):
     assert load_scene(copy) == scene
 
 
-def test_the_schema_tells_the_kinds():
+def test_the_schema_lists_the_kinds():
     result = CliRunner().invoke(cli.app, ["schema"])
     assert result.exit_code == 0
     schema = json.loads(result.stdout)

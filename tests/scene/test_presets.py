@@ -49,7 +49,7 @@ def test_every_scene_takes_every_preset(name: str, preset: str) -> None:
 
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
-def test_presets_go_from_fast_to_near(simulator: str) -> None:
+def test_presets_go_from_fast_to_accurate(simulator: str) -> None:
     prices = price_table()[simulator]
     for key in ("time.cfl", "time.dt_max", "solver.tolerance"):
         values = [*(prices.presets[name].settings[key] for name in PRESETS), prices.reference[key]]
@@ -63,7 +63,7 @@ def test_presets_go_from_fast_to_near(simulator: str) -> None:
     assert list(prices.tolerances) == sorted(set(prices.tolerances), reverse=True)
 
 
-def test_what_the_scene_says_wins(scene_file: Path) -> None:
+def test_keys_of_the_scene_override_the_preset(scene_file: Path) -> None:
     settings = price_table()["fluids"].presets["final"].settings
     scene = load_scene(scene_file, ["solver.preset=final", "time.cfl=3.5"])
     assert scene.time.cfl == 3.5
@@ -83,7 +83,7 @@ def test_without_a_preset_nothing_changes(scene_file: Path) -> None:
     assert "preset" not in dict(scene.plan())
 
 
-def test_the_plan_tells_what_came_from_where(scene_file: Path) -> None:
+def test_the_plan_shows_the_origin_of_each_value(scene_file: Path) -> None:
     _, lines = check_scene(str(scene_file), ["solver.preset=preview", "time.cfl=3.5"])
     assert (
         dict(lines)["preset"]
@@ -104,7 +104,7 @@ def test_an_unknown_preset_is_refused(scene_file: Path) -> None:
         load_scene(scene_file, ["solver.preset=fast"])
 
 
-def test_changed_settings_leave_what_is_off_alone(scene_file: Path) -> None:
+def test_presets_do_not_enable_disabled_models(scene_file: Path) -> None:
     scene = changed(load_scene(scene_file), {"time.cfl": 0.75, "density_correction.every": 3})
     assert scene.time.cfl == 0.75
     assert scene.density_correction is None

@@ -81,7 +81,7 @@ def test_fixed_text_keeps_all_else(form):
     assert fix_text(text, SandScene, "heap.toml") == (text, [])
 
 
-def test_what_cannot_be_rewritten_is_refused():
+def test_text_that_cannot_be_rewritten_is_refused():
     with pytest.raises(
         SceneError,
         match=r"material\.angle_of: is the old name of material\.friction_angle_test, which is "
@@ -98,7 +98,7 @@ def test_what_cannot_be_rewritten_is_refused():
         fix_text(SCENE.replace("angle_of repose", "angle_of = repose"), SandScene, "heap.toml")
 
 
-def test_check_says_it_and_fix_does_it(tmp_path):
+def test_check_reports_old_names_and_fix_rewrites_them(tmp_path):
     file = tmp_path / "heap.toml"
     file.write_text(SCENE)
     done = CliRunner().invoke(app, ["check", str(file)])

@@ -31,7 +31,7 @@ def test_the_file_names_the_scene(scene_file):
         ("folder/missing", "folder/missing: there is no such file"),
     ],
 )
-def test_what_is_not_there(dots, text, expected):
+def test_missing_files_are_reported(dots, text, expected):
     with pytest.raises(SceneError) as caught:
         load_scene(text)
     assert expected in str(caught.value)
@@ -159,7 +159,7 @@ def test_built_in_scenes_are_valid(name):
     check_shapes(scene, name)
 
 
-def test_the_promised_scenes_are_there():
+def test_the_documented_scenes_exist():
     promised = {
         "dam-break-2d",
         "dam-break",
@@ -202,7 +202,7 @@ NAMES += ["*", "x" * 61, "~/x", "a\u0300"]
 
 
 @pytest.mark.parametrize("name", NAMES, ids=ascii)
-def test_names_that_would_lead_elsewhere(scene_file, name):
+def test_names_that_leave_the_folder_are_refused(scene_file, name):
     with pytest.raises(SceneError, match=r"scene\.name = .*: must be a name of at most 60 letters"):
         load_scene(scene_file, [f"scene.name={json.dumps(name)}"])
     written = scene_file.read_text().replace("[scene]", f"[scene]\nname = {json.dumps(name)}")

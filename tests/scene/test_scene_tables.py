@@ -129,11 +129,11 @@ def test_unknown_keys_suggest(changes, expected):
         ({"domain.periodic": [True, False]}, "domain.periodic[0] = true"),
     ],
 )
-def test_what_another_simulator_has_is_no_typo(changes, path):
+def test_keys_of_another_simulator_are_no_typo(changes, path):
     assert complaint(changes) == f'dam.toml: {path}: needs scene.simulator = "granular"'
 
 
-def test_what_comes_later_may_be_off():
+def test_unsupported_features_may_be_set_to_off():
     scene = build({"domain.periodic": [False, False]})
     assert scene.domain.periodic == [False, False]
     assert (

@@ -133,7 +133,7 @@ def falls(cells, columns):
 
 @pytest.mark.parametrize("bodies", [1, 3])
 @pytest.mark.parametrize("solver", [wl.ProjectedMultigrid(), wl.MinimumMapNewton()])
-def test_iterations_hardly_depend_on_what_bodies_weigh(solver, bodies, device):
+def test_iterations_hardly_depend_on_the_mass_of_bodies(solver, bodies, device):
     counts = {}
     for ratio in (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3):
         cells, columns, A, _ = tank(24, bodies, ratio, device)
@@ -148,7 +148,7 @@ def test_iterations_hardly_depend_on_what_bodies_weigh(solver, bodies, device):
 
 
 @pytest.mark.parametrize("bodies", [1, 3])
-def test_iterations_where_walls_let_go(bodies, device):
+def test_iterations_with_separating_walls(bodies, device):
     """Iterations with separating walls.
 
     The active set must be found as well; for the lightest bodies that takes longer.
@@ -286,7 +286,7 @@ def test_bodies_may_come_and_go_in_place(device):
 @pytest.mark.parametrize(
     ("weight", "precision"), [slow((1e4, "mixed")), (1e6, "mixed"), slow((1e8, "double"))]
 )
-def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision):
+def test_nearly_massless_bodies_with_separating_walls(weight, precision):
     """Very light bodies with separating walls.
 
     Projections jump there, and projected cycles of the grid hardly move: the active set cycled, and
@@ -324,11 +324,11 @@ def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, de
     Projected cycles keep every unknown free and make no correction. The first correction comes
     after them.
     """
-    taken, made = [], []
+    iterations, corrections = [], []
     renew = WoodburyCorrection.renew
 
     def noted(self, *, begins, **others):
-        made.append((taken[-1], begins))
+        corrections.append((iterations[-1], begins))
         return renew(self, begins=begins, **others)
 
     monkeypatch.setattr(WoodburyCorrection, "renew", noted)
@@ -337,11 +337,11 @@ def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, de
     problem = wl.LCP(A, np.random.default_rng(53).standard_normal(grid.shape))
     method = wl.ProjectedMultigrid(monotone_cycles=cycles)
     result = wl.solve(
-        problem, method, stopping=TIGHT, callback=lambda record: taken.append(record.iteration)
+        problem, method, stopping=TIGHT, callback=lambda record: iterations.append(record.iteration)
     )
     assert [record.step for record in result.history[1 : cycles + 2]] == [
         "monotone cycle"
     ] * cycles + ["truncated cycle"]
-    assert made[0] == (cycles, True)
-    assert len(made) > 1
-    assert not any(begins for _, begins in made[1:])
+    assert corrections[0] == (cycles, True)
+    assert len(corrections) > 1
+    assert not any(begins for _, begins in corrections[1:])

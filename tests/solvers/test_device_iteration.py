@@ -114,7 +114,7 @@ def test_solves_are_those_of_the_host(
         wp.copy(guess, alone.x)
         if rng.random() < 0.3:
             guess.assign(rng.standard_normal(guess.size) * (problem.unknown.numpy() == 1))
-    assert begun == 5 * (ahead.problem.layout.across is None)
+    assert begun == 5 * (ahead.problem.layout.comm is None)
 
 
 def solved_in_turn(
@@ -193,10 +193,10 @@ def test_a_warm_solve_is_read_once() -> None:
 
 def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
     scene = splash(16)
-    problem, asked = scene.lcp("walls", device="cpu"), []
+    problem, count_calls = scene.lcp("walls", device="cpu"), []
     n = int((scene.cells == wl.FLUID).sum())
     mean = MeanCriteria(
-        rtol=0.0, atol=1e-3, max_iterations=50, count=lambda: asked.append(1) or float(n)
+        rtol=0.0, atol=1e-3, max_iterations=50, count=lambda: count_calls.append(1) or float(n)
     )
     from warp_lcp.problem.solve import solve
 
@@ -206,7 +206,7 @@ def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
         SOLVER,
         stopping=wl.StoppingCriteria(rtol=0.0, atol=1e-3 * n**0.5, max_iterations=50),
     )
-    assert len(asked) == 1
+    assert len(count_calls) == 1
     assert (result.status, result.iterations, result.residual) == (
         plain.status,
         plain.iterations,
@@ -296,13 +296,13 @@ def outcomes(problem: wl.LCP, works: tuple[Any, ...], **options: Any) -> list[An
             if record.iteration >= limit:
                 raise StopIteration
 
-        given = {name: value for name, value in options.items() if name != "stop_at"}
+        settings = {name: value for name, value in options.items() if name != "stop_at"}
         result = wl.solve(
             problem,
             SOLVER,
             workspace=work,
             callback=look if "stop_at" in options else None,
-            **given,
+            **settings,
         )
         rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
         found.append((seen, rows, result.status, result.residual, work.x.numpy().tobytes()))
@@ -333,7 +333,7 @@ def test_threads_take_the_steps_of_the_host(
 
 
 @pytest.mark.parametrize("stop_at", [0, 1, 3, 1 << 30])
-def test_who_looks_at_each_step_sees_its_iterate(stop_at: int, both: Any) -> None:
+def test_callbacks_see_the_iterate_of_each_step(stop_at: int, both: Any) -> None:
     problem, alone, ahead = both(4200)
     for guess in (None, problem.layout.zeros(wp.float64)):
         one, other = outcomes(problem, (alone, ahead), x0=guess, stop_at=stop_at)
@@ -363,7 +363,7 @@ def test_limits_end_both_alike(limits: dict[str, Any], both: Any) -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_what_is_not_finite_is_found_by_both(wrong: float, both: Any) -> None:
+def test_non_finite_values_are_detected_on_host_and_device(wrong: float, both: Any) -> None:
     problem, alone, ahead = both(4400)
     guess, inside = problem.layout.zeros(wp.float64), np.flatnonzero(problem.unknown.numpy() == 1)
     for work in (alone, ahead):
@@ -418,7 +418,7 @@ def test_a_solve_waits_once(least: float) -> None:
 
 
 @emulated
-def test_nothing_is_solved_where_no_unknown_counts() -> None:
+def test_a_problem_without_unknowns_is_not_solved() -> None:
     """Problem without relevant unknowns: unchanged iterate.
 
     The criteria are by the mean over no unknowns.

@@ -76,7 +76,7 @@ def test_m_matrices_take_whole_steps_alone(family):
         assert steps(result) <= {"nested iteration", "active set"}
 
 
-def test_a_contact_set_does_not_creep_back_by_a_layer_a_step():
+def test_a_contact_set_shrinks_by_more_than_a_layer_per_step():
     """Contact set that shrinks by many layers in a step.
 
     Successful releases in a row extend further; a plain active set needs a step for each layer.
@@ -315,7 +315,7 @@ def test_lemke_on_narrow_matrices_with_far_bounds_alone(size):
     )
 
 
-def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():
+def test_lemke_reports_its_progress_on_a_large_narrow_problem():
     p = option(5563, n=2000, kind="put")
     told = []
     result = wl.solve(lcp(p), wl.Lemke(), callback=told.append)

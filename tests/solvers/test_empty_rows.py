@@ -39,7 +39,7 @@ def method(request):
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_they_go_to_the_bound_that_b_asks_for(method, sparse, device):
+def test_empty_rows_go_to_the_bound_selected_by_b(method, sparse, device):
     A, b = chain()
     problem = wl.LCP(operator_of(A, "sparse" if sparse else "dense", device), b, -1.0, 1.0)
     result = wl.solve(problem, method, stopping=wl.StoppingCriteria(max_iterations=300))
@@ -50,7 +50,7 @@ def test_they_go_to_the_bound_that_b_asks_for(method, sparse, device):
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_where_that_bound_is_infinite_there_is_no_solution(method, sparse, device):
+def test_empty_rows_with_an_infinite_bound_have_no_solution(method, sparse, device):
     A, b = chain()
     problem = wl.LCP(
         operator_of(A, "sparse" if sparse else "dense", device), np.where(b == -0.3, 0.3, b)

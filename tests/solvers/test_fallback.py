@@ -79,18 +79,18 @@ def plain(chain, problem, most):
 
     `chain` has (rate, name, when).
     """
-    distance, size, place, told = 1.0, np.sqrt(3), 0, Progress(problem, 1e-12 * np.sqrt(3))
+    distance, size, place, progress = 1.0, np.sqrt(3), 0, Progress(problem, 1e-12 * np.sqrt(3))
     names, distances = [chain[0][1]], [1.0]
     for _ in range(most):
-        told.record(size * distance)
-        if place + 1 < len(chain) and chain[place + 1][2](told):
+        progress.record(size * distance)
+        if place + 1 < len(chain) and chain[place + 1][2](progress):
             place += 1
-            told.begin()
-            told.record(size * distance)
+            progress.begin()
+            progress.record(size * distance)
         distance *= chain[place][0]
         names.append(chain[place][1])
         distances.append(distance)
-        told.step = Step("")
+        progress.step = Step("")
         if distance <= 1e-12:
             break
     return names, np.array(distances)
@@ -286,7 +286,7 @@ def test_interim_steps_do_not_stall():
     assert wl.stalls(progress)
 
 
-def test_a_path_creeps():
+def test_a_slow_interior_point_path_triggers_the_fallback():
     for factor, creeps in ((0.999, True), (0.95, False), (0.5, False)):
         progress = Progress(None, 0.0)
         for k in range(12):

@@ -63,7 +63,7 @@ def test_nncg_is_its_algorithm(device):
 @pytest.mark.parametrize(
     "solver", [NNCG(), NNCG(direction="symmetric"), NNCG(omega=1.2), AcceleratedProjectedGradient()]
 )
-def test_they_need_far_fewer_sweeps_than_gauss_seidel(solver, device):
+def test_first_order_methods_need_far_fewer_sweeps_than_gauss_seidel(solver, device):
     cells, b = obstacle(24, 103)
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
     A = scipy.sparse.csr_array(dense[np.ix_(fluid, fluid)])
@@ -170,7 +170,7 @@ def test_gradient_method_solves_singular_semidefinite_boxes(device):
     np.testing.assert_allclose(A @ gradient.x.numpy(), A @ sweeps.x.numpy(), atol=1e-7)
 
 
-def test_what_they_cannot_take_is_refused():
+def test_unsupported_problems_are_refused():
     unsymmetric = wl.LCP(
         wl.DenseOperator(np.array([[1.0, 1.0], [0.0, 1.0]]), device="cpu"), -np.ones(2)
     )

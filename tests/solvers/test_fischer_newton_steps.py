@@ -523,7 +523,7 @@ def test_a_bound_may_make_the_minimum(kind):
     )
 
 
-def test_a_minimum_is_not_told_from_products_alone():
+def test_products_alone_do_not_identify_a_minimum():
     A, b, at = MINIMUM
     problem = wl.LCP(
         wl.LinearOperator(lambda x: A @ x, (3,), diagonal=np.diag(A), symmetric=False), b

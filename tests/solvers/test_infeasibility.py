@@ -321,7 +321,7 @@ def test_diagonal_dominance():
     check_dominance(range(200))
 
 
-def test_what_is_not_dominant():
+def test_matrices_without_dominance():
     laplacian = np.array([[1.0, -1.0], [-1.0, 1.0]])
     assert not diagonally_dominant(laplacian)  # singular: no row is strictly dominant
     assert diagonally_dominant(laplacian + np.diag([1e-3, 0.0]))

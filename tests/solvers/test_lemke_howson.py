@@ -79,7 +79,7 @@ def test_order_and_units_do_not_matter():
     assert abs(x @ (A @ x + b)) <= 1e-9
 
 
-def test_what_is_no_game_starts_as_before():
+def test_problems_that_are_no_game_use_the_lemke_start():
     A, b = problem(*game(5, integer=False))
     assert strategies(A, b) is not None
     negative, within, positive, zero = A.copy(), A.copy(), b.copy(), A.copy()

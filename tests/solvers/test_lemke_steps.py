@@ -95,9 +95,9 @@ def test_pivots_are_those_of_the_lexicographic_rule(band, largest):
         if not (q < 0).any():
             continue
         plain = PlainTableau(M, q, d)
-        made = [Basis(M.astype(float), q.astype(float), d.astype(float))]
+        bases = [Basis(M.astype(float), q.astype(float), d.astype(float))]
         if band is not None:
-            made.append(
+            bases.append(
                 BandedBasis(
                     scipy.sparse.csr_array(M.astype(float)), q.astype(float), d.astype(float)
                 )
@@ -105,14 +105,14 @@ def test_pivots_are_those_of_the_lexicographic_rule(band, largest):
         outcome = None
         while outcome is None:
             outcome = plain.pivot()
-            for basis in made:
+            for basis in bases:
                 assert basis.pivot() is outcome
                 assert sorted(basis.variables.tolist()) == sorted(plain.variables), seed
             pivots += 1
         ends.append(outcome)
         ties += plain.ties
         if outcome:
-            for basis in made:
+            for basis in bases:
                 np.testing.assert_allclose(basis.z(), plain.z(), atol=1e-12)
                 w = M @ basis.z() + q
                 assert (w >= -1e-12).all()
@@ -146,11 +146,12 @@ def test_z0_leaves_as_soon_as_it_may():
                 if e != 8 and plain.table[i][e] > 0
             }
             tied = [i for i in ratios if ratios[i] == min(ratios.values())]
-            there = [i for i in tied if plain.variables[i] == 8]
+            tied_rows = [i for i in tied if plain.variables[i] == 8]
             seen += (
-                bool(there) and min(tied, key=lambda i: plain.key(i, plain.table[i][e])) != there[0]
+                bool(tied_rows)
+                and min(tied, key=lambda i: plain.key(i, plain.table[i][e])) != tied_rows[0]
             )
             outcome = plain.pivot()
             assert basis.pivot() is outcome
-            assert not there or outcome
+            assert not tied_rows or outcome
     assert seen > 0

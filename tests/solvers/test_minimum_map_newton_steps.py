@@ -206,7 +206,7 @@ def test_newton_alone_fails_on_contacts_and_says_so():
     assert max(failed) <= 20
 
 
-def test_newton_alone_may_go_round_in_no_circle():
+def test_newton_without_fallback_may_fail_without_a_cycle():
     """Newton alone without cycling.
 
     On the matrix of period three whole steps cycle; searched ones cannot, and end where no share of

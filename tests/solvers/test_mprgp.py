@@ -199,7 +199,7 @@ def test_single_precision_says_floor_and_mixed_goes_on():
     assert wl.solve(p.lcp(), MPRGP(), stopping=tight)
 
 
-def test_refuses_what_it_cannot_minimize():
+def test_unsupported_problems_are_refused():
     with pytest.raises(ValueError, match="not symmetric"):
         MPRGP().init(skewed(5).lcp(device="cpu"))
     with pytest.raises(ValueError, match="negative diagonal"):

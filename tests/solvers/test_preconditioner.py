@@ -44,7 +44,7 @@ def test_multigrid_of_pyamg_takes_few_iterations(kind):
     "name",
     [name for name, method in wl.METHODS.items() if getattr(method, "preconditioned", False)],
 )
-def test_methods_that_say_so_take_one(name):
+def test_methods_that_declare_it_accept_a_preconditioner(name):
     calls = []
 
     def count(r):
@@ -114,7 +114,7 @@ WRONG = {
 @pytest.mark.parametrize(
     ("kind", "operator"), covering(list(WRONG), [A, wl.LinearOperator(aslinearoperator(A))])
 )
-def test_what_is_no_preconditioner_makes_no_success(kind, operator):
+def test_an_unsuitable_preconditioner_causes_no_false_success(kind, operator):
     """Invalid preconditioner: no false success.
 
     It may cost iterations, or the solution; a converged result is the solution.
@@ -154,12 +154,12 @@ def test_recommendations_take_it():
         ),
     ],
 )
-def test_what_is_refused(given, message):
+def test_invalid_preconditioners_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         wl.LCP(A, B, preconditioner=given)
 
 
-def test_grids_have_their_own():
+def test_grids_use_their_own_preconditioner():
     with pytest.raises(ValueError, match="preconditioner: cannot be given for systems on grids"):
         wl.LCP(
             wl.GridPoisson(np.ones((4, 4), dtype=int), shift=1.0, device="cpu"),

@@ -223,13 +223,13 @@ def honest(family, seed):
     return bool(result)
 
 
-def test_what_a_result_says_is_so():
+def test_a_result_meets_its_reported_residual():
     solved_ones = [honest(family, 100 + seed) for family in FAMILIES for seed in range(4)]
     assert sum(solved_ones) >= 5
 
 
 @pytest.mark.slow
-def test_what_many_results_say_is_so():
+def test_many_results_meet_their_reported_residuals():
     assert all(sum(honest(family, 1000 + seed) for seed in range(40)) >= 10 for family in FAMILIES)
 
 
@@ -250,7 +250,7 @@ def test_in_the_plane_and_without_tangents(dim, device):
     coulomb(problem, result.x.numpy(), 1e-6)
 
 
-def test_where_nothing_approaches_there_are_no_impulses():
+def test_separating_contacts_have_no_impulses():
     problem = drawn("stack", 0, friction=0.5)
     problem.b[:] = [1.0, 0.0, 0.0]
     result = wl.solve(problem, wl.ProximalGaussSeidel())
@@ -292,7 +292,7 @@ def test_a_warm_start_and_a_workspace_that_serves_again():
     ],
 )
 def test_wrong_contacts_are_named(change, message):
-    given = {
+    arguments = {
         "first": [0],
         "second": [1],
         "one": np.eye(6)[None, :3],
@@ -301,7 +301,7 @@ def test_wrong_contacts_are_named(change, message):
         "friction": [0.5],
     }
     with pytest.raises(ValueError, match=message):
-        wl.FrictionalContact(**given | change, bodies=1)
+        wl.FrictionalContact(**arguments | change, bodies=1)
     with pytest.raises(ValueError, match="takes problems of the class FrictionalContact"):
         wl.solve(wl.LCP(np.eye(2), np.ones(2)), wl.ProximalGaussSeidel())
 

@@ -101,7 +101,7 @@ def test_normal_force_and_friction_meet_at_their_common_solution(pull, device):
         Staggering(blocks=[[0], [1, 2]], solvers=[Lemke()] * 3).init(problem)
 
 
-def test_what_cannot_be_taken_apart_is_refused():
+def test_problems_that_cannot_be_split_are_refused():
     class Ring:
         shape, dtype, device, symmetric = (3,), wp.float64, wp.get_device("cpu"), True
 

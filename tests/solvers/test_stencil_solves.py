@@ -168,7 +168,7 @@ def test_answers_are_those_of_the_matrix(seed):
         )
 
 
-def test_methods_say_what_they_cannot():
+def test_methods_refuse_unsupported_stencils():
     A = operator("wind", 20)
     with pytest.raises(
         ValueError, match="A is not symmetric: ProjectedMultigrid minimizes an energy"

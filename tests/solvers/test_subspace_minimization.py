@@ -152,15 +152,17 @@ def test_heavy_boxes_on_light_ones_are_solved_by_default_as_dense_matrices_too(
     Exact steps are too long by the ratio of masses: dense matrices ended STAGNATED, with residuals
     to 0.5 after a minute.
     """
-    given = BoxedModel().problem(heavy_on_light(layers, ratio=ratio, seed=seed).assemble(dt).system)
-    A, b = given.A.toarray(), np.asarray(given.b)
-    result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, given.lower, given.upper))
+    problem = BoxedModel().problem(
+        heavy_on_light(layers, ratio=ratio, seed=seed).assemble(dt).system
+    )
+    A, b = problem.A.toarray(), np.asarray(problem.b)
+    result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, problem.lower, problem.upper))
     assert result, result.status
     assert result.method == "subspace-minimization"
     x, d = result.x.numpy(), np.diag(A)
     lower, upper = (
         side.at(x) if isinstance(side, wl.AffineBounds) else side
-        for side in (given.lower, given.upper)
+        for side in (problem.lower, problem.upper)
     )
     residual = d * (x - np.clip(x - (A @ x + b) / d, lower, upper))
     assert np.linalg.norm(residual) <= 2e-6 * result.history[0].residual

@@ -212,7 +212,7 @@ def test_random_boxes_with_zero_diagonals_never_converge_falsely(device):
     assert solved >= 30
 
 
-def test_divergence_is_told_by_contraction(device):
+def test_divergence_is_detected_by_contraction(device):
     """Divergence, detected by contraction.
 
     Jacobi's method on ones + 0.1 I has spectral radius 8 / 1.1; damping by the estimated lambda_max

@@ -58,7 +58,7 @@ app = typer.Typer(
 )
 
 
-def _begin_alike(word: str, names: Iterable[str]) -> list[str]:
+def _matching_names(word: str, names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if name.startswith(word))
 
 
@@ -73,15 +73,17 @@ def _scenes_alike(incomplete: str) -> list[str]:
         [f"{path}/" for path in near if path.is_dir()],
         [str(path) for path in near if path.suffix == ".toml"],
     )
-    return [*_begin_alike(incomplete, built_in_scenes()), *scene_files, *folders]
+    return [*_matching_names(incomplete, built_in_scenes()), *scene_files, *folders]
 
 
 def _suites_alike(incomplete: str) -> list[str]:
-    return _begin_alike(incomplete, suite_names())
+    return _matching_names(incomplete, suite_names())
 
 
 def _methods_alike(incomplete: str) -> list[str]:
-    return _begin_alike(incomplete, [name for name, method in METHODS.items() if families(method)])
+    return _matching_names(
+        incomplete, [name for name, method in METHODS.items() if families(method)]
+    )
 
 
 SceneArgument = Annotated[
@@ -134,7 +136,7 @@ ForceMemory = Annotated[
 ]
 
 
-def _tell_version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     if asked:
         tell(versions()["warp-lcp"])
         raise typer.Exit
@@ -145,7 +147,7 @@ def options(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_tell_version, is_eager=True, help="Print the version and exit."
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
         ),
     ] = False,
 ) -> None:
@@ -236,15 +238,15 @@ def run(
                 "deletes it"
             )
         loaded = launcher.load(scene, overrides or (), options)
-        chosen, console = launcher.choose_device(device), launcher.console
+        chosen_device, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
-        say(console, f"{name} on {launcher.place(chosen)}, into {folder}")
+        say(console, f"{name} on {launcher.place(chosen_device)}, into {folder}")
         if loaded.kept:
             say(console, f"earlier --set values: {', '.join(loaded.kept)}")
         request = RunRequest(
             scene=loaded.scene,
             out=folder,
-            device=chosen,
+            device=chosen_device,
             overrides=loaded.overrides,
             last_frame=frames,
             resume=resume,
@@ -261,7 +263,7 @@ def run(
             check_window(folder)
         stop = Interruption(partial(say, console), at_once=at_once, last=last)
         with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
-            watch = Profile(chosen) if profile and launcher.is_root else None
+            watch = Profile(chosen_device) if profile and launcher.is_root else None
             with looked_on(
                 observer, folder, page=page and launcher.is_root, window=window and launcher.is_root
             ) as observers:
@@ -296,7 +298,7 @@ def check(
 ) -> None:
     """Validate a scene; estimate memory and run time; list suspicious settings."""
     with wrong_input():
-        chosen = choose_device(device)
+        chosen_device = choose_device(device)
         if fix:
             _print_pairs(
                 [("fixed", line) for line in fix_file(scene) or ["nothing: no key has an old name"]]
@@ -304,8 +306,8 @@ def check(
         loaded, lines = check_scene(scene, overrides or ())
         _print_pairs(lines)
         if not force_memory:
-            check_memory(loaded, chosen)
-            beginning = start(loaded, chosen)
+            check_memory(loaded, chosen_device)
+            beginning = start(loaded, chosen_device)
             _print_pairs(
                 [("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))]
             )
@@ -314,10 +316,12 @@ def check(
         if not calibrate:
             return
         try:
-            seconds, steps = step_seconds(loaded, device=chosen)
+            seconds, steps = step_seconds(loaded, device=chosen_device)
         except (StepFailed, SimulationFailed) as error:
             end(str(error), FAILED)
-    _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
+    _print_pairs(
+        [("seconds a step", f"about {seconds:.3g} on {chosen_device}, the median of {steps}")]
+    )
     if not force_memory:
         _print_pairs(estimate_run(loaded, beginning, seconds))
     if isinstance(loaded, ParticleScene):
@@ -345,16 +349,16 @@ def tune_scene(
 ) -> None:
     """Find the fastest settings of a scene for an accuracy, by short trial runs."""
     with wrong_input():
-        chosen = choose_device(device)
+        chosen_device = choose_device(device)
         loaded = load_scene(scene, overrides or ())
         if out is not None and (out.is_dir() or not out.parent.is_dir()):
             raise OutputError(f"--out {out}: must be a file in an existing folder")
-        check_memory(loaded, chosen)
+        check_memory(loaded, chosen_device)
         try:
             tuning = tune(
                 loaded,
                 accuracy=accuracy,
-                device=chosen,
+                device=chosen_device,
                 frames=frames,
                 say=partial(say, Terminal(stderr=True)),
             )
@@ -362,10 +366,10 @@ def tune_scene(
             end(str(error), FAILED)
         if out is not None:
             try:
-                write_tuned(out, tuning, accuracy, chosen)
+                write_tuned(out, tuning, accuracy, chosen_device)
             except OSError as error:
                 raise OutputError(f"--out {out}: {error}") from error
-    _print_tuning(tuning, accuracy, chosen)
+    _print_tuning(tuning, accuracy, chosen_device)
 
 
 @app.command()
@@ -470,7 +474,7 @@ def solve(
         launcher.agree(
             {"the problem": file_digest(problem), "--out": out, "--device": device, **options}
         )
-        chosen = launcher.choose_device(device)
+        chosen_device = launcher.choose_device(device)
         if out is not None and not out.parent.is_dir():
             raise ProblemError(f"--out {out}: no such folder: {out.parent}")
         if out is not None and out.is_dir():
@@ -478,7 +482,7 @@ def solve(
         outcome: FileOutcome
         if problem.suffix == SUFFIX:
             check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
-            outcome = solve_recorded(problem, device=chosen, ranks=launcher.ranks, **options)
+            outcome = solve_recorded(problem, device=chosen_device, ranks=launcher.ranks, **options)
         elif engine is Engine.PETSC:
             raise ProblemError(
                 f"{problem}: --engine petsc solves only grid problems, as written by `warp-lcp run "
@@ -492,7 +496,7 @@ def solve(
             outcome = solve_files(
                 problem,
                 right_side,
-                device=chosen,
+                device=chosen_device,
                 lower=lower or "0",
                 upper=upper or "inf",
                 **options,
@@ -572,7 +576,7 @@ def bench(
     with wrong_input():
         _use_threads(threads)
         # Ranks choose their devices themselves.
-        chosen = device if engine is Engine.PETSC else choose_device(device)
+        chosen_device = device if engine is Engine.PETSC else choose_device(device)
         if scene:
             load_scene(scene)
     shared = engine is Engine.PETSC
@@ -591,7 +595,7 @@ def bench(
         if not shared:  # called on every rank
             tell(f"{suite}: takes about {installed[suite].takes}", error=True)
         files = installed[suite].run(
-            device=chosen,
+            device=chosen_device,
             out=out,
             sizes=tuple(size or ()),
             repeat=repeat,
@@ -653,7 +657,7 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 
 def _report(record: RunRecord, folder: Path) -> None:
     """Print the exit status of a run."""
-    taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
+    summary = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
     if record.status == "finished" and record.steps and record.resumed_from_step == record.steps:
         tell(
             f"finished earlier, nothing to do: {record.reason}; {record.steps} steps, "
@@ -661,10 +665,10 @@ def _report(record: RunRecord, folder: Path) -> None:
         )
         return
     if record.status == "finished":
-        tell(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
+        tell(f"finished: {record.reason}; {summary}; ParaView opens the .pvd files in {folder}")
         return
     message = (
-        f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
+        f"{record.status}: {record.reason}\n{summary}; frames 0 to {record.frames} are in {folder}"
     )
     newest = max(
         folder.glob("checkpoints/step_*.npz"),

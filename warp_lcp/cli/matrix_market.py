@@ -185,7 +185,7 @@ def _entries(rows: int, columns: int, entries: int) -> str:
 
 def _check_stored(what: str, count: int, held: int, needed: int = 0) -> None:
     """Raise an error if a count of numbers exceeds the file or free memory."""
-    check_claim(what, needed, stored=len("1\n") * count - 1, held=held)
+    check_claim(what, needed, stored=len("1\n") * count - 1, available=held)
 
 
 def _text(path: Path, most: int | None = None) -> bytes:

@@ -226,12 +226,12 @@ def _vector_of(n: int) -> tuple[Fits, str]:
 
 def _checked(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
     """Return the shape in a file's header after a check."""
-    with _told(path):
+    with _file_named_in_errors(path):
         return read_shape(path, fits, expected)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _file_named_in_errors(path: Path) -> Iterator[None]:
     """Add the file's name to errors of reading."""
     try:
         yield
@@ -250,7 +250,7 @@ def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> M
 
     Or also infinite ones, if `infinite` is set.
     """
-    with _told(path):
+    with _file_named_in_errors(path):
         matrix = read_market(path, fits, expected)
     values = matrix if isinstance(matrix, np.ndarray) else matrix.data
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)

@@ -209,13 +209,13 @@ def _write_boxes(
             comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
         return
     with replacing_by_name(path) as temporary:
-        whole = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float64, shape=shape)
+        solution = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float64, shape=shape)
         for rank, box in enumerate(boxes):
             part = box.slices[-len(shape) :]
             mine = x if rank == 0 else np.empty([s.stop - s.start for s in part])
             if rank:
                 with waiting(f"the box of rank {rank}"):
                     comm.Recv(mine, source=rank)
-            whole[part] = mine
-        whole.flush()
-        del whole
+            solution[part] = mine
+        solution.flush()
+        del solution

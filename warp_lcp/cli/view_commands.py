@@ -211,7 +211,7 @@ def render(
                         film,
                         looks=looks,
                         rate=check_rate(fps),
-                        told=counter,
+                        on_progress=counter,
                         estimated=estimated,
                     )
                 )
@@ -227,20 +227,20 @@ def render(
                 looks=looks,
                 out=out,
                 sheet=sheet,
-                told=counter,
+                on_progress=counter,
                 estimated=estimated,
             )
         )
     tell(_listed(images))
 
 
-def refuse_quick_options(**given: bool) -> None:
+def refuse_quick_options(**options: bool) -> None:
     """Raise an error for options that only `--look quick` has.
 
     Raises:
         RenderError: one of them is set.
     """
-    for name, there in given.items():
+    for name, there in options.items():
         if there:
             raise RenderError(f"--{name}: needs --look quick")
 
@@ -321,7 +321,9 @@ def export(
     """
     devices()
     with wrong_input(), Count(Terminal(stderr=True), "writing", "frames") as told:
-        count = len(list(export_run(folder, out, show=show, first=first, last=last, told=told)))
+        count = len(
+            list(export_run(folder, out, show=show, first=first, last=last, on_progress=told))
+        )
     tell(f"{out}: {count} frames")
 
 

@@ -50,7 +50,7 @@ def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
         ValueError: a body has no hinge as its first body, or several; a joint is no hinge; or
             bodies form a ring.
     """
-    own = {joint.first: number for number, joint in enumerate(joints)}
+    joint_of_body = {joint.first: number for number, joint in enumerate(joints)}
     if sorted(joint.first for joint in joints) != list(range(bodies)) or any(
         joint.kind != "hinge" for joint in joints
     ):
@@ -63,7 +63,7 @@ def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
         placed = {joints[number].first for number in order} | {WORLD}
         more = [
             number
-            for body, number in sorted(own.items())
+            for body, number in sorted(joint_of_body.items())
             if body not in placed and joints[number].second in placed
         ]
         if not more:
@@ -279,11 +279,11 @@ class KinematicSimulation:
     def _row(self, pose: ReachedPose, goals: np.ndarray) -> dict[str, float | int | str | None]:
         """Return a row of the log."""
         off = np.linalg.norm(self.figure.positions(self.theta) - goals, axis=1)
-        own: dict[str, float | int | str | None] = {
+        model_row: dict[str, float | int | str | None] = {
             "target_error": float(off.max()),
             "solver": self._method,
             "solve_status": pose.status.name,
             "solve_iterations": pose.iterations,
             "solve_residual": pose.projected_gradient,
         }
-        return own | self.bodies.row()
+        return model_row | self.bodies.row()

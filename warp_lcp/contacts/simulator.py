@@ -133,7 +133,7 @@ class ContactSimulation:
         momentum = bodies.bodies.momentum.sum(axis=0)
         # Potential energy half a step earlier.
         energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)
-        own: dict[str, float | int | str | None] = {
+        model_row: dict[str, float | int | str | None] = {
             "kinetic_energy": bodies.kinetic_energy(),
             "potential_energy": energy,
             "max_speed": bodies.top_speed(0.0),
@@ -142,7 +142,7 @@ class ContactSimulation:
             "solve_iterations": bodies.contact_iterations if solved else None,
             "solve_residual": float(bodies.contact_residual) if solved else None,
         }
-        return own | bodies.row()
+        return model_row | bodies.row()
 
 
 class ContactSimulator:

@@ -59,7 +59,7 @@ class Load:
             rank: search only this rank's share of the numbers of boxes along x, y, z, where all
                 ranks search together; None: search all of them.
         """
-        total, found = float(self.material.sum()), list[tuple[float, Parts]]()
+        total, candidates = float(self.material.sum()), list[tuple[float, Parts]]()
 
         def least(p: Triple) -> float:
             """Return a lower bound of the busiest rank's work: an even share of all work."""
@@ -73,13 +73,13 @@ class Load:
 
         processes = sorted(cuttings(self.counts, ranks), key=lambda p: (least(p), p))
         for p in processes if rank is None else processes[rank::ranks]:
-            if found and least(p) >= min(found)[0]:
+            if candidates and least(p) >= min(candidates)[0]:
                 break
             starts = [[parts(n, a) for n, a in zip(self.counts, p, strict=True)]]
             if start is not None and tuple(map(len, start)) == p:
                 starts.append(start)
-            found += filter(None, map(self._improved, starts))
-        return min(found) if found else None
+            candidates += filter(None, map(self._improved, starts))
+        return min(candidates) if candidates else None
 
     def _improved(self, cut: Parts) -> tuple[float, Parts] | None:
         """Return improved cuts and the work of the busiest rank.
@@ -110,13 +110,13 @@ class Load:
 
             W_1(e) = w(0, e),   W_k(e) = min over a of max(W_(k-1)(a), w(a, e))
         """
-        n, ranks, others = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
+        n, ranks, other_axes = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
         ends = np.append(np.arange(0, n, self.edge), n)
         beside, material = (
             seen_by(self.counts, [*cut[:axis], [n], *cut[axis + 1 :]], self.layers),
             np.moveaxis(self.material, axis, 0),
         )
-        for place, other in enumerate(others, start=1):
+        for place, other in enumerate(other_axes, start=1):
             material = np.diff(
                 _through(material, place).take(
                     -(-np.cumsum([0, *cut[other]]) // self.edge), axis=place

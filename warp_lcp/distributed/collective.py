@@ -91,7 +91,7 @@ class Collective:
         self.failed: list[int] = []
         self.watchdog: Watchdog | None = None
         self._depth = 0
-        self._told: BaseException | None = None  # exception that a block has raised on all ranks
+        self._raised: BaseException | None = None  # exception that a block has raised on all ranks
 
     @classmethod
     def of_one(cls) -> Collective:
@@ -153,7 +153,7 @@ class Collective:
         self.failed = [rank for rank, _ in failed]
         if not failed:
             return
-        self._told = error
+        self._raised = error
         fresh = [(rank, other) for rank, other in failed if not other.told]
         if failure is not None and (failure.told or not fresh):
             return  # the exception is raised unchanged
@@ -163,8 +163,8 @@ class Collective:
         same = len(failed) == self.ranks.size and all(other == failed[0][1] for _, other in failed)
         if same or (failure is not None and not named):
             return
-        self._told = _joined(fresh or failed, named)
-        raise self._told from error
+        self._raised = _joined(fresh or failed, named)
+        raise self._raised from error
 
     def _failure(self, error: BaseException | None) -> Failure | None:
         if error is None:
@@ -173,7 +173,7 @@ class Collective:
         kind = type(error) if planned else RankFailed
         text = str(error) if planned else f"{type(error).__name__}: {error}"
         errno = error.errno if isinstance(error, OSError) else None
-        return Failure(kind, text, errno, planned, error is self._told)
+        return Failure(kind, text, errno, planned, error is self._raised)
 
     def _meet(self, error: BaseException | None, failure: Failure | None) -> list[Failure | None]:
         """Gather the outcome of a block on every rank."""
@@ -198,9 +198,9 @@ class Collective:
         )
         self.end_all(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks are aborted")
 
-    def told_as(self, error: BaseException) -> BaseException:
+    def local_exception(self, error: BaseException) -> BaseException:
         """Return the exception to raise for a block's error; the same on all ranks."""
-        self._told = error
+        self._raised = error
         return error
 
     def end_all(self, text: str) -> None:

@@ -175,7 +175,7 @@ class Decomposition:
         return self.halo if self.ranks.size > 1 else None
 
     @property
-    def across(self) -> Ranks | None:
+    def comm(self) -> Ranks | None:
         """The ranks as the communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
@@ -234,7 +234,7 @@ class Decomposition:
     def dmda(self) -> PETSc.DMDA:
         """DMDA of PETSc with these boxes: one value per cell, 7-point stencils."""
         PETSc = petsc()
-        made = PETSc.DMDA().create(
+        distributed_array = PETSc.DMDA().create(
             dim=3,
             dof=1,
             sizes=self.counts,
@@ -244,8 +244,8 @@ class Decomposition:
             stencil_type=PETSc.DMDA.StencilType.STAR,
             comm=self.ranks.comm,
         )
-        weakref.finalize(self, made.destroy)  # as of `halo.StarForest`
-        return made
+        weakref.finalize(self, distributed_array.destroy)  # as of `halo.StarForest`
+        return distributed_array
 
 
 def parts(n: int, p: int) -> list[int]:
@@ -272,17 +272,17 @@ def _processes(counts: Triple, size: int) -> Triple:
     Among equals, the numbers that cut z are chosen: planes of constant z are contiguous.
     """
     nx, ny, nz = counts
-    found = [
+    candidates = [
         ((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz))
         for px, py, pz in cuttings(counts, size)
     ]
-    if not found:
+    if not candidates:
         most = next(fewer for fewer in range(size - 1, 0, -1) if cuttings(counts, fewer))
         raise ValueError(
             f"{size} ranks cannot share {' x '.join(map(str, counts))} cells, each with a box: "
             f"start {most} or fewer"
         )
-    return min(found)[3]
+    return min(candidates)[3]
 
 
 def cuttings(counts: Triple, size: int) -> list[Triple]:

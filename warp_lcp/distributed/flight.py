@@ -47,33 +47,33 @@ class TreesAtCuts:
 
         The rings at the domain's sides are included.
         """
-        known, place = self._part.known, 2 - axis
+        known_box, place = self._part.known, 2 - axis
         first, planes = (
             self._part.owned.high[place] - 1 if side else self._part.owned.low[place],
             [],
         )
         for n in (first, first + 2 * side - 1):
-            low, high = list(known.low[::-1]), list(known.high[::-1])
+            low, high = list(known_box.low[::-1]), list(known_box.high[::-1])
             low[place], high[place] = n, n + 1
             planes.append(Window.of(low, high, self._part.grid.device))
         return planes
 
-    def join(self, trees: int, seen: Window | None, *found: wp.array) -> BodyNumbers:
+    def join(self, trees: int, seen: Window | None, *cell_fields: wp.array) -> BodyNumbers:
         """Number the bodies of this rank, those on several ranks first; collective.
 
         Args:
             trees: number of trees that this rank has found.
             seen: the cells that it has looked at; None: none.
-            found: parent, number and held of `GridPart.join_trees`.
+            cell_fields: parent, number and held of `GridPart.join_trees`.
         """
         part, ranks = self._part, self._part.ranks
-        planes = self._nodes_at_cuts(seen, *found) if trees else []
+        planes = self._nodes_at_cuts(seen, *cell_fields) if trees else []
         # Without trees at the cuts of any rank, every body belongs to one rank.
         near = any(bool((nodes > GROUND).any()) for pair in planes for _, nodes in pair)
         everyone = ranks.gather(np.array([trees, near]))
         if not everyone[:, 1].any():
             return BodyNumbers(trees)
-        planes = planes or self._nodes_at_cuts(seen, *found)
+        planes = planes or self._nodes_at_cuts(seen, *cell_fields)
         # The nodes of this rank's planes are exchanged; a cell that two ranks know is an edge.
         first, count = nodes_of(ranks, everyone[:, 0])
         grid = np.full(part.grid.shape, ALONE, dtype=np.int32)

@@ -123,7 +123,7 @@ class Halo:
 
         The face lies at a cut. Shape (n, 2).
         """
-        found, grid = [], node.reshape(self.shape).copy()
+        edges, grid = [], node.reshape(self.shape).copy()
         # Ghost cells at the domain's sides are not written.
         for axis in self.decomposition.cut_axes:
             for end in (0, -1):
@@ -138,9 +138,9 @@ class Halo:
             a, b = grid[tuple(lower)].ravel(), grid[tuple(upper)].ravel()
             face = np.broadcast_to(faces[axis], self.shape)[tuple(upper)].ravel()
             open_faces = (a >= 0) & (b >= 0) & (face > 0)
-            found.append(np.stack([a[open_faces], b[open_faces]], axis=1))
+            edges.append(np.stack([a[open_faces], b[open_faces]], axis=1))
         return (
-            np.unique(np.concatenate(found), axis=0) if found else np.empty((0, 2), dtype=np.int32)
+            np.unique(np.concatenate(edges), axis=0) if edges else np.empty((0, 2), dtype=np.int32)
         )
 
     @cached_property
@@ -197,14 +197,14 @@ class Halo:
 
         They are ghost cells, or the cells that other ranks have as ghost cells.
         """
-        found, w = [], self.width
+        slabs, w = [], self.width
         for axis, side in self.cuts:
             n = self.shape[2 - axis]
             first = (0 if ghost else w) if side == 0 else (n - w if ghost else n - 2 * w)
             slab = [slice(None)] * 3
             slab[2 - axis] = slice(first, first + w)
-            found.append(tuple(slab))
-        return found
+            slabs.append(tuple(slab))
+        return slabs
 
 
 class Gathering:
@@ -237,13 +237,13 @@ class Gathering:
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def collecting(self, mine: DeviceArray, whole: DeviceArray) -> Task:
+    def collecting(self, own_part: DeviceArray, whole: DeviceArray) -> Task:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
-            return Task(partial(self.collect, mine, whole))
+            return Task(partial(self.collect, own_part, whole))
         return Task(
-            partial(self.collect, mine, whole),
-            partial(exchanging, self._forest, mine.numpy(), whole.numpy()),
+            partial(self.collect, own_part, whole),
+            partial(exchanging, self._forest, own_part.numpy(), whole.numpy()),
         )
 
     def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:
@@ -284,14 +284,14 @@ class StarForest:
 
     def __init__(self, made: PETSc.SF) -> None:
         self.handle, self.free = (ctypes.c_uint64 * 1)(), weakref.finalize(self, made.destroy)
-        self.made = made
+        self.petsc_forest = made
         self.handle[0] = made.handle
         self.pairs: dict[tuple[int, ...], ctypes.Array[ctypes.c_uint64]] = {}
 
     def replace(self, made: PETSc.SF) -> None:
         """Free the forest and use another one, also in recorded exchanges; collective."""
         self.free()
-        self.made, self.free = made, weakref.finalize(self, made.destroy)
+        self.petsc_forest, self.free = made, weakref.finalize(self, made.destroy)
         self.handle[0] = made.handle
 
 
@@ -324,22 +324,25 @@ def star_forest(
             rank.
         into: a forest that this one replaces, see `StarForest.replace`; None: there is none.
     """
-    mine, roots = ranks.rank, layers * stored[ranks.rank].cells
-    around = whole or stored[mine]
+    own_rank, roots = ranks.rank, layers * stored[ranks.rank].cells
+    around = whole or stored[own_rank]
     wanted = around if filled is None else around.common(filled)
     leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
     for (rank, (box, remote)), shift in itertools.product(
         enumerate(zip(owned, stored, strict=True)), shifts
     ):
         shared = wanted.common(box.moved(shift))
-        if (whole or rank != mine) and shared.cells:
-            here, there = _elements(shared, around), _elements(shared.moved(shift, -1), remote)
+        if (whole or rank != own_rank) and shared.cells:
+            here, remote_elements = (
+                _elements(shared, around),
+                _elements(shared.moved(shift, -1), remote),
+            )
             if which is not None:
                 chosen = which.ravel()[here]
-                here, there = here[chosen], there[chosen]
+                here, remote_elements = here[chosen], remote_elements[chosen]
             for layer in range(layers):
                 leaves.append(here + layer * around.cells)
-                remotes.append(_remote(rank, there + layer * remote.cells))
+                remotes.append(_remote(rank, remote_elements + layer * remote.cells))
     forest = petsc().SF().create(comm=ranks.comm)
     forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
     if into is None:

@@ -100,15 +100,15 @@ def command(ranks: int, *arguments: str) -> list[str]:
     return ["mpiexec", "-n", str(ranks), sys.executable, *arguments]
 
 
-def environment(given: Mapping[str, str] | None = None) -> dict[str, str]:
+def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the environment for `command`.
 
-    One thread per rank, any number of ranks, and Debian's PETSc, unless `given` sets them.
+    One thread per rank, any number of ranks, and Debian's PETSc, unless `base` sets them.
 
     Args:
-        given: variables that stay as they are; this process's own if None.
+        base: variables that stay as they are; this process's own if None.
     """
     found = {**ONE_THREAD, **OPEN_MPI}
     if debian_petsc():
         found["PETSC_DIR"] = debian_petsc()[0]
-    return found | dict(os.environ if given is None else given)
+    return found | dict(os.environ if base is None else base)

@@ -195,7 +195,7 @@ class _Library:
 _library = cache(_Library)
 
 
-def handle(of: MPI.Comm | MPI.Datatype | MPI.Op) -> ctypes.c_int | ctypes.c_void_p:
+def handle(mpi_object: MPI.Comm | MPI.Datatype | MPI.Op) -> ctypes.c_int | ctypes.c_void_p:
     """Return the C handle of an mpi4py object.
 
     Open MPI's handles are pointers, MPICH's are numbers.
@@ -203,9 +203,11 @@ def handle(of: MPI.Comm | MPI.Datatype | MPI.Op) -> ctypes.c_int | ctypes.c_void
     from mpi4py import MPI
 
     kind: type[ctypes.c_int] | type[ctypes.c_void_p] = (
-        ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
+        ctypes.c_int if MPI._sizeof(mpi_object) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
     )
-    return kind.from_buffer_copy(ctypes.string_at(MPI._addressof(of), MPI._sizeof(of)))
+    return kind.from_buffer_copy(
+        ctypes.string_at(MPI._addressof(mpi_object), MPI._sizeof(mpi_object))
+    )
 
 
 def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
@@ -228,7 +230,7 @@ def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarra
                 where = (ctypes.c_void_p(array.ctypes.data) for array in (roots, leaves))
                 _check(
                     call(
-                        ctypes.c_void_p(forest.made.handle),
+                        ctypes.c_void_p(forest.petsc_forest.handle),
                         library.units[roots.dtype.itemsize],
                         *where,
                         library.replace,
@@ -250,14 +252,14 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
     ]
     key = tuple((word or 0) & (1 << 64) - 1 for pair in listed for word in pair)
     words = forest.pairs.setdefault(key, (ctypes.c_uint64 * len(key))(*key))
-    given = [
+    kernel_args = [
         *functions,
         ctypes.addressof(forest.handle),
         ctypes.addressof(words),
         library.replace.value,
         len(pairs),
     ]
-    return _operation(exchange_kernel, given, (forest, words, pairs))
+    return _operation(exchange_kernel, kernel_args, (forest, words, pairs))
 
 
 def adding(comm: MPI.Comm, sums: np.ndarray) -> Operation:
@@ -265,24 +267,28 @@ def adding(comm: MPI.Comm, sums: np.ndarray) -> Operation:
 
     The partial sums are added in the order of the ranks. The operation runs in the thread pool.
     """
-    library, of_all = _library(), np.empty((comm.size, sums.size))
-    given = [
+    library, gathered = _library(), np.empty((comm.size, sums.size))
+    kernel_args = [
         ctypes.cast(library.gather, ctypes.c_void_p).value,
         library.units[8].value,
         handle(comm).value,
     ]
     return _operation(
         add_kernel,
-        [*given, sums.ctypes.data, of_all.ctypes.data, sums.size, comm.size],
-        (comm, sums, of_all),
+        [*kernel_args, sums.ctypes.data, gathered.ctypes.data, sums.size, comm.size],
+        (comm, sums, gathered),
     )
 
 
-def _operation(kernel: wp.Kernel, given: Sequence[int | None], kept: object) -> Operation:
+def _operation(
+    kernel: wp.Kernel, kernel_args: Sequence[int | None], keep_alive: object
+) -> Operation:
     # Handles of MPICH may be negative.
-    words = [(word or 0) & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]
+    words = [
+        (word or 0) & (1 << 64) - 1 for word in (*kernel_args, ctypes.addressof(waiting.native))
+    ]
     launch = wp.launch(kernel, 1, words, device="cpu", record_cmd=True)
-    operation = launched_alone(launch, kept)
+    operation = launched_alone(launch, keep_alive)
     operation.check = _check_native
     return operation
 

@@ -28,36 +28,38 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
     Returns:
         The piece of this rank's new box.
     """
-    mine, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
+    own_rank, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
 
     def gives(giver: int, taker: int) -> bool:  # particles migrate when a step begins
         return now.decomposition.meet(old[giver].grown(before.layers), new[taker])
 
-    others = [
+    other_ranks = [
         rank
         for rank in range(now.ranks.size)
-        if rank != mine and (gives(mine, rank) or gives(rank, mine))
+        if rank != own_rank and (gives(own_rank, rank) or gives(rank, own_rank))
     ]
     owner = now.owners(cells_of(now, piece["position"]))
-    taken = {**piece, "box": np.array([now.box.low, now.box.high])}
+    new_piece = {**piece, "box": np.array([now.box.low, now.box.high])}
     for name in (*particles, "place"):
         values = np.asarray(piece[name])
-        come = now.mailbox.swap({rank: values[owner == rank].ravel() for rank in others})
-        taken[name] = np.concatenate(
-            [values[owner == mine], *(found.reshape(-1, *values.shape[1:]) for found in come)]
+        come = now.mailbox.swap({rank: values[owner == rank].ravel() for rank in other_ranks})
+        new_piece[name] = np.concatenate(
+            [values[owner == own_rank], *(found.reshape(-1, *values.shape[1:]) for found in come)]
         )
     for name, values in fields_of(piece).items():
-        taken[name] = np.zeros((*values.shape[:-3], *now.box.counts[::-1]), dtype=values.dtype)
-        sent = {rank: _cut_out(values, old[mine], new[rank]) for rank in (mine, *others)}
+        new_piece[name] = np.zeros((*values.shape[:-3], *now.box.counts[::-1]), dtype=values.dtype)
+        sent = {
+            rank: _cut_out(values, old[own_rank], new[rank]) for rank in (own_rank, *other_ranks)
+        }
         for rank, found in zip(
-            (mine, *others), [sent.pop(mine), *now.mailbox.swap(sent)], strict=True
+            (own_rank, *other_ranks), [sent.pop(own_rank), *now.mailbox.swap(sent)], strict=True
         ):
-            box = old[rank].common(new[mine])
+            box = old[rank].common(new[own_rank])
             if box.cells:
-                taken[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(
+                new_piece[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(
                     *values.shape[:-3], *box.counts[::-1]
                 )
-    return taken
+    return new_piece
 
 
 def _cut_out(values: np.ndarray, box: CellBox, other: CellBox) -> np.ndarray:

@@ -33,14 +33,14 @@ def check_shared(
         ValueError: the message names the key and what is allowed; on all ranks.
     """
     ranks.agree("the scene", scene.model_dump(mode="json"))
-    told = [f"{key} {NOT_ON_RANKS}" for key in refused]
+    complaints = [f"{key} {NOT_ON_RANKS}" for key in refused]
     if scene.solver.method not in methods:
-        told.append(
+        complaints.append(
             f"solver.method = {scene.solver.method} works on one process only (without --engine "
             f"petsc): {' or '.join(methods)}"
         )
-    if told:
-        raise ValueError("; ".join(told))
+    if complaints:
+        raise ValueError("; ".join(complaints))
 
 
 def part_of(

@@ -47,7 +47,7 @@ class Buffer:
         self._dtype, self._slot = dtype, Slot()
         self._allocate(1)
 
-    def reserve(self, count: int, kept: int = 0) -> None:
+    def reserve(self, count: int, keep: int = 0) -> None:
         """Allocate room for so many elements, and keep the first ones.
 
         The other elements are not initialized.
@@ -55,7 +55,7 @@ class Buffer:
         if count > len(self.host):
             before = self.host
             self._allocate(2 * count)
-            self.host[:kept] = before[:kept]
+            self.host[:keep] = before[:keep]
 
     def take(self, values: np.ndarray) -> None:
         """Store these values."""
@@ -110,14 +110,14 @@ class ParticleMessages:
         This rank comes last. A neighbor needs the particles in its box and within REACH of it, at
         every periodic shift; this rank itself needs those at nonzero shifts.
         """
-        part, joined, mine = self.part, self.part.decomposition.joined, self.part.ranks.rank
+        part, joined, own_rank = self.part, self.part.decomposition.joined, self.part.ranks.rank
         counts, origin = np.array(part.grid.counts), np.array(part.grid.origin)
         limits = [[0, 0, 0], part.decomposition.counts] if joined else [origin, origin + counts]
         if part.grid.dimension == 2:
             limits = [[*limits[0][:2], origin[2]], limits[1]]
         shifts = part.decomposition.shifts
-        ranks = [*self._neighbors, mine] if joined else self._neighbors
-        seen = [(rank, shift) for rank in ranks for shift in shifts[rank == mine :]]
+        ranks = [*self._neighbors, own_rank] if joined else self._neighbors
+        seen = [(rank, shift) for rank in ranks for shift in shifts[rank == own_rank :]]
         boxes = [
             part.decomposition.boxes[rank].grown(REACH).moved(shift, -1) for rank, shift in seen
         ]
@@ -175,15 +175,15 @@ class ParticleMessages:
             The number of this rank's particles, the number with ghosts, and the indices before this
             rank's end whose particles were replaced.
         """
-        found = self._found.host
-        most = int(found[0]) + come
+        counts = self._found.host
+        most = int(counts[0]) + come
         for buffer in (self._others, self._ghosts):
             buffer.reserve(most)
         self._flags.reserve(2 * most)
         self._moved.reserve(2 * most * (PLACE_WORDS + COLUMN_WORDS * len(COLUMNS)))
         self._settling.run()
         self._send()
-        own, end, free = found[:3].tolist()
+        own, end, free = counts[:3].tolist()
         return own, end, self._others.host[:free].astype(np.int64)
 
     def give_places(self) -> None:
@@ -227,7 +227,7 @@ class ParticleMessages:
 
     def _launch_packing(self, positions_only: bool) -> None:
         end_x, end_y, end_z = map(float, self._end)
-        given = {
+        kernel_args = {
             "message": self._outgoing.array,
             "offsets": self._offsets.array,
             "place": self._place.array,
@@ -239,29 +239,31 @@ class ParticleMessages:
             "end_y": end_y,
             "end_z": end_z,
         }
-        self._bind(PACK, given | numbers | self._border_found | self._columns(positions_only))
+        self._bind(PACK, kernel_args | numbers | self._border_found | self._columns(positions_only))
 
     def _launch_unpacking(self, positions_only: bool) -> None:
-        given = {
+        kernel_args = {
             "message": self._incoming.array,
             "found": self._found.array,
             "place": self._place.array,
         }
         self._bind(
             UNPACK,
-            given | self._columns(positions_only) | {"count": self._count, "come": self._come},
+            kernel_args
+            | self._columns(positions_only)
+            | {"count": self._count, "come": self._come},
         )
 
     def _launch_settling(self) -> None:
-        given = {
+        kernel_args = {
             "message": self._moved.array,
             "others": self._others.array,
             "ghosts": self._ghosts.array,
             "flags": self._flags.array,
         }
-        given |= {"place": self._place.array, "count": self._count, "come": self._come}
+        kernel_args |= {"place": self._place.array, "count": self._count, "come": self._come}
         self._bind(
-            SETTLE, self._placed | self._bounds | self._border_found | given | self._columns()
+            SETTLE, self._placed | self._bounds | self._border_found | kernel_args | self._columns()
         )
 
     def _launch_places(self) -> None:
@@ -277,13 +279,13 @@ class ParticleMessages:
                 strict=True,
             )
         )
-        given = {
+        kernel_args = {
             "key": key,
             "place": self._place.array,
             "found": self._found.array,
             "count": self._count,
         }
-        self._bind(GIVE_PLACES, given | numbers)
+        self._bind(GIVE_PLACES, kernel_args | numbers)
 
     @property
     def _border_found(self) -> dict[str, DeviceArray]:

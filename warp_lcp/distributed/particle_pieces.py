@@ -67,10 +67,10 @@ def take_pieces(
             name: np.zeros((*layers, *part.box.counts[::-1]), dtype=dtype)
             for name, (dtype, layers) in kinds.items()
         }
-        own: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {
+        own_piece: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {
             "place": np.empty(0, dtype=np.int64)
         }
-        covered, found = 0, [own]
+        covered, parts = 0, [own_piece]
         for piece in pieces:
             box = CellBox.of(*piece["box"])
             shared = box.common(part.box)
@@ -82,30 +82,35 @@ def take_pieces(
             # Particles migrate to their rank when the next step begins.
             if part.decomposition.meet(box.grown(part.layers), part.box):
                 inside = part.owners(cells_of(part, piece["position"])) == part.ranks.rank
-                found.append({name: np.asarray(piece[name])[inside] for name in own})
-        own = {name: np.ascontiguousarray(np.concatenate([p[name] for p in found])) for name in own}
+                parts.append({name: np.asarray(piece[name])[inside] for name in own_piece})
+        own_piece = {
+            name: np.ascontiguousarray(np.concatenate([p[name] for p in parts]))
+            for name in own_piece
+        }
         if covered != part.box.cells:
             raise ValueError("the pieces do not cover the domain: some are missing or duplicated")
         if any(
             values.dtype.kind == "f" and not np.isfinite(values).all()
-            for values in (*own.values(), *cells.values())
+            for values in (*own_piece.values(), *cells.values())
         ):
             raise ValueError("the pieces hold values that are not finite")
         if solids is not None and not np.array_equal(
             cells["cells"] == wl.SOLID, part.box_of(solids) == wl.SOLID
         ):
             raise ValueError("the state's solids are not this scene's")
-        return own, cells, numbers
+        return own_piece, cells, numbers
 
 
 def _numbers(
-    pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str], signature: np.ndarray
+    pieces: Sequence[Piece], names: Sequence[str], other_names: Sequence[str], signature: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the numbers that all pieces share.
 
     The pieces are first checked: they must agree in everything else and belong to a scene.
     """
-    missing = sorted({name for piece in pieces for name in (*names, *others) if name not in piece})
+    missing = sorted(
+        {name for piece in pieces for name in (*names, *other_names) if name not in piece}
+    )
     if missing or not pieces:
         raise ValueError(
             f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene "

@@ -233,24 +233,31 @@ class ParticleMigration(ParticleExchange):
             self.particles.number()
             self._lying = PlaceOrder(self.place.copy())
 
-    def joined_totals(self, own: ParticleTotals) -> ParticleTotals:
+    def joined_totals(self, own_totals: ParticleTotals) -> ParticleTotals:
         """Return sums over all ranks' particles; there must be no ghosts."""
         assert self._own is None, "ghosts would be counted twice"
-        n, ranks = own.count, self.part.ranks
+        n, ranks = own_totals.count, self.part.ranks
         before, added, self._added = sum(self._counts), self._added, 0
         if ranks.size == 1:
             self._counts, self._expected = [n], before + added
-            return own
+            return own_totals
         # One message: count, bad values, 7 means times the count, additions; then 7 maxima.
-        mine = np.full(18, -np.inf)
-        mine[:3], mine[10] = (n, own.bad_positions, own.bad_velocities), added
-        mine[3:10] = own.mean_square_speed, *own.center.tolist(), *own.velocity.tolist()
-        mine[11] = own.max_speed
+        own_values = np.full(18, -np.inf)
+        own_values[:3], own_values[10] = (
+            (n, own_totals.bad_positions, own_totals.bad_velocities),
+            added,
+        )
+        own_values[3:10] = (
+            own_totals.mean_square_speed,
+            *own_totals.center.tolist(),
+            *own_totals.velocity.tolist(),
+        )
+        own_values[11] = own_totals.max_speed
         if n:
-            mine[12:15], mine[15:] = -own.low, own.high
+            own_values[12:15], own_values[15:] = -own_totals.low, own_totals.high
         with np.errstate(invalid="ignore"):
-            mine[3:10] *= n
-            everyone = ranks.gather(mine)
+            own_values[3:10] *= n
+            everyone = ranks.gather(own_values)
         sums, most, self._counts = (
             everyone.sum(axis=0),
             everyone[:, -7:].max(axis=0),
@@ -258,7 +265,7 @@ class ParticleMigration(ParticleExchange):
         )
         count, self._expected = int(sums[0]), before + int(sums[10])
         if count == 0:
-            return own
+            return own_totals
         return ParticleTotals(
             count=count,
             mean_square_speed=float(sums[3]) / count,
@@ -281,14 +288,14 @@ class ParticleMigration(ParticleExchange):
     def _where(self) -> np.ndarray:
         """Return INNER, BORDER or OUTSIDE of each particle, uint8, shape (count,)."""
         grid, count = self.part.grid, self.particles.count
-        found = wp.empty(count, dtype=wp.uint8, device=grid.device)
+        inside = wp.empty(count, dtype=wp.uint8, device=grid.device)
         if count:
             launch(
                 WHERE,
                 count,
                 grid,
                 position=self.particles.position,
-                where=found,
+                where=inside,
                 **bounds_of(self.part),
             )
-        return np.asarray(found.numpy())
+        return np.asarray(inside.numpy())

@@ -215,13 +215,13 @@ def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
         raise ValueError(f"{error} (rank {ranks.rank})") from error
 
 
-def dealt(name: str | None, number: int, found: list[str]) -> str:
+def dealt(name: str | None, number: int, gpus: list[str]) -> str:
     """Return the device of a rank, by its number on its machine.
 
     Args:
         name: requested device, as `device_of_rank` takes it.
         number: of the rank among those of its machine.
-        found: GPUs of the machine.
+        gpus: GPUs of the machine.
 
     Raises:
         ValueError: there is no such device.
@@ -230,15 +230,15 @@ def dealt(name: str | None, number: int, found: list[str]) -> str:
         >>> [dealt("cuda", number, ["cuda:0", "cuda:1"]) for number in range(3)]
         ['cuda:0', 'cuda:1', 'cuda:0']
     """
-    if name == "cpu" or (name is None and not found):
+    if name == "cpu" or (name is None and not gpus):
         return "cpu"
-    if name in (None, "cuda") and found:
-        return found[number % len(found)]
-    if name in found:
+    if name in (None, "cuda") and gpus:
+        return gpus[number % len(gpus)]
+    if name in gpus:
         return str(name)
     raise ValueError(
         f"--device {name}: there is no such device on this machine; choose from "
-        f"{', '.join([*found, 'cpu'])}"
+        f"{', '.join([*gpus, 'cpu'])}"
     )
 
 

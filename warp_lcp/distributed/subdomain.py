@@ -190,7 +190,7 @@ class Subdomain(GridPart):
                 self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
 
     @property
-    def across(self) -> Communicator | None:
+    def comm(self) -> Communicator | None:
         """Communicator of reductions; None if there is one rank."""
         return self.ranks if self.ranks.size > 1 else None
 
@@ -333,7 +333,7 @@ class Subdomain(GridPart):
 
         Returns None if a cut lies inside a coarse cell, or a box is thinner than `layers`.
         """
-        if self.across is None:
+        if self.comm is None:
             return super().coarser(layers)
         boxes, grid = self.decomposition.coarser((2, 2, self.dimension - 1)), self.grid
         if boxes is None or any(min(boxes.parts[axis]) < layers for axis in boxes.cut_axes):

@@ -139,7 +139,9 @@ class Watchdog:
         self._main = threading.main_thread().ident
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         # Of each rank: first heartbeat without progress, last one, its age in beats.
-        self._seen: dict[int, tuple[HeartbeatMessages | None, HeartbeatMessages | None, int]] = {}
+        self._observed: dict[
+            int, tuple[HeartbeatMessages | None, HeartbeatMessages | None, int]
+        ] = {}
 
     def __enter__(self) -> Self:
         if self._limit and self._ranks.size > 1:
@@ -176,7 +178,7 @@ class Watchdog:
             beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now
             if count != self._watched.count:
                 count, idle = self._watched.count, 0.0
-            mine = HeartbeatMessages(
+            own_message = HeartbeatMessages(
                 beat,
                 count,
                 self._watched.name,
@@ -188,32 +190,32 @@ class Watchdog:
                     return
                 # If the disk accepts no file, the other ranks report this one as silent.
                 with suppress(OSError):
-                    self._board.write(self._ranks.rank, mine)
+                    self._board.write(self._ranks.rank, own_message)
             if idle < self._limit + min(self._ranks.rank, FIRST) * self._beat:
-                self._seen.clear()
-            elif text := self._look(mine):
+                self._observed.clear()
+            elif text := self._look(own_message):
                 threading.Timer(GRACE, os._exit, [1]).start()
                 self._board.clear(range(self._ranks.size))
                 self._end(f"{text}\nall ranks are aborted: --rank-timeout {self._limit:g}")
                 return
 
-    def _look(self, mine: HeartbeatMessages) -> str:
+    def _look(self, own_message: HeartbeatMessages) -> str:
         """Return the error message; "" while ranks make progress.
 
         It is also "" until two different heartbeats of each rank, or none for long, show that it
         does not.
         """
         # A rank that computes waits for no other rank.
-        patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)
-        posts: dict[int, HeartbeatMessages | None] = {self._ranks.rank: mine}
+        patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if own_message.name else BEATS)
+        posts: dict[int, HeartbeatMessages | None] = {self._ranks.rank: own_message}
         certain = True
         for rank in (rank for rank in range(self._ranks.size) if rank != self._ranks.rank):
             post = self._board.read(rank)
-            first, last, age = self._seen.get(rank, (post, post, 0))
+            first, last, age = self._observed.get(rank, (post, post, 0))
             if post and first and post.count != first.count:
                 first = post  # the rank makes progress
             age = 0 if post and last and post.beat != last.beat else age + 1
-            self._seen[rank] = first or post, post or last, age
+            self._observed[rank] = first or post, post or last, age
             posts[rank] = None if age > patience else post or last
             certain = certain and (
                 age > patience
@@ -259,15 +261,15 @@ def place_of(frame: FrameType | None) -> str:
 
     Also the line of the module that it has called.
     """
-    found = list[str]()
+    places = list[str]()
     while frame is not None:
         name, line = str(frame.f_globals.get("__name__", "")), frame.f_lineno
-        if name not in PASSING and (name.startswith(OWN) or not found):
-            found.append(f"{name}:{line}")
+        if name not in PASSING and (name.startswith(OWN) or not places):
+            places.append(f"{name}:{line}")
             if name.startswith(OWN):
                 break
         frame = frame.f_back
-    return " from ".join(found) or "its end"
+    return " from ".join(places) or "its end"
 
 
 def _named(ranks: Sequence[int]) -> str:

@@ -84,7 +84,7 @@ class VectorCopies:
         """
         values = v.getArray(readonly=True)  # PETSc counts accesses: this one ends with the array
         ENTER.bind(
-            self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale
+            self._rows, v=self._view(values, 0), d=self.stencil.d, x=field, scale=scale
         ).launch()
 
     def leave(
@@ -96,14 +96,14 @@ class VectorCopies:
         """
         given = None if others is None else others.getArray(readonly=True)
         values = v.getArray()
-        seen, target = None if given is None else self._seen(given, 0), self._seen(values, 1)
+        seen, target = None if given is None else self._view(given, 0), self._view(values, 1)
         LEAVE.bind(
             self._rows, x=field, d=self.stencil.d, others=seen, v=target, scale=scale
         ).launch()
         if self._staging:
             values[:] = target.numpy()
 
-    def _seen(self, values: np.ndarray, buffer: int) -> DeviceArray:
+    def _view(self, values: np.ndarray, buffer: int) -> DeviceArray:
         """Return a vector's memory on the device: itself on the CPU, a copy on a GPU."""
         if not self._staging:
             return wp.array(
@@ -242,8 +242,8 @@ class PetscGrid:
         # Objects that ranks share are destroyed when all ranks have released them and PETSc
         # collects garbage.
         petsc().garbage_cleanup(comm)
-        self._kept: list[PETSc.Object] = []
-        weakref.finalize(self, _let_go, self._kept).atexit = False
+        self._keep_alive: list[PETSc.Object] = []
+        weakref.finalize(self, _release, self._keep_alive).atexit = False
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=False, settings=cycle)
         finest = self.hierarchy.finest.stencil
         self.copies = VectorCopies(finest, comm)
@@ -304,11 +304,11 @@ class PetscGrid:
         remaining objects after Python has ended, and must not destroy these.
         """
         thing.incRef()
-        self._kept.append(thing)
+        self._keep_alive.append(thing)
         return thing
 
 
-def _let_go(kept: list[PETSc.Object]) -> None:
+def _release(kept: list[PETSc.Object]) -> None:
     """Make PETSc destroy objects that are no longer referenced."""
     for thing in kept:
         thing.decRef()

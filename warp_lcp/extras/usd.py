@@ -39,7 +39,7 @@ def export_run(
     show: Show | None = None,
     first: int | None = None,
     last: int | None = None,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Iterator[int]:
     """Write frames of a run into a USD file; yield the number of each written frame.
 
@@ -52,7 +52,7 @@ def export_run(
         show: part of the material to write; see `Recording`.
         first: number of the first frame. Default: that of the run.
         last: number of the last frame.
-        told: called with the number of written frames, and the total number.
+        on_progress: called with the number of written frames, and the total number.
 
     Raises:
         RenderError: USD is missing, there are no such frames, or the file cannot be written.
@@ -85,10 +85,10 @@ def export_run(
         make_folder(file.parent)
         with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
             stage = UsdStage(Path(scratch) / "frames.usdc", recording, numbers)
-            told(0, len(numbers))
+            on_progress(0, len(numbers))
             for done, number in enumerate(numbers, 1):
                 stage.add(number)
-                told(done, len(numbers))
+                on_progress(done, len(numbers))
                 yield number
             whole = stage.saved_as(suffix)
             with replacing_by_name(file) as temporary:
@@ -222,13 +222,13 @@ class UsdStage:
         """Place rigid bodies; each shape is stored once, relative to its center."""
         of_point = np.asarray(bodies.fields["body"]).ravel()
         for body in np.unique(of_point):
-            own = of_point == body
-            middle = bodies.points[own].mean(axis=0)
-            points = bodies.points[own] - middle
+            of_body = of_point == body
+            middle = bodies.points[of_body].mean(axis=0)
+            points = bodies.points[of_body] - middle
             if body not in self._bodies:
                 shape = self._shape(f"body_{body}", BODY_COLORS[body % len(BODY_COLORS)])
-                corners = bodies.corners[own[bodies.corners[:, 0]]]
-                self._set_shape(shape, points, (np.cumsum(own) - 1)[corners], self._always)
+                corners = bodies.corners[of_body[bodies.corners[:, 0]]]
+                self._set_shape(shape, points, (np.cumsum(of_body) - 1)[corners], self._always)
                 self._bodies[body] = points, shape.AddTransformOp()
             at_first, place = self._bodies[body]
             place.Set(

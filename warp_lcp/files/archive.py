@@ -197,7 +197,9 @@ class Archive:
             most = info.compress_size * (
                 DEFLATED if info.compress_type == zipfile.ZIP_DEFLATED else 1
             )
-            check_claim(f"{name!r} of {info.file_size} bytes", 0, stored=info.file_size, held=most)
+            check_claim(
+                f"{name!r} of {info.file_size} bytes", 0, stored=info.file_size, available=most
+            )
 
     def _header(self, info: zipfile.ZipInfo) -> Header:
         """Read the header of an array, and compare it with the member's size."""

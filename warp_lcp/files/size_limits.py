@@ -23,7 +23,7 @@ class ClaimError(ValueError):
 
 
 def check_claim(
-    what: str, needed: int, *, stored: int | None = None, held: int | None = None
+    what: str, needed: int, *, stored: int | None = None, available: int | None = None
 ) -> None:
     """Raise an error if a size exceeds the file or the free memory.
 
@@ -34,15 +34,17 @@ def check_claim(
         needed: memory for reading it [bytes].
         stored: its least size in the file [bytes]; None if a file may omit it, as the zeros of a
             sparse matrix.
-        held: bytes of the file available for it.
+        available: bytes of the file available for it.
 
     Raises:
         ClaimError: the size is negative, larger than the file, or larger than the free memory.
     """
     if needed < 0:
         raise ClaimError(f"{what}: a size must be >= 0")
-    if stored is not None and held is not None and stored > held:
-        raise ClaimError(f"{what}: these take {_bytes(stored)}, and the file has {_bytes(held)}")
+    if stored is not None and available is not None and stored > available:
+        raise ClaimError(
+            f"{what}: these take {_bytes(stored)}, and the file has {_bytes(available)}"
+        )
     free = free_host_memory()
     if free is not None and needed > free:
         raise ClaimError(

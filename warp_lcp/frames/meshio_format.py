@@ -272,22 +272,22 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
         _sample(kind, dimension, round(SAMPLE ** (1.0 / dimension))),
         _sample(kind, dimension, 0),
     )
-    support, why, said = None, "", io.StringIO()
+    support, why, captured = None, "", io.StringIO()
     with (
         tempfile.TemporaryDirectory() as folder,
-        contextlib.redirect_stderr(said),
-        contextlib.redirect_stdout(said),
+        contextlib.redirect_stderr(captured),
+        contextlib.redirect_stdout(captured),
     ):
         path = Path(folder) / f"sample.{SUFFIXES[name]}"
         for dress in Dress:
             if support and dress is Dress.BARE:
                 break
-            said.truncate(said.seek(0))
+            captured.truncate(captured.seek(0))
             try:
-                if not _comes_back(path, sample, name, dress):
-                    why = why or said.getvalue()
+                if not _round_trips(path, sample, name, dress):
+                    why = why or captured.getvalue()
                     continue
-                warns, size = bool(said.getvalue()), path.stat().st_size / vtu_bytes(sample)
+                warns, size = bool(captured.getvalue()), path.stat().st_size / vtu_bytes(sample)
             except _faults() as error:
                 why = why or (
                     f"needs {error.name}" if isinstance(error, ModuleNotFoundError) else str(error)
@@ -295,14 +295,14 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
                 continue
             empty = False
             with contextlib.suppress(*_faults()):
-                empty = _comes_back(path, none, name, dress)
+                empty = _round_trips(path, none, name, dress)
             support = support or Holds(dress, empty, size)
             if not warns:  # else meshio would warn at every frame; another conversion is tried
                 return Holds(dress, empty, size)
     return support or Holds(None, why=why)
 
 
-def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dress) -> bool:
+def _round_trips(path: Path, part: Points | Cells | Surface, name: str, dress: Dress) -> bool:
     """Return whether a part is unchanged after writing and reading.
 
     That is, its points to float32, its cells, and its fields unless bare.

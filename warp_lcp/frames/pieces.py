@@ -141,7 +141,7 @@ def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
     ):
         raise ValueError("its pieces have different fields")
     starts = np.cumsum([0, *(len(mesh.points) for mesh in filled)])
-    whole = Mesh(
+    joined = Mesh(
         np.concatenate([mesh.points for mesh in filled]),
         np.concatenate(
             [mesh.corners + start for mesh, start in zip(filled, starts[:-1], strict=True)]
@@ -149,7 +149,7 @@ def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
         {name: np.concatenate([mesh.fields[name] for mesh in filled]) for name in first.fields},
         first.on_cells,
     )
-    return _sewn(whole) if len(filled) > 1 and whole.corners.shape[1] in SURFACES else whole
+    return _sewn(joined) if len(filled) > 1 and joined.corners.shape[1] in SURFACES else joined
 
 
 def one_grid(parts: Sequence[Cells]) -> Cells:

@@ -211,7 +211,7 @@ def _dataset(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
         f"{name} of {size} bytes",
         size,
         stored=-(-size // DEFLATED) if member.chunks else size,
-        held=stored,
+        available=stored,
     )
     return member
 

@@ -59,9 +59,9 @@ def planted(
         raise ValueError(f"A has shape {A.shape}: expected (n, n) with n >= 1")
     n, S = A.shape[0], plant.size
     equation = rng.random(n) < plant.mixed
-    held = (rng.random(n) < plant.active) & ~equation
-    at_upper = held & (rng.random(n) < 0.5) & plant.boxed
-    weak = held & (rng.random(n) < plant.weak)
+    at_bound = (rng.random(n) < plant.active) & ~equation
+    at_upper = at_bound & (rng.random(n) < 0.5) & plant.boxed
+    weak = at_bound & (rng.random(n) < plant.weak)
     lower = np.where(equation, -np.inf, -S * rng.random(n) if plant.boxed else 0.0)
     upper = np.where(
         equation | (not plant.boxed),
@@ -75,9 +75,9 @@ def planted(
             inside - 0.55 * S,
             lower + (0.9 * inside / S * (upper - lower) if plant.boxed else inside),
         )
-    x = np.where(held, np.where(at_upper, upper, lower), offset)
+    x = np.where(at_bound, np.where(at_upper, upper, lower), offset)
     push = rng.uniform(0.1, 1.0, n) * S * float(np.abs(A.diagonal()).mean() or 1.0)
-    y = np.where(held & ~weak, np.where(at_upper, -push, push), 0.0)
+    y = np.where(at_bound & ~weak, np.where(at_upper, -push, push), 0.0)
     added = (
         {"solvable"}
         | ({"boxed"} if plant.boxed else set())

@@ -89,7 +89,7 @@ def _bearings() -> list[Published]:
         )
         for nx, ny, e, printed in rows
     ]
-    known = {
+    published = {
         4: "-0.22474",
         10: "-0.17896",
         23: "-0.18005",
@@ -98,7 +98,7 @@ def _bearings() -> list[Published]:
         100: "-0.18057",
         125: "-0.18058",
     }
-    for n, printed in known.items():
+    for n, printed in published.items():
         figures.append(
             Published(
                 "Journal bearing",
@@ -255,7 +255,7 @@ def _ball_errors(n: int) -> np.ndarray:
 
 def _balls() -> list[Published]:
     """Return the published figures of the ball obstacle problem."""
-    known = {
+    published = {
         5: ("4.531e-02", "1.635e-01"),
         9: ("3.076e-03", "1.334e-02"),
         17: ("2.707e-03", "1.428e-02"),
@@ -269,7 +269,7 @@ def _balls() -> list[Published]:
             PETSC,
             partial(_taken, take, _ball_errors, n),
         )
-        for n, values in known.items()
+        for n, values in published.items()
         for norm, take, printed in zip(NORMS, NORMS.values(), values, strict=True)
     ]
 

@@ -201,7 +201,7 @@ def _checked(result: SolveResult, allow_inexact: bool) -> LCP:
             "result is that of a problem with bounds that are affine in x: gradients need numbers "
             "or fields"
         )
-    if problem.layout.across is not None:
+    if problem.layout.comm is not None:
         raise ValueError("result belongs to a problem on several ranks: gradients need one process")
     if not (result or allow_inexact):
         raise ValueError(

@@ -56,16 +56,16 @@ class ActiveRows:
         if other._now is None:
             return
         shift = np.array(other.grid.origin) - self.grid.origin
-        made = np.zeros(self._shape, dtype=np.uint8)
-        into, of = [], []
+        marks = np.zeros(self._shape, dtype=np.uint8)
+        into, source = [], []
         for steps, mine, theirs in zip(
-            (shift[2], shift[1], shift[0] // SEGMENT), made.shape, other._now.shape, strict=True
+            (shift[2], shift[1], shift[0] // SEGMENT), marks.shape, other._now.shape, strict=True
         ):
             first, last = max(steps, 0), min(mine, theirs + steps)
             into.append(slice(first, max(last, first)))
-            of.append(slice(first - steps, max(last, first) - steps))
-        made[tuple(into)] = other._now[tuple(of)]
-        self._step, self._now = other._step, made
+            source.append(slice(first - steps, max(last, first) - steps))
+        marks[tuple(into)] = other._now[tuple(source)]
+        self._step, self._now = other._step, marks
 
     def window(self, box: Window, particles: Particles, grow: int, step: int) -> Window:
         """Return the window of cells that a step must visit.
@@ -76,8 +76,8 @@ class ActiveRows:
             grow: cells that they reach beyond their own.
             step: number of the step; cells that the previous step reached are included.
         """
-        whole = math.prod(end - start for start, end in zip(box.low, box.high, strict=True))
-        if not self.active or whole < LEAST_CELLS or step < self._rest:
+        cell_count = math.prod(end - start for start, end in zip(box.low, box.high, strict=True))
+        if not self.active or cell_count < LEAST_CELLS or step < self._rest:
             self._step, self._now, self._before = step, None, None
             return box
         near = self._near(box, particles, grow)
@@ -87,7 +87,7 @@ class ActiveRows:
         if self._before is None:
             return box
         both = self._now | self._before
-        if SEGMENT * np.count_nonzero(both) > MOST * whole:
+        if SEGMENT * np.count_nonzero(both) > MOST * cell_count:
             self._rest = step + REST
             return box
         return replace(box, near=both)

@@ -368,7 +368,7 @@ class Barriers:
         components.u, components.v, components.w = three_components(velocity)
         marks.u, marks.v, marks.w = three_components(known)
         for axis, (number, result) in enumerate(zip(self.number, self._scratch, strict=True)):
-            given = [
+            kernel_args = [
                 self._barrier,
                 axis,
                 number,
@@ -382,7 +382,7 @@ class Barriers:
                 released,
                 result,
             ]
-            window.launch(velocity_kernels.constrain_kernel, given)
+            window.launch(velocity_kernels.constrain_kernel, kernel_args)
         for number, result, field, mark in zip(
             self.number, self._scratch, velocity, known, strict=True
         ):

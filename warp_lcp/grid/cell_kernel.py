@@ -224,19 +224,19 @@ def _made(
     Warp gets the resulting source text, and hashes it.
     """
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    made = tree.body[0]
+    definition = tree.body[0]
     typed = [
         p for p in inspect.signature(function).parameters.values() if p.annotation is not p.empty
     ]
     task = ast.parse(before).body
     if task and isinstance(task[-1], ast.For):
-        task[-1].body = made.body
+        task[-1].body = definition.body
     else:
-        task += made.body
+        task += definition.body
     opened = ast.parse(loop).body
     opened[-1].body = task
     name, kind = first
-    made.body, made.decorator_list, made.args.args = (
+    definition.body, definition.decorator_list, definition.args.args = (
         opened,
         [],
         [ast.arg(name), *(ast.arg(p.name) for p in typed)],

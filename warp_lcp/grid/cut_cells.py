@@ -389,8 +389,10 @@ class CutCells:
         A mesh takes microseconds a node, so several processes share its nodes; then this is
         collective.
         """
-        placed = {run: self._placed(run) for run in self._runs if isinstance(run, int)}
-        meshes = {run: solid for run, solid in placed.items() if isinstance(solid, TriangleMesh)}
+        geometries = {run: self._placed(run) for run in self._runs if isinstance(run, int)}
+        meshes = {
+            run: solid for run, solid in geometries.items() if isinstance(solid, TriangleMesh)
+        }
         layers = measure_together(self._sampler, meshes) if self.grid.part.ranks.size > 1 else {}
         for run in self._runs:
             if not isinstance(run, int):
@@ -398,7 +400,7 @@ class CutCells:
             elif run in layers:
                 enter_layers(self._nodes, self._moving[run], layers[run])
             else:
-                self._sampler.enter(self._nodes, self._moving[run], placed[run])
+                self._sampler.enter(self._nodes, self._moving[run], geometries[run])
 
     def _join(self) -> None:
         """Fill distances and marks beyond cut periodic sides from the ranks there."""

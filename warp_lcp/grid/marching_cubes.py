@@ -58,14 +58,14 @@ def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Ed
     Each goes from the edge before a run to the edge after it.
     """
     inside = [bool(case >> corner & 1) for corner in face]
-    found = []
+    segments = []
     for n in range(4):
         if inside[n] and not inside[n - 1]:
             last = n
             while inside[(last + 1) % 4]:
                 last = (last + 1) % 4
-            found.append((_edge(face[n - 1], face[n]), _edge(face[last], face[(last + 1) % 4])))
-    return found
+            segments.append((_edge(face[n - 1], face[n]), _edge(face[last], face[(last + 1) % 4])))
+    return segments
 
 
 def _loops(case: int) -> list[Loop]:
@@ -116,13 +116,13 @@ def _cut(loop: Loop) -> Cut | None:
         for part in (loop[: middle + 1], loop[middle:]):
             if len(part) < 3:
                 continue
-            found = None if _on_one_face(part[0], part[-1]) else _cut(part)
-            if found is None:
+            best_cut = None if _on_one_face(part[0], part[-1]) else _cut(part)
+            if best_cut is None:
                 break
             parts.append(
                 (
-                    found[0] + float(np.linalg.norm(_midpoint(part[0]) - _midpoint(part[-1]))),
-                    found[1],
+                    best_cut[0] + float(np.linalg.norm(_midpoint(part[0]) - _midpoint(part[-1]))),
+                    best_cut[1],
                 )
             )
         else:
@@ -226,7 +226,7 @@ class MarchingCubes:
         )
         # Cells between the centers of cells and of their upper neighbors.
         cells = Window(low, high, device)
-        owned, made = self._counted(cells, phi)
+        owned, triangle_counts = self._counted(cells, phi)
         points = wp.empty(_total(owned[1]), dtype=wp.vec3, device=device)
         most_x, most_y, most_z = grid.domain_counts
         cells.run(
@@ -242,7 +242,7 @@ class MarchingCubes:
             most_y=most_y,
             most_z=most_z,
         )
-        return DeviceMesh(points, self._corners(cells, phi, number, made))
+        return DeviceMesh(points, self._corners(cells, phi, number, triangle_counts))
 
     def corners(self, phi: wp.array, number: wp.array, cells: Window) -> wp.array:
         """Return the corners of the last surface that lie in given cells.
@@ -261,7 +261,9 @@ class MarchingCubes:
 
         Each count comes with its inclusive prefix sums over rows.
         """
-        owned, made = (wp.empty(cells.rows, dtype=wp.int32, device=cells.device) for _ in range(2))
+        owned, triangle_counts = (
+            wp.empty(cells.rows, dtype=wp.int32, device=cells.device) for _ in range(2)
+        )
         cells.run(
             COUNT,
             whole=True,
@@ -269,27 +271,32 @@ class MarchingCubes:
             planes=self.grid.planes,
             table=self._table,
             owned=owned,
-            made=made,
+            made=triangle_counts,
         )
         ends = [
-            wp.empty(count.size, dtype=wp.int32, device=cells.device) for count in (owned, made)
+            wp.empty(count.size, dtype=wp.int32, device=cells.device)
+            for count in (owned, triangle_counts)
         ]
-        for count, end in zip((owned, made), ends, strict=True):
+        for count, end in zip((owned, triangle_counts), ends, strict=True):
             wp.utils.array_scan(count.flatten(), end, inclusive=True)
-        return (owned, ends[0]), (made, ends[1])
+        return (owned, ends[0]), (triangle_counts, ends[1])
 
     def _corners(
-        self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]
+        self,
+        cells: Window,
+        phi: wp.array,
+        number: wp.array,
+        triangle_counts: tuple[wp.array, wp.array],
     ) -> wp.array:
         """Return the triangles of cells, given the number of them in each row."""
         corners = wp.empty(
-            (_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device
+            (_total(triangle_counts[1]), self.grid.dimension), dtype=wp.int32, device=cells.device
         )
         cells.run(
             CORNERS,
             whole=True,
-            counts=made[0],
-            ends=made[1],
+            counts=triangle_counts[0],
+            ends=triangle_counts[1],
             phi=phi,
             planes=self.grid.planes,
             number=number,

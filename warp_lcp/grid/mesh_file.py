@@ -298,7 +298,7 @@ class _Records:
 
     def lists(self, element: _Element, wanted: int) -> list[Sequence[int] | np.ndarray]:
         """Return a list property of each record, none if `wanted` is -1."""
-        found: list[Sequence[int] | np.ndarray] = []
+        records: list[Sequence[int] | np.ndarray] = []
         for _ in range(element.count):
             for number, (_, kind, length) in enumerate(element.properties):
                 count = _index(self._take(length, 1, element)[0]) if length else 1
@@ -308,8 +308,8 @@ class _Records:
                 if number == wanted:
                     if not isinstance(entries, np.ndarray):
                         entries = np.array([_index(word) for word in entries], dtype=np.int64)
-                    found.append(entries)
-        return found
+                    records.append(entries)
+        return records
 
     @property
     def _size(self) -> int:

@@ -116,14 +116,14 @@ def smooth(
         Marks of the points that are fixed, uint8, shape (points,).
     """
     device, count = lattice.device, len(mesh.points)
-    held = wp.zeros(count, dtype=wp.uint8, device=device)
+    flags = wp.zeros(count, dtype=wp.uint8, device=device)
     if not count:
-        return held
+        return flags
     ends = [wp.vec3(*numbers) for numbers in (lattice.origin, lattice.domain_counts)]
     wp.launch(
         hold_kernel,
         count,
-        [lattice.planes, lattice.spacing, ends[0], mesh.points, room, ends[1], held],
+        [lattice.planes, lattice.spacing, ends[0], mesh.points, room, ends[1], flags],
         device=device,
     )
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
@@ -135,6 +135,6 @@ def smooth(
         sums.zero_()
         SEE_NEIGHBORS.bind(rows, corners=mesh.corners, points=mesh.points, sums=sums).launch()
         wp.launch(
-            move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device
+            move_kernel, count, [share, most, sums, flags, size, start, mesh.points], device=device
         )
-    return held
+    return flags

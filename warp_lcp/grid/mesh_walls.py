@@ -110,10 +110,10 @@ def fit_to_walls(
     Returns:
         Points [cells], shape (n, 3).
     """
-    own = np.flatnonzero(on_solid)
-    if not len(own):
+    on_walls = np.flatnonzero(on_solid)
+    if not len(on_walls):
         return points
-    start, free = points[own].astype(np.float64), ~fixed[own]
+    start, free = points[on_walls].astype(np.float64), ~fixed[on_walls]
     x, gradient, d = start.copy(), np.zeros_like(start), np.zeros(len(start))
     # The second pass starts within rounding of the wall, so that the gradient is that at the wall.
     for _ in range(2):
@@ -127,9 +127,9 @@ def fit_to_walls(
     known = np.isfinite(d) & (length > SHARP)  # shorter: the differences reach across an edge
     normal = np.where(known[:, None], gradient / np.maximum(length, 1e-9)[:, None], 0.0)
     number = np.full(len(points), -1)
-    number[own[known]] = np.flatnonzero(known)
+    number[on_walls[known]] = np.flatnonzero(known)
     result = points.astype(np.float64)
-    result[own] = _sharpened(x, normal, free, number[corners], walls)
+    result[on_walls] = _sharpened(x, normal, free, number[corners], walls)
     return result
 
 

@@ -334,8 +334,8 @@ class NodeSampler:
             return
         if not listed:
             self.list_flat_cells(nodes, node_window(self.grid, low, high))
-        found = int(self._listed.numpy()[0])
-        if found > len(self._list):
+        node_count = int(self._listed.numpy()[0])
+        if node_count > len(self._list):
             longest = int(np.argmax(np.subtract(high, low)))
             middle = (low[longest] + high[longest]) // 2
             for part in (slice(None, middle), slice(middle, None)):
@@ -345,16 +345,18 @@ class NodeSampler:
                     part.stop or end[longest],
                 )
                 self.look_at_centers(nodes, solids, begin, end, marks)
-        elif found:
+        elif node_count:
             block, listed = (
                 self._block(np.array(low), np.array(high), offset=0.5),
-                self._list[:found],
+                self._list[:node_count],
             )
             for order, geometry in enumerate(solids()):
-                distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
+                distances = self._measure(
+                    geometry, node_count, kernels.listed_points, [block, listed]
+                )
                 wp.launch(
                     kernels.mark_listed,
-                    found,
+                    node_count,
                     [listed, distances, order == 0, marks],
                     device=self.grid.device,
                 )

@@ -228,7 +228,7 @@ class GridPart:
         self.grid = grid
 
     @property
-    def across(self) -> Communicator | None:
+    def comm(self) -> Communicator | None:
         """The communicator that reductions use; None if there is one process."""
         return None
 

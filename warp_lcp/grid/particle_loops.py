@@ -131,7 +131,7 @@ def scatter(
     touched: wp.array[wp.int32] | None,
     *structs: "DataclassInstance",
     runs: wp.array[wp.int32] | None = None,
-    **given: object,
+    **kernel_args: object,
 ) -> None:
     """Launch a pass in which particles add to a field.
 
@@ -145,7 +145,7 @@ def scatter(
         touched: result of `touched_planes` for them.
         runs: `runs` of `Particles`.
         structs: further arguments of the pass, see `StencilKernel.bind`.
-        given: likewise.
+        kernel_args: likewise.
     """
     count, shares = len(position), 1
     listed = list_of(position) if is_recording() else None
@@ -159,15 +159,15 @@ def scatter(
         planes = grid.shape[3 - grid.dimension]
         shares = 1 if touched is None else min(SHARES * get_threads(), -(-planes // LEAST_PLANES))
         rows = Rows.listed(shares, grid.device, 1, weight=1 << 20)  # a share is a piece
-    given |= {
+    kernel_args |= {
         "touched": touched,
         "runs": runs,
         "count": number,
         "chunk": CPU_GRAIN,
         "shares": shares,
     }
-    given["position"] = position
-    passed.bind_arguments(rows, (grid.placement, *structs), given).launch()
+    kernel_args["position"] = position
+    passed.bind_arguments(rows, (grid.placement, *structs), kernel_args).launch()
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +201,7 @@ def launch(
     count: int,
     grid: "StaggeredGrid",
     *structs: "DataclassInstance",
-    **given: object,
+    **kernel_args: object,
 ) -> None:
     """Launch a pass over the first particles of a list.
 
@@ -211,9 +211,9 @@ def launch(
     rows, listed = chunks(count, grid.device), None
     if is_recording():
         members = [getattr(s, f.name) for s in structs for f in fields(s)]
-        found = (list_of(a) for a in (*given.values(), *members))
+        found = (list_of(a) for a in (*kernel_args.values(), *members))
         listed = next((one for one in found if one is not None), None)
     if listed is not None:
         rows = replace(rows, memory=listed.rows)
     if count or listed is not None:
-        passed.bind_arguments(rows, (grid.placement, *structs), given).launch()
+        passed.bind_arguments(rows, (grid.placement, *structs), kernel_args).launch()

@@ -214,12 +214,12 @@ class Particles:
             self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
         else:
             self._partials = wp.zeros(columns * THREADS, dtype=wp.float64, device=device)
-            self._found, self._places = DeviceScalar(device, columns), Scalar()
+            self._device_totals, self._places = DeviceScalar(device, columns), Scalar()
             self._sort_rows, self._sort_pieces = RowsMemory(), Scalar()
             self._counts = wp.zeros(0, dtype=wp.int32, device=device)
         self._last: ParticleTotals | None = None
         self._totals_launched = False  # whether a GPU has the sums of the current particles
-        self._known: ParticleTotals | None = None  # current sums
+        self._current_totals: ParticleTotals | None = None  # current sums
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
         self.exchange = grid.part.exchange_of(self)
@@ -436,7 +436,12 @@ class Particles:
 
     def resize(self, count: int) -> None:
         """Set the number of particles; new ones have undefined values."""
-        before, self.count, self._known, self._totals_launched = self.count, count, None, False
+        before, self.count, self._current_totals, self._totals_launched = (
+            self.count,
+            count,
+            None,
+            False,
+        )
         if count > self._capacity:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
@@ -600,8 +605,8 @@ class Particles:
         return self.exchange.joined_totals(self._own_totals())
 
     def _own_totals(self) -> ParticleTotals:
-        if self._known is not None:
-            return self._known
+        if self._current_totals is not None:
+            return self._current_totals
         if self.count == 0:
             return ParticleTotals()
         if self._tally is not None:
@@ -611,8 +616,8 @@ class Particles:
             total = self._tally.read()
         else:
             self._totals.run()
-            total = self._found.numpy().copy()
-        self._last = found = ParticleTotals(
+            total = self._device_totals.numpy().copy()
+        self._last = totals = ParticleTotals(
             count=self.count,
             mean_square_speed=float(total[0]) / self.count,
             center=total[1:4] / self.count,
@@ -623,7 +628,7 @@ class Particles:
             high=total[10:13],
             low=-total[13:16],
         )
-        return found
+        return totals
 
     def _rows_of_totals(self) -> Rows:
         """Return the division of the particles into rows for sums."""
@@ -650,7 +655,7 @@ class Particles:
         kernels.ADD_IN_ORDER.bind(
             columns,
             partials=self._partials,
-            results=self._found.array,
+            results=self._device_totals.array,
             places_of_sums=self._places,
             sums_=len(kernels.TOTAL.sums),
         ).launch()
@@ -660,7 +665,7 @@ class Particles:
 
         They are launched again if particles come or go before.
         """
-        if self._tally is not None and self._known is None and self.count:
+        if self._tally is not None and self._current_totals is None and self.count:
             self._totals.run()
             self._tally.changed()
             self._totals_launched = True
@@ -672,7 +677,9 @@ class Particles:
 
         On a GPU, code that changes them between steps must reset this.
         """
-        self._known = self._last if stay and self.count and self.grid.device.is_cuda else None
+        self._current_totals = (
+            self._last if stay and self.count and self.grid.device.is_cuda else None
+        )
 
     def cells_of(self, positions: np.ndarray) -> np.ndarray:
         """Return the interior cells (x, y, z), counted from 0, of positions [m].
@@ -753,24 +760,32 @@ def sort_keys(
     """
     device = counts.device
     rounds, each = digits_of(bits)
-    (here, there), (moved_to, moved_from), before = keys, order[::-1], None
+    (source_keys, sorted_keys), (moved_to, moved_from), before = keys, order[::-1], None
     for shift in range(0, rounds * each, each):
         digits = 1 << each
-        kernels.SORT_COUNT.bind(rows, key=here, counts=counts, digits=digits, shift=shift).launch()
+        kernels.SORT_COUNT.bind(
+            rows, key=source_keys, counts=counts, digits=digits, shift=shift
+        ).launch()
         kernels.SORT_BEGIN.bind(
             Rows.entries(1, device), counts=counts, digits=digits, pieces=pieces
         ).launch()
         kernels.SORT_PLACE.bind(
             rows,
-            key=here,
+            key=source_keys,
             order=before,
-            sorted=there,
+            sorted=sorted_keys,
             moved=moved_to,
             counts=counts,
             digits=digits,
             shift=shift,
         ).launch()
-        here, there, before, moved_to, moved_from = there, here, moved_to, moved_from, moved_to
+        source_keys, sorted_keys, before, moved_to, moved_from = (
+            sorted_keys,
+            source_keys,
+            moved_to,
+            moved_from,
+            moved_to,
+        )
 
 
 def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:
@@ -799,9 +814,9 @@ def lattice(
         Points [m], shape (n, 3), z = 0 in 2-D.
     """
     dimension, spacing = grid.dimension, grid.spacing / per_axis
-    whole = np.array(grid.domain_counts[:2]) * per_axis
+    site_counts = np.array(grid.domain_counts[:2]) * per_axis
     low = np.maximum(np.array(grid.origin[:2]) - 1, 0) * per_axis
-    high = np.minimum((np.array(grid.origin[:2]) + grid.counts[:2] + 1) * per_axis, whole)
+    high = np.minimum((np.array(grid.origin[:2]) + grid.counts[:2] + 1) * per_axis, site_counts)
     x, y = (np.arange(first, last) for first, last in zip(low, high, strict=True))
     z = (
         np.arange(plane * per_axis, (plane + 1) * per_axis)
@@ -812,8 +827,8 @@ def lattice(
     for number, layer in enumerate(z):
         drawn = np.random.PCG64(random_seed)
         # Skip the random numbers of the points before.
-        drawn.advance(int((layer * whole[1] + low[1]) * whole[0]) * dimension)
-        rows = np.random.Generator(drawn).random((len(y), whole[0], dimension))
+        drawn.advance(int((layer * site_counts[1] + low[1]) * site_counts[0]) * dimension)
+        rows = np.random.Generator(drawn).random((len(y), site_counts[0], dimension))
         moved[number] = rows[:, low[0] : high[0]]
     Z, Y, X = np.meshgrid(
         z + 0.5 if dimension == 3 else np.zeros(1), y + 0.5, x + 0.5, indexing="ij"

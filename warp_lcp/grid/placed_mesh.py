@@ -257,14 +257,14 @@ def tables_of(
     grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]
 ) -> list[ShapeTable | PlacedMesh] | None:
     """Return tables of standing solids, in order; None if one fits in no table."""
-    made: list[ShapeTable | PlacedMesh] = []
+    tables: list[ShapeTable | PlacedMesh] = []
     for number, geometry in solids:
         if ShapeTable.holds(geometry):
-            made.append(ShapeTable(grid, [(number, geometry)], []))
+            tables.append(ShapeTable(grid, [(number, geometry)], []))
         elif isinstance(geometry, TriangleMesh):
-            made.append(PlacedMesh(grid, number, geometry))
+            tables.append(PlacedMesh(grid, number, geometry))
         else:
             return None
-    for table in made:
+    for table in tables:
         table.place(np.eye(3)[None], np.zeros((1, 3)))
-    return made
+    return tables

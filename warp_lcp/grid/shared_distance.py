@@ -42,26 +42,28 @@ def measure_together(
         for key, geometry in geometries.items()
         if (box := nodes_near(domain, geometry)) is not None
     }
-    found: dict[int, list[Layer]] = {key: [] for key in geometries}
+    measured: dict[int, list[Layer]] = {key: [] for key in geometries}
     if not boxes:
-        return found
+        return measured
     layers = {
         key: [layer_of(box, rank, ranks.size) for rank in range(ranks.size)]
         for key, box in boxes.items()
     }
     thickest = {key: of[0].cells for key, of in layers.items()}
-    mine = np.empty(sum(thickest.values()), dtype=np.float32)
+    own_distances = np.empty(sum(thickest.values()), dtype=np.float32)
     first = 0
-    for key, of in layers.items():
-        layer = of[ranks.rank]
-        mine[first : first + layer.cells] = _measure(sampler, geometries[key], layer)
+    for key, rank_layers in layers.items():
+        layer = rank_layers[ranks.rank]
+        own_distances[first : first + layer.cells] = _measure(sampler, geometries[key], layer)
         first += thickest[key]
-    everyone, first = ranks.gather(mine), 0
-    for key, of in layers.items():
-        for layer, distances in zip(of, everyone[:, first : first + thickest[key]], strict=True):
-            found[key].append((layer, distances[: layer.cells].reshape(layer.counts[::-1])))
+    everyone, first = ranks.gather(own_distances), 0
+    for key, rank_layers in layers.items():
+        for layer, distances in zip(
+            rank_layers, everyone[:, first : first + thickest[key]], strict=True
+        ):
+            measured[key].append((layer, distances[: layer.cells].reshape(layer.counts[::-1])))
         first += thickest[key]
-    return found
+    return measured
 
 
 def layer_of(box: tuple[np.ndarray, np.ndarray], rank: int, ranks: int) -> CellBox:
@@ -105,16 +107,16 @@ def enter_layers(nodes: NodeDistances, number: int, layers: list[Layer]) -> None
     for layer, distances in layers:
         common = layer.common(stored)
         if common.cells:
-            inside, here = common.moved(layer.low, -1), common.moved(grid.origin, -1)
-            given = wp.array(
+            inside, local_box = common.moved(layer.low, -1), common.moved(grid.origin, -1)
+            device_distances = wp.array(
                 np.ascontiguousarray(distances[inside.slices]).ravel(),
                 dtype=wp.float32,
                 device=grid.device,
             )
-            block = block_of(here.low, here.high, 1.0, grid.dimension, grid.origin)
+            block = block_of(local_box.low, local_box.high, 1.0, grid.dimension, grid.origin)
             wp.launch(
                 claim_nodes,
-                len(given),
-                [block, given, 0.0, number, nodes.struct],
+                len(device_distances),
+                [block, device_distances, 0.0, number, nodes.struct],
                 device=grid.device,
             )

@@ -190,7 +190,7 @@ class Window(Identified):
         whole: bool = False,
         grouped: bool = False,
         launch: Launch | None = None,
-        **given: object,
+        **kernel_args: object,
     ) -> None:
         """Launch a pass over the box, or record it with `LaunchGraph.launch`.
 
@@ -201,10 +201,10 @@ class Window(Identified):
             grouped: a thread takes `GROUPED_PLANES` planes together on CUDA, if the window is
                 large; of kernels with `plane_group` of `particles.h`.
             launch: the launch function of a launch graph.
-            given: fields and numbers by name.
+            kernel_args: fields and numbers by name.
         """
         rows = self._grouped if grouped else self._whole if whole else self._shared
-        passed.bind_arguments(rows, structs, given).launch(launch)
+        passed.bind_arguments(rows, structs, kernel_args).launch(launch)
 
     def rows_of_sums(self, planes: int) -> Rows:
         """Return the rows of a pass that sums.
@@ -241,12 +241,12 @@ class Window(Identified):
             return Rows.box(self.low, self.high, self.device, cells=self.high[2] - self.low[2])
         return Rows.in_part(self._hulls, self._visited, self.high)
 
-    def clear(self, *given: wp.array) -> None:
+    def clear(self, *arrays: wp.array) -> None:
         """Set fields to 0 in the box, or in its active part.
 
         No memory is allocated for the rest.
         """
-        for array in given:
+        for array in arrays:
             if self.near is None:
                 clear(array)
             else:

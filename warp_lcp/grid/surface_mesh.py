@@ -264,17 +264,17 @@ class SurfaceMesh:
     def _whole_mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the smoothed surface phi = 0 of all lattice cells."""
         mesh = self._cubes.contour(phi, number)
-        held = smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
+        flags = smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
         shapes = (
             self.obstacles.shapes()
             if self.obstacles is not None and self.obstacles.shapes is not None
             else ()
         )
         if shapes and len(mesh.points):
-            self._fit(mesh, held.numpy(), shapes)
+            self._fit(mesh, flags.numpy(), shapes)
         return mesh
 
-    def _fit(self, mesh: DeviceMesh, held: np.ndarray, shapes: Sequence[Geometry]) -> None:
+    def _fit(self, mesh: DeviceMesh, flags: np.ndarray, shapes: Sequence[Geometry]) -> None:
         """Move the points on solids onto the solids' shapes.
 
         Points on a side of the domain move along that side.
@@ -285,7 +285,7 @@ class SurfaceMesh:
         fixed = (place < TOUCHING) | (place > np.array(lattice.domain_counts) - TOUCHING)
         fixed[:, lattice.dimension :] = True
         walls = MeshWalls(shapes, spacing, lattice.dimension, lattice.device)
-        on_solid = (held & ON_SOLID) > 0
+        on_solid = (flags & ON_SOLID) > 0
         fitted = fit_to_walls(points, mesh.corners.numpy(), on_solid, fixed, walls)
         # Along a side a point could leave the domain beyond a corner.
         size = np.asarray(lattice.extent)

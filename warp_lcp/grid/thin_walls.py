@@ -281,7 +281,7 @@ class ThinWalls:
         """
         if len(position) == 0:
             return
-        given = [
+        kernel_args = [
             self.start_of(position),
             position,
             self.shapes,
@@ -293,7 +293,7 @@ class ThinWalls:
         launch_list(
             kernels.stop_kernel,
             len(position),
-            [*given, wp.vec3d(*self.least), wp.vec3d(*self.most)],
+            [*kernel_args, wp.vec3d(*self.least), wp.vec3d(*self.most)],
             device=self.grid.device,
             cost=COST,
         )

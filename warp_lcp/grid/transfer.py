@@ -61,7 +61,7 @@ def transfer_passes(real: type) -> TransferKernels:
     Two forms of the sum over particles, its adjoint `interpolate`, and the division by the weights.
     """
     name = f"warp_lcp.grid.transfer_{real.__name__}"
-    made = functools.partial(
+    make_kernel = functools.partial(
         KERNELS.kernel, compute=real, constants={"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT}
     )
 
@@ -75,9 +75,9 @@ def transfer_passes(real: type) -> TransferKernels:
             field[k, j, i] = real(0.0)
 
     return TransferKernels(
-        scatter=made("grid.transfer.scatter", module=f"grid.transfer_{real.__name__}"),
-        interpolate=made("warp_lcp.grid.transfer.interpolate", module=name),
-        gather_weights=made("warp_lcp.grid.transfer.gather_weights", module=name),
+        scatter=make_kernel("grid.transfer.scatter", module=f"grid.transfer_{real.__name__}"),
+        interpolate=make_kernel("warp_lcp.grid.transfer.interpolate", module=name),
+        gather_weights=make_kernel("warp_lcp.grid.transfer.gather_weights", module=name),
         normalize=normalize,
     )
 

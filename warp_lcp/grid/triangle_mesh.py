@@ -363,13 +363,13 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     triangles = triangles[keep]
     if not len(triangles):
         raise ValueError(f"{name}: all {degenerate} triangles are degenerate (without area)")
-    kept = _without_repeated(triangles)
-    if len(kept) < len(triangles):
-        again = np.setdiff1d(np.arange(len(triangles)), kept)
+    distinct = _without_repeated(triangles)
+    if len(distinct) < len(triangles):
+        again = np.setdiff1d(np.arange(len(triangles)), distinct)
         warnings.append(
             f"{name}: dropped {len(again)} repeated triangles, {_first(vertices[triangles[again]])}"
         )
-        triangles = triangles[kept]
+        triangles = triangles[distinct]
     _check_closed(vertices, triangles, name)
     triangles, flipped = _orient(vertices, triangles, name)
     warnings += flipped

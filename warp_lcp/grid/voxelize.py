@@ -151,15 +151,15 @@ def inside(
     result = np.zeros(len(points), dtype=bool)
     for geometry in geometries:
         bounds = geometry.bounds()
-        wanted = np.flatnonzero(~result) if result.any() else np.arange(len(points))
+        candidates = np.flatnonzero(~result) if result.any() else np.arange(len(points))
         # points often are of one plane
         for axis, low, high in (
             [] if bounds is None else list(zip(range(3), *bounds, strict=True))[::-1]
         ):
-            column = points[wanted, axis]
-            wanted = wanted[(column >= low) & (column <= high)]
-        for first in range(0, len(wanted), CHUNK):
-            part = wanted[first : first + CHUNK]
+            column = points[candidates, axis]
+            candidates = candidates[(column >= low) & (column <= high)]
+        for first in range(0, len(candidates), CHUNK):
+            part = candidates[first : first + CHUNK]
             positions = wp.array(points[part], dtype=wp.vec3, device=device)
             distance = wp.empty(len(part), dtype=wp.float32, device=device)
             geometry.signed_distance(positions, distance)
@@ -261,19 +261,19 @@ def repair_notes(geometry: Geometry, name: str) -> list[str]:
     """
     if not isinstance(geometry, TriangleMesh):
         return []
-    surface, found = geometry.surface, geometry.surface.crossings
+    surface, crossings = geometry.surface, geometry.surface.crossings
     notes = [f"{name}: {warning}" for warning in surface.warnings]
-    if found.place is None:
+    if crossings.place is None:
         return notes
     what = (
-        f"{found.count} of its {len(surface.triangles)} triangles cross others, first"
-        if found.count
+        f"{crossings.count} of its {len(surface.triangles)} triangles cross others, first"
+        if crossings.count
         else "a part lies inside another,"
     )
-    what += f" at {[float(f'{coordinate:.4g}') for coordinate in found.place]}"
-    if found.inverted > INVERTED_SHARE:
+    what += f" at {[float(f'{coordinate:.4g}') for coordinate in crossings.place]}"
+    if crossings.inverted > INVERTED_SHARE:
         raise ValueError(
-            f"{name}: {surface.name}: {what}, and about {found.inverted:.0%} of its surface is "
+            f"{name}: {surface.name}: {what}, and about {crossings.inverted:.0%} of its surface is "
             "inside out there: what that surrounds would "
             "count as outside. Repair the mesh (in Blender: a Remesh modifier; in MeshLab: Remove "
             "Self Intersecting Faces, Close Holes)"

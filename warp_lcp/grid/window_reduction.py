@@ -53,14 +53,14 @@ class WindowTally:
                 Rows.flat(columns, device, serial=True),
             )
 
-    def take(self, window: Window, *structs: DataclassInstance, **given: object) -> None:
+    def take(self, window: Window, *structs: DataclassInstance, **kernel_args: object) -> None:
         """Launch the pass, bound as by `StencilKernel.bind`, over a window."""
         rows_of_sums = window.rows_of_sums(self._planes)
         if self._tally is not None:
-            self._tally.launch(rows_of_sums, structs, given)
+            self._tally.launch(rows_of_sums, structs, kernel_args)
             return
-        given["out"] = self._partials
-        self._declared.bind_arguments(rows_of_sums, structs, given).launch()
+        kernel_args["out"] = self._partials
+        self._declared.bind_arguments(rows_of_sums, structs, kernel_args).launch()
         first_k, first_j, planes, rows = _numbers(window)
         box_k, box_j, box_planes, box_rows = _numbers(self._counted or window)
         hulls, pieces = _hulls(window)

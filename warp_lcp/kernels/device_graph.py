@@ -118,11 +118,11 @@ def kernel_from_memory(kernel: wp.Kernel, sized: int) -> tuple[DataType, wp.Kern
             `launch_ranges`; 0: none do.
     """
     if (kernel, sized) not in _KERNELS:
-        _KERNELS[kernel, sized] = _made_from_memory(kernel, sized)
+        _KERNELS[kernel, sized] = _compiled_from_memory(kernel, sized)
     return _KERNELS[kernel, sized]
 
 
-def _made_from_memory(kernel: wp.Kernel, sized: int) -> tuple[DataType, wp.Kernel]:
+def _compiled_from_memory(kernel: wp.Kernel, sized: int) -> tuple[DataType, wp.Kernel]:
     name = kernel.key.replace("__", "_")
     members = {FIRST: wp.int64} | {arg.label: arg.type for arg in kernel.adj.args}
     Given = make_struct(f"Given_{kernel.module.name.replace('.', '_')}_{name}", members)
@@ -260,11 +260,11 @@ class DeviceGraph(CommandBuffer):
         if not (changing or first or sized):
             super().launch(kernel, dim, inputs, device=self.device, block_dim=block_dim)
             return
-        struct, made = kernel_from_memory(kernel, sized)
-        given = struct()
+        struct, compiled = kernel_from_memory(kernel, sized)
+        arguments = struct()
         for arg, value in zip(kernel.adj.args, inputs, strict=True):
-            setattr(given, arg.label, value_of(value))  # Warp checks the type
-        native, patches = type(native_of(given)), []
+            setattr(arguments, arg.label, value_of(value))  # Warp checks the type
+        native, patches = type(native_of(arguments)), []
         if first:
             offset, address, size = first[0]
             patches.append((offset_of(native, kernel.adj.args[0].label) + offset, address, size))
@@ -276,7 +276,15 @@ class DeviceGraph(CommandBuffer):
                 patches.append((offset, *value.address(arg.type)))
             elif (slot := slot_of(value)) is not None:
                 patches.append((offset, slot.address, ARRAY_BYTES))
-        self._add(made, struct, dim, bytes(native_of(given)), patches, (given, inputs), block_dim)
+        self._add(
+            compiled,
+            struct,
+            dim,
+            bytes(native_of(arguments)),
+            patches,
+            (arguments, inputs),
+            block_dim,
+        )
 
     def _add(
         self,
@@ -285,13 +293,13 @@ class DeviceGraph(CommandBuffer):
         dim: tuple[int, ...],
         memory: bytes,
         patches: list[Patch],
-        kept: object,
+        keep_alive: object,
         block_dim: int = 256,
     ) -> None:
         at = self._bytes
         self._bytes += -(-len(memory) // ALIGNED) * ALIGNED
         self._patches += [(at + offset, address, size) for offset, address, size in patches]
-        self._arguments.append(kept)
+        self._arguments.append(keep_alive)
         self._pieces.append(
             (len(self._commands), kernel, struct, tuple(dim), memory, at, block_dim)
         )

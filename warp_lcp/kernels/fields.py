@@ -213,7 +213,7 @@ class Layout:
     """Fields stored as they are.
 
     Attributes:
-        across: communicator of a distributed problem, see `warp_lcp.kernels.vectors.Communicator`;
+        comm: communicator of a distributed problem, see `warp_lcp.kernels.vectors.Communicator`;
             None if serial.
         chunks: (0, its elements) of each chunk of `CPU_CHUNK` elements that has ever been in use,
             (0, 0) of others, where fields are 0 and stay untouched: wp.vec2i, shape (chunks, 1);
@@ -222,7 +222,7 @@ class Layout:
         inside: index of the part of a stored field that the operator's shape stands for.
     """
 
-    across: Communicator | None = None
+    comm: Communicator | None = None
     inside: ClassVar[EllipsisType | tuple[slice, ...]] = ...
     chunks: DeviceArray | None = None
     rows: Rows | None = None
@@ -359,10 +359,10 @@ class PaddedLayout(Layout):
     inside = (slice(1, -1),) * 3
 
     def __init__(
-        self, shape: tuple[int, ...], device: wp.Device, across: Communicator | None = None
+        self, shape: tuple[int, ...], device: wp.Device, comm: Communicator | None = None
     ) -> None:
         super().__init__(shape, device)
-        self.across = across
+        self.comm = comm
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
         self.padding = Padding((nz, ny, nx))
         self.stored_shape = self.padding.shape

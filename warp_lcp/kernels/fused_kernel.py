@@ -58,7 +58,7 @@ class FusedKernel:
             ValueError: threads share the rows of a stage otherwise, as those of a flat field.
         """
         declared = tuple(stage for stage, _ in self.stages)
-        given = [
+        lagged_kernels = [
             (b, lag) for b, (_, lag) in zip(passes, self.stages, strict=False) if b is not None
         ]
         if len(passes) != len(declared) or any(
@@ -67,23 +67,28 @@ class FusedKernel:
             raise TypeError(
                 f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order"
             )
-        if not given:
+        if not lagged_kernels:
             return
-        if given[0][0].rows.device.is_cuda or max(b.layout.slab for b, _ in given) > 1:
-            for bound, _ in given:
+        if (
+            lagged_kernels[0][0].rows.device.is_cuda
+            or max(b.layout.slab for b, _ in lagged_kernels) > 1
+        ):
+            for bound, _ in lagged_kernels:
                 bound.launch(launch)
             return
-        if max([b.rows.single.chunks for b, _ in given]) > 1:
+        if max([b.rows.single.chunks for b, _ in lagged_kernels]) > 1:
             raise ValueError(f"{self.name}: takes whole rows, not chunks of them")
         if team() is None:
-            self._launch_planes(given, launch)
+            self._launch_planes(lagged_kernels, launch)
             return
-        perform(self._operation(given), launch)
+        perform(self._operation(lagged_kernels), launch)
 
-    def _launch_planes(self, given: list[tuple[BoundKernel, int]], launch: Launch) -> None:
+    def _launch_planes(self, lagged_kernels: list[tuple[BoundKernel, int]], launch: Launch) -> None:
         """Launch the stages plane by plane, in the order of `team.h` within a slab."""
-        for turn in range(max(b.layout.planes for b, _ in given) + max(lag for _, lag in given)):
-            for bound, lag in given:
+        for turn in range(
+            max(b.layout.planes for b, _ in lagged_kernels) + max(lag for _, lag in lagged_kernels)
+        ):
+            for bound, lag in lagged_kernels:
                 L, i = bound.layout, turn - lag
                 # Planes of the finer level that one of a coarser level stands for. The coarser
                 # plane is processed with the last of them.
@@ -98,10 +103,10 @@ class FusedKernel:
                         device=bound.rows.device,
                     )
 
-    def _operation(self, given: list[tuple[BoundKernel, int]]) -> Operation:
+    def _operation(self, lagged_kernels: list[tuple[BoundKernel, int]]) -> Operation:
         """Return the fused kernel for the thread pool, cut into slabs of planes."""
-        layouts = [b.layout for b, _ in given]
-        planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
+        layouts = [b.layout for b, _ in lagged_kernels]
+        planes, most = max(L.planes for L in layouts), max(lag for _, lag in lagged_kernels)
         # Gaps between slabs must not overlap, and three planes lie between those that are kept.
         least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)
         alone = (
@@ -114,7 +119,9 @@ class FusedKernel:
         )
         members = {}
         if slabs > 1:
-            apart = max([lag for b, lag in given if b.form.declared.ring], default=0) + 1
+            apart = max([lag for b, lag in lagged_kernels if b.form.declared.ring], default=0) + 1
             members = {"cut": each, "slabs": slabs, "apart": apart}
-        stages = [b.stage(lag, **(members if b.form.declared.ring else {})) for b, lag in given]
+        stages = [
+            b.stage(lag, **(members if b.form.declared.ring else {})) for b, lag in lagged_kernels
+        ]
         return Operation(SLABS, stages, slabs, each, planes, most)

@@ -147,20 +147,24 @@ class KernelVariant:
         self.pattern = pattern = shape if isinstance(shape, Pattern) else None
         self.joins = bool(d.module) and pattern is None  # shares a module with other kernels
         shape = pattern.word if pattern else shape
-        of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
+        type_of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         self.words = d.words(letters, constants, shape, bounds) + words_of(quads)
         weights = (
-            of(d.stencil[1])
+            type_of(d.stencil[1])
             if d.stencil and (shape == VARIABLE or (pattern and pattern.names))
             else wp.float32
         )
-        parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
+        parts = (
+            {"stencil": stencil_struct(type_of(d.stencil[0]), weights, pattern)}
+            if d.stencil
+            else {}
+        )
         parts |= {"bounds": BoundFields} if d.bounds else {}
-        self.types = {name: of(kind) for name, kind in d.arrays.items()}
+        self.types = {name: type_of(kind) for name, kind in d.arrays.items()}
         members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {
-            n: of(t) for n, t in d.numbers.items()
+            n: type_of(t) for n, t in d.numbers.items()
         }
-        self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
+        self._numbers = struct.Struct("".join(PACKED[type_of(t)] for t in d.numbers.values()))
         self.fields = Fields = make_struct(
             f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members
         )
@@ -178,11 +182,15 @@ class KernelVariant:
         run.__module__ = area if d.box else variant
         self.name = d.name.replace(".", "_") if self.joins else last
         run.__qualname__ = f"{self.name}_rows"
-        self._code = self._source(letters, constants, ord(shape[0]), of)
+        self._code = self._source(letters, constants, ord(shape[0]), type_of)
         self.run = wp.func_native(self._code)(run)
 
     def _source(
-        self, letters: dict[str, DataType], constants: dict[str, float], stencil: int, of: Resolver
+        self,
+        letters: dict[str, DataType],
+        constants: dict[str, float],
+        stencil: int,
+        type_of: Resolver,
     ) -> str:
         """Return the kernel's body in C++.
 
@@ -202,7 +210,7 @@ class KernelVariant:
         }
         macros = {n: v for n, v in constants.items() if isinstance(v, SupportsIndex)}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [
-            f"typedef {C[of(d.compute)]} T;"
+            f"typedef {C[type_of(d.compute)]} T;"
         ] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [
             f"#define {n} {int(v)}" for n, v in macros.items()
@@ -211,7 +219,7 @@ class KernelVariant:
             f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros
         ]
         if self.quads:
-            return self._source_of_quads(head, macros, of)
+            return self._source_of_quads(head, macros, type_of)
         at = {
             n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)
         } | dict.fromkeys(d.other, " + P.q")
@@ -327,7 +335,7 @@ class KernelVariant:
             ]
         )
 
-    def _source_of_quads(self, head: list[str], macros: dict[str, float], of: Resolver) -> str:
+    def _source_of_quads(self, head: list[str], macros: dict[str, float], type_of: Resolver) -> str:
         """Return the kernel's body for quads in C++.
 
         It is a loop over planes with the row function twice: for four cells and for fewer.
@@ -359,13 +367,13 @@ class KernelVariant:
         whole = [
             line
             for half in self._halves()
-            for line in (*half, *self._fields_of_quad(of, kept=True), *function, "}", "else")
+            for line in (*half, *self._fields_of_quad(type_of, kept=True), *function, "}", "else")
         ][:-1]
         rest = [
             "else if (FOUND || P.n > 0) {",
             "const int n = P.n;",
             POINTERS,
-            *self._fields_of_quad(of, kept=False),
+            *self._fields_of_quad(type_of, kept=False),
             *function,
             "}",
         ]
@@ -388,7 +396,7 @@ class KernelVariant:
         """
         finer = self.declared.finer
         either = self.quads[finer].either
-        made = []
+        halves = []
         for half in ("false", "true")[: 1 + either]:
             ours, others = ("half_", half) if finer else (half, "other_half_")
             here = f" && {'other_' * finer}half_ == {half}" * either
@@ -397,16 +405,16 @@ class KernelVariant:
                 f"const auto in_ = reading_(Ours_(), {ours});",
                 f"const auto in_other_ = reading_(Others_(), {others});",
             ]
-            made.append([*lines, f"const auto out_ = writing_({ours});"])
-        return made
+            halves.append([*lines, f"const auto out_ = writing_({ours});"])
+        return halves
 
-    def _fields_of_quad(self, of: Resolver, *, kept: bool) -> list[str]:
+    def _fields_of_quad(self, type_of: Resolver, *, kept: bool) -> list[str]:
         """Return C++ that declares the fields at a quad's first cell, by name.
 
-        `kept`: they are held in registers, as `quad.h` does.
+        `keep_alive`: they are held in registers, as `quad.h` does.
         """
         d = self.declared
-        made = []
+        declarations = []
         of_other = "in_other_" if kept else "in_"
         reading = lambda other, data: f"{of_other}({data}, q)" if other else f"in_({data}, p)"  # noqa: E731
         for n in (n for n in d.arrays if not (d.found and n == "out")):
@@ -417,7 +425,7 @@ class KernelVariant:
             ):
                 data = f"given.{n}.data"
                 out = f"auto {n} = out_({data}, p);"
-                made.append(
+                declarations.append(
                     out if n in d.writes else f"const auto {n} = {reading(n in d.other, data)};"
                 )
                 continue
@@ -425,9 +433,9 @@ class KernelVariant:
                 " + p" if n in d.reads or n in d.writes else " + q" * (n in d.other)
             )
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
-            made.append(f"{'const ' * (n in d.reads)}auto* {n} = {pointer};")
-        made += ["const bool pairs = L.fx > 1 || L.fx < -1;"] if d.other or d.finer else []
-        made += (
+            declarations.append(f"{'const ' * (n in d.reads)}auto* {n} = {pointer};")
+        declarations += ["const bool pairs = L.fx > 1 || L.fx < -1;"] if d.other or d.finer else []
+        declarations += (
             [
                 "const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2, wide = L.fy == 1 || 2*P.j "
                 "+ 2 > L.n2 ? 1 : 2;"
@@ -435,20 +443,20 @@ class KernelVariant:
             if d.finer
             else []
         )
-        made += [f"const auto {n} = given.{n};" for n in d.numbers]
+        declarations += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.stencil:
             fields, numbers = ("d", "wx", "wy", "wz", "known"), ("unit", "cx", "cy", "cz")
-            made += [
+            declarations += [
                 f"const auto {n} = {reading(d.finer, f'given.stencil.{n}.data')};" for n in fields
             ]
-            made += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
-        return made
+            declarations += [f"const T {n} = (T)given.stencil.{n};" for n in numbers]
+        return declarations
 
     def fill(
         self,
         stencil: KernelStencil | None,
         bounds: BoundOperands | None,
-        given: dict[str, KernelArgument],
+        kernel_args: dict[str, KernelArgument],
     ) -> bytes:
         """Return the C layout of the argument struct.
 
@@ -458,8 +466,8 @@ class KernelVariant:
         if bounds is not None:
             lower, least, upper, most, code = bounds
             parts += [*packed((lower, upper, code)), SIDES.pack(least.value, most.value)]
-        parts += packed([given[name] for name in self.types])
-        values = [value_of(given[name]) for name in self.declared.numbers]
+        parts += packed([kernel_args[name] for name in self.types])
+        values = [value_of(kernel_args[name]) for name in self.declared.numbers]
         try:
             parts.append(self._numbers.pack(*values))
         except struct.error as error:
@@ -474,8 +482,8 @@ class KernelVariant:
 
         A capture on the CPU finds the arrays in it by name.
         """
-        stencil, bounds = bound.kept
-        members = {name: bound.given[name] for name in self.types}
+        stencil, bounds = bound.keep_alive
+        members = {name: bound.kernel_args[name] for name in self.types}
         if stencil is not None:
             members["stencil"] = stencil.struct
         if bounds is not None:

@@ -212,13 +212,13 @@ def together(device: wp.Device) -> Iterator[Launch]:
 
 
 @contextmanager
-def as_one_table(device: wp.Device, across: Communicator | None = None) -> Iterator[None]:
+def as_one_table(device: wp.Device, comm: Communicator | None = None) -> Iterator[None]:
     """Record the launches of a `with` block as one table for the thread pool.
 
     The table runs at the end of the block. Nothing may be read from the device within. Launches run
-    at once on CUDA, and where `across` is a communicator of several ranks.
+    at once on CUDA, and where `comm` is a communicator of several ranks.
     """
-    if device.is_cuda or across is not None or is_recording() or team() is None:
+    if device.is_cuda or comm is not None or is_recording() or team() is None:
         yield
         return
     program = CommandBuffer(device)
@@ -591,18 +591,18 @@ class CommandBuffer:
 
         A stretch is a graph, a table or its launches.
         """
-        made: list[Callable[[], object]] = []
+        functions: list[Callable[[], object]] = []
         for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
             stretch = list(group)
             if is_task:
-                made += [task.function for task in stretch if isinstance(task, Task)]
+                functions += [task.function for task in stretch if isinstance(task, Task)]
             elif self.device.is_cuda:
-                made.append(partial(launch_graph, self._captured(stretch)))
+                functions.append(partial(launch_graph, self._captured(stretch)))
             elif all(isinstance(command, Operation) for command in stretch):
-                made.append(partial(run_table, OperationTable(_only_operations(stretch))))
+                functions.append(partial(run_table, OperationTable(_only_operations(stretch))))
             else:
-                made += [partial(_launch_alone, command) for command in stretch]
-        return made
+                functions += [partial(_launch_alone, command) for command in stretch]
+        return functions
 
     def _captured(self, commands: Sequence[Command]) -> wp.Graph:
         """Capture some launches and return their graph."""

@@ -278,7 +278,7 @@ class Pattern:
 
         There is one function of the piece's cell for each weight.
         """
-        made = [
+        lines = [
             f"const auto weight{i} = [&](long long k) -> T {{ return (T)({self._expression(i)}); "
             f"}};"
             for i in range(len(self.offsets))
@@ -287,7 +287,7 @@ class Pattern:
             f"DO(weight{i}, {x}, {y}, {z})" for i, (x, y, z) in enumerate(self.offsets)
         )
         return [
-            *made,
+            *lines,
             f"#define EACH_WEIGHT(DO) {visits}",
             f"constexpr bool SYMMETRIC = {str(self.symmetric).lower()};",
         ]
@@ -734,13 +734,13 @@ class Rows:
         return {}
 
     def _beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
-        L, theirs = self.single, other.single
+        L, other_layout = self.single, other.single
         members = {
-            "o0": theirs.base,
-            "o1": theirs.s1,
-            "o2": theirs.s2,
-            "n1": theirs.planes,
-            "n2": theirs.rows,
+            "o0": other_layout.base,
+            "o1": other_layout.s1,
+            "o2": other_layout.s2,
+            "n1": other_layout.planes,
+            "n2": other_layout.rows,
         }
         members |= dict(zip(("fx", "fy", "fz"), factors, strict=True))
         quads = (

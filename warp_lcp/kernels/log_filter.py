@@ -36,19 +36,19 @@ class KernelMessages:
 
     def __init__(self, logger: wp.Logger, stream: TextIO | None = None) -> None:
         self._logger, self._stream = logger, stream
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.debug, self.error = logger.debug, logger.error
 
     def info(self, message: str) -> None:
         """Pass a message on, unless it is the banner or is about a module of this library."""
-        found = LOADED.match(message)
-        hidden = (found is not None and found[1] in OURS) or BANNER.match(message)
+        match = LOADED.match(message)
+        hidden = (match is not None and match[1] in OURS) or BANNER.match(message)
         if not hidden or wp.config.log_level <= wp.LOG_DEBUG:
             self._logger.info(message)
-        elif found and found[3] == "compiled" and found[2] not in self._told:
-            self._told.add(found[2])
+        elif match and match[3] == "compiled" and match[2] not in self._reported:
+            self._reported.add(match[2])
             print(
-                f"compiling kernels for {found[2]}, which takes seconds and is done once; cache: "
+                f"compiling kernels for {match[2]}, which takes seconds and is done once; cache: "
                 f"{wp.config.kernel_cache_dir}",
                 file=self._stream or sys.stderr,
                 flush=True,
@@ -82,7 +82,7 @@ def start_warp() -> None:
 def _native_messages_dropped() -> Iterator[None]:
     """Redirect the native error stream within a `with` block, if there is one."""
     try:
-        kept = os.dup(2)
+        saved_descriptor = os.dup(2)
     except OSError:  # the stream is closed
         yield
         return
@@ -91,9 +91,9 @@ def _native_messages_dropped() -> Iterator[None]:
         os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(kept, 2)
+        os.dup2(saved_descriptor, 2)
         os.close(nowhere)
-        os.close(kept)
+        os.close(saved_descriptor)
 
 
 def install_log_filter() -> None:

@@ -97,25 +97,25 @@ class Slot:
     The current array has it as attribute `slot`.
     """
 
-    __slots__ = ("_held", "_length", "_memory", "address")
+    __slots__ = ("_first_store", "_length", "_memory", "address")
 
     def __init__(self) -> None:
         self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
         self.address = ctypes.addressof(self._memory)
         self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
-        self._held: DeviceArray | None = None  # the last store passed to `point_to_first`
+        self._first_store: DeviceArray | None = None  # the last store passed to `point_to_first`
 
     def point_to(self, array: DeviceArray) -> None:
         """Make recorded launches use this array from now on."""
-        self._held = None
+        self._first_store = None
         ctypes.memmove(self.address, ctypes.addressof(native_of(array)), ARRAY_BYTES)
         array.slot = self
 
     def point_to_first(self, count: int, store: DeviceArray) -> None:
         """Make recorded launches use the first elements of a flat array from now on."""
-        if self._held is not store:
+        if self._first_store is not store:
             ctypes.memmove(self.address, ctypes.addressof(native_of(store)), ARRAY_BYTES)
-            self._held = store
+            self._first_store = store
         self._length.value = count
 
 

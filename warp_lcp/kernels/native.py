@@ -59,7 +59,7 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
     for number, line in enumerate(lines[: starts[0] if starts else None], 1):
         if line and not line.startswith("//"):
             raise ValueError(f"{path}:{number}: expected comments before the first kernel")
-    found: dict[str, HeaderSection] = {}
+    sections: dict[str, HeaderSection] = {}
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         first = _BEGIN.fullmatch(lines[start])
         if not first:
@@ -67,9 +67,9 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
                 f"{path}:{start + 1}: expected `// kernel NAME: description`, not {lines[start]!r}"
             )
         kind, name = first[1], first[2]
-        if name in found:
+        if name in sections:
             raise ValueError(
-                f"{path}:{start + 1}: {name} is declared in line {found[name].line}, too"
+                f"{path}:{start + 1}: {name} is declared in line {sections[name].line}, too"
             )
         begin = start + 1
         # A continued description.
@@ -79,10 +79,10 @@ def _sections(path: Path, source: str) -> dict[str, HeaderSection]:
             begin += 1
         if not any(line and not line.startswith("//") for line in lines[begin:end]):
             raise ValueError(f"{path}:{start + 1}: {name} has no body")
-        found[name] = HeaderSection(
+        sections[name] = HeaderSection(
             kind, name, start + 1, tuple(lines[start:begin]), tuple(lines[begin:end])
         )
-    return found
+    return sections
 
 
 def text(path: Path, name: str = "") -> str:
@@ -109,17 +109,17 @@ def _included(path: Path, number: int, line: str) -> str | None:
 
     Returns None for any other line, and for includes that the compiler resolves.
     """
-    found = _INCLUDE.fullmatch(line)
-    if not found:
+    include = _INCLUDE.fullmatch(line)
+    if not include:
         return None
-    whole = not found[1] and found[2].endswith(".h")
-    file = found[1] or (found[2] if whole else path.name)
+    whole = not include[1] and include[2].endswith(".h")
+    file = include[1] or (include[2] if whole else path.name)
     places = [place / file for place in (path.parent, HEADERS) if (place / file).exists()]
     if whole:
         return text(places[0]) if places else None
-    if not places or found[2] not in sections(places[0]):
+    if not places or include[2] not in sections(places[0]):
         raise ValueError(f"{path}:{number}: {line}: there is no such kernel or snippet")
-    return text(places[0], found[2])
+    return text(places[0], include[2])
 
 
 @functools.cache

@@ -88,23 +88,23 @@ class PersistentKernel:
     def tables(self) -> StructInstance:
         """Tables of the kernels by variant, and the order of execution."""
         places = dict[int, tuple[int, int]]()
-        kept: list[list[bytes]] = [[] for _ in self._forms]
+        table_bytes: list[list[bytes]] = [[] for _ in self._forms]
         for bound in {id(stage): stage for stage in self._stages}.values():
             which = self._forms.index(bound.form)
-            places[id(bound)] = which, len(kept[which])
-            kept[which].append(bytes(native_of(bound.layout)) + bound.arguments)
-        made = self._Tables()
-        made.order = wp.array(
+            places[id(bound)] = which, len(table_bytes[which])
+            table_bytes[which].append(bytes(native_of(bound.layout)) + bound.arguments)
+        tables = self._Tables()
+        tables.order = wp.array(
             [places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device
         )
-        for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):
+        for table, struct, pieces in zip(TABLES, self._structs, table_bytes, strict=False):
             stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
             typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
             # A recorded launch holds the tables alone, so the tables must hold the arrays whose
             # addresses they have.
-            typed.kept = stored, self._stages
-            put(made, {table: typed})
-        return made
+            typed.keep_alive = stored, self._stages
+            put(tables, {table: typed})
+        return tables
 
     def launch(self, launch: Launch = launch_now) -> None:
         """Launch all kernels, or record their launch."""
@@ -112,15 +112,17 @@ class PersistentKernel:
             inputs = [self.tables, 0, len(self._stages), self.threads]
             launch(self.kernel, self.threads, inputs, device=self.device, block_dim=THREADS)
             return
-        made: dict[int, Operation | None] = {}  # operations of the thread pool for repeated kernels
+        operations: dict[
+            int, Operation | None
+        ] = {}  # operations of the thread pool for repeated kernels
         for stage in self._stages:
             key = id(stage)
-            if key not in made:
-                made[key] = stage.operation()
-            if made[key] is None:
+            if key not in operations:
+                operations[key] = stage.operation()
+            if operations[key] is None:
                 stage.launch(launch)
             else:
-                perform(made[key], launch)
+                perform(operations[key], launch)
 
 
 TABLES = tuple(f"pieces{i}" for i in range(MOST))

@@ -71,7 +71,7 @@ class ReadbackBuffer:
 
     def __init__(self, device: wp.Device, size: int = BYTES) -> None:
         self.memory = wp.zeros(-(-size // LINE) * LINE, dtype=wp.uint8, device=device)
-        self._host, self._end, self._changes, self._known = np.zeros(0, dtype=np.uint8), 0, 0, 0
+        self._host, self._end, self._changes, self._fetched = np.zeros(0, dtype=np.uint8), 0, 0, 0
         self._free: dict[int, list[int]] = {}  # free places by their size
 
     def take(self, size: int) -> int | None:
@@ -82,7 +82,7 @@ class ReadbackBuffer:
         if self._end + size > self.memory.size:
             return None
         self._end += size
-        self._known = -1  # the fetched copy is too short
+        self._fetched = -1  # the fetched copy is too short
         return self._end - size
 
     def give_back(self, place: int, size: int) -> None:
@@ -96,8 +96,8 @@ class ReadbackBuffer:
 
     def fetched(self, change: int) -> np.ndarray:
         """Return all bytes as they are after a change, or later."""
-        if self._known < change:
-            self._known, self._host = self._changes, self.memory[: self._end].numpy()
+        if self._fetched < change:
+            self._fetched, self._host = self._changes, self.memory[: self._end].numpy()
         return self._host
 
 

@@ -204,13 +204,13 @@ class StencilKernel:
                 "a box that is not optional"
             )
             raise ValueError(f"{self.label}: {sorted(wrong)}: expected {expected}")
-        if others := {
+        if wrong_types := {
             name
             for name, kind in numbers.items()
             if not isinstance(kind, str) and kind not in PACKED
         }:
             raise TypeError(
-                f"{self.label}: {sorted(others)}: expected numbers of the types "
+                f"{self.label}: {sorted(wrong_types)}: expected numbers of the types "
                 f"{', '.join(t.__name__ for t in PACKED)}"
             )
 
@@ -268,7 +268,7 @@ class StencilKernel:
         *structs: DataclassInstance,
         stencil: KernelStencil | None = None,
         bounds: BoundOperands | None = None,
-        **given: KernelArgument,
+        **kernel_args: KernelArgument,
     ) -> BoundKernel:
         """Check the arguments of a launch and bind them.
 
@@ -279,8 +279,8 @@ class StencilKernel:
             stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `PrecomputedProduct`
                 in place of one.
             bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
-            given: arrays, numbers, and constants other than their defaults, by name; they override
-                members of structs.
+            kernel_args: arrays, numbers, and constants other than their defaults, by name; they
+                override members of structs.
 
         Raises:
             TypeError: an argument is missing, unknown, or of the wrong type; two structs have it; a
@@ -288,19 +288,19 @@ class StencilKernel:
             ValueError: an array has the wrong length, lies on another device, or its elements do
                 not lie side by side.
         """
-        return self.bind_arguments(rows, structs, given, stencil, bounds)
+        return self.bind_arguments(rows, structs, kernel_args, stencil, bounds)
 
     def bind_arguments(
         self,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, KernelArgument],
+        kernel_args: dict[str, KernelArgument],
         stencil: KernelStencil | None = None,
         bounds: BoundOperands | None = None,
     ) -> BoundKernel:
         """Bind as `bind` does, with structs and keywords as containers.
 
-        It serves functions that pass on the arguments of their callers. `given` is modified.
+        It serves functions that pass on the arguments of their callers. `kernel_args` is modified.
         """
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
@@ -309,16 +309,16 @@ class StencilKernel:
                 "bounds"
             )
         if structs:
-            given = self._with_members(structs, given)
+            kernel_args = self._with_members(structs, kernel_args)
         if self.box:
-            given |= rows.place
+            kernel_args |= rows.place
             constants = tuple(self.constants.values())
         else:
             try:
                 constants = (
                     tuple(
                         [
-                            index(given.pop(n)) if n in given else v
+                            index(kernel_args.pop(n)) if n in kernel_args else v
                             for n, v in self.constants.items()
                         ]
                     )
@@ -329,17 +329,17 @@ class StencilKernel:
                 raise TypeError(
                     f"{self.label}: {', '.join(self.constants)} are integers where given: {error}"
                 ) from None
-        if given.keys() != self._wanted:
+        if kernel_args.keys() != self._expected_names:
             missing, unknown = (
-                sorted(self._wanted - given.keys()),
-                sorted(given.keys() - self._wanted),
+                sorted(self._expected_names - kernel_args.keys()),
+                sorted(kernel_args.keys() - self._expected_names),
             )
             searched = (
                 f" in {', '.join(type(s).__name__ for s in structs)}" if structs and missing else ""
             )
             raise TypeError(f"{self.label}: missing {missing}{searched}, unknown {unknown}")
         types = [
-            value.dtype if isinstance(value := given[n], ARRAYS) else type(value)
+            value.dtype if isinstance(value := kernel_args[n], ARRAYS) else type(value)
             for n in self.arrays
         ]
         kind, weights, stored = NUMBERS, None, ()
@@ -366,12 +366,12 @@ class StencilKernel:
             and rows.memory is None
             and not (stored and stored[1])
         ):
-            fields = rows.alignments != QUADS and self._fields_of_rows(given, stencil, bounds)
+            fields = rows.alignments != QUADS and self._fields_of_rows(kernel_args, stencil, bounds)
             quads = rows.alignments if fields and in_blocks(fields) else QUADS
         key = (constants, kind, quads, *stored, *types)
-        made = self._forms.get(key)
-        if made is None:
-            letters = tuple(sorted(self._letters(stencil, given).items()))
+        variant = self._forms.get(key)
+        if variant is None:
+            letters = tuple(sorted(self._letters(stencil, kernel_args).items()))
             numbers = tuple(zip(self.constants, constants, strict=True))
             shape = (
                 KNOWN
@@ -382,15 +382,21 @@ class StencilKernel:
                 if weights
                 else UNIFORM
             )
-            made = self._forms[key] = form_of(self, letters, numbers, shape, kind, quads=quads)
-            make_kernels_of_module(made, letters, shape, kind)
-        self._check_memory(rows, given)
-        return BoundKernel(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
+            variant = self._forms[key] = form_of(self, letters, numbers, shape, kind, quads=quads)
+            make_kernels_of_module(variant, letters, shape, kind)
+        self._check_memory(rows, kernel_args)
+        return BoundKernel(
+            variant,
+            rows,
+            variant.fill(stencil, bounds, kernel_args),
+            kernel_args,
+            (stencil, bounds),
+        )
 
     def _with_members(
-        self, structs: tuple[DataclassInstance, ...], given: dict[str, KernelArgument]
+        self, structs: tuple[DataclassInstance, ...], kernel_args: dict[str, KernelArgument]
     ) -> dict[str, KernelArgument]:
-        """Return the arguments among the structs' members, and those of `given`."""
+        """Return the arguments among the structs' members, and those of `kernel_args`."""
         kinds = tuple([type(s) for s in structs])
         plan = self._members.get(kinds)
         if plan is None:
@@ -402,7 +408,7 @@ class StencilKernel:
             if get is not None
             for value in get(s)
         ]
-        return {**dict(zip(names, values, strict=True)), **given}
+        return {**dict(zip(names, values, strict=True)), **kernel_args}
 
     def _plan(self, kinds: tuple[type, ...]) -> Plan:
         """Return the arguments that structs of these classes have.
@@ -411,7 +417,9 @@ class StencilKernel:
         """
         if others := [kind.__name__ for kind in kinds if not is_dataclass(kind)]:
             raise TypeError(f"{self.label}: {others[0]} is not a dataclass")
-        shares = [[f.name for f in fields(kind) if f.name in self._wanted] for kind in kinds]
+        shares = [
+            [f.name for f in fields(kind) if f.name in self._expected_names] for kind in kinds
+        ]
         names = tuple(name for share in shares for name in share)
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise TypeError(
@@ -455,7 +463,7 @@ class StencilKernel:
         return {}
 
     @functools.cached_property
-    def _wanted(self) -> frozenset[str]:
+    def _expected_names(self) -> frozenset[str]:
         return frozenset({*self.arrays, *self.numbers})
 
     @functools.cached_property
@@ -464,12 +472,12 @@ class StencilKernel:
         return {}
 
     def _letters(
-        self, stencil: KernelStencil | None, given: dict[str, KernelArgument]
+        self, stencil: KernelStencil | None, kernel_args: dict[str, KernelArgument]
     ) -> dict[str, DataType]:
         """Resolve the letters, and check the types of all arrays."""
         letters: dict[str, DataType] = {}
         seen: dict[str, str] = {}
-        pairs = [(name, kind, given[name]) for name, kind in self.arrays.items()]
+        pairs = [(name, kind, kernel_args[name]) for name, kind in self.arrays.items()]
         if self.stencil is not None:
             pairs += [("the stencil's d", self.stencil[0], stencil.d)]
             pairs += (
@@ -515,30 +523,31 @@ class StencilKernel:
         )
         return [(length, tuple(names)) for length, names in groups if names]
 
-    def _check_memory(self, rows: Rows, given: dict[str, KernelArgument]) -> None:
+    def _check_memory(self, rows: Rows, kernel_args: dict[str, KernelArgument]) -> None:
         device = rows.device
         for length, names in self._lengths:
             expected = None if length is None else length(rows)
             for name in names:
-                value = given[name]
-                found = 0 if value is None else value.size
-                if not found and name in self.optional and slot_of(value) is None:
+                value = kernel_args[name]
+                size = 0 if value is None else value.size
+                if not size and name in self.optional and slot_of(value) is None:
                     # An empty slice has an address. A list that grows is read when the launch runs.
-                    given[name] = None
-                if found != expected is not None and (found or name not in self.optional):
-                    raise ValueError(f"{self.label}: {name} has {found} elements, not {expected}")
-                if found and not (value.is_contiguous and value.device is device):
+                    kernel_args[name] = None
+                if size != expected is not None and (size or name not in self.optional):
+                    raise ValueError(f"{self.label}: {name} has {size} elements, not {expected}")
+                if size and not (value.is_contiguous and value.device is device):
                     why = f"on {value.device}, not {device}" if value.is_contiguous else "strided"
                     raise ValueError(f"{self.label}: {name} is {why}")
         if self.box:
             self._check_box(
-                rows, {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None}
+                rows,
+                {tuple(kernel_args[n].shape[-3:]) for n in self.box if kernel_args[n] is not None},
             )
-        if self.found and given["out"].size < len(self.found) * rows.places:
+        if self.found and kernel_args["out"].size < len(self.found) * rows.places:
             least = (
                 f"fewer than {len(self.found) * rows.places}: {rows.places} threads for each sum"
             )
-            raise ValueError(f"{self.label}: out has {given['out'].size} elements, {least}")
+            raise ValueError(f"{self.label}: out has {kernel_args['out'].size} elements, {least}")
 
     def _check_box(self, rows: Rows, shapes: set[tuple[int, ...]]) -> None:
         if len(shapes) > 1:
@@ -587,8 +596,8 @@ class BoundKernel(NamedTuple):
     form: KernelVariant
     rows: Rows
     arguments: bytes
-    given: dict[str, KernelArgument]
-    kept: tuple[KernelStencil | None, BoundOperands | None]
+    kernel_args: dict[str, KernelArgument]
+    keep_alive: tuple[KernelStencil | None, BoundOperands | None]
 
     @property
     def fields(self) -> StructInstance:
@@ -649,10 +658,10 @@ class BoundKernel(NamedTuple):
                 LAYOUT_BYTES + offset_of(native, "k0") if d.box else None
             )
         for name in self.form.types:
-            if (slot := slot_of(self.given[name])) is not None:
+            if (slot := slot_of(self.kernel_args[name])) is not None:
                 patches.append((LAYOUT_BYTES + offset_of(native, name), slot.address, ARRAY_BYTES))
         for name, kind in d.numbers.items():
-            if type(number := self.given[name]) is Scalar:
+            if type(number := self.kernel_args[name]) is Scalar:
                 kind = self.form.letters[kind] if isinstance(kind, str) else kind
                 patches.append((LAYOUT_BYTES + offset_of(native, name), *number.address(kind)))
         return patches

@@ -120,7 +120,7 @@ class TableEntry:
     def __init__(self, launch: wp.Launch) -> None:
         self.kernel, self.function = launch.kernel, launch.hooks.forward
         # The module stays loaded. The launch itself is not stored, as it would hold arrays.
-        self._kept = launch.module_exec, launch.bounds
+        self._keep_alive = launch.module_exec, launch.bounds
         self.call = ctypes.cast(self.function, ctypes.c_void_p).value
         self.bounds = ctypes.addressof(launch.bounds)
 
@@ -145,7 +145,7 @@ class OperationKind:
         self,
         entry: TableEntry,
         arguments: bytes,
-        kept: object,
+        keep_alive: object,
         plane_tasks: int = 1,
         planes: int = 1,
         lag: int = 0,
@@ -159,8 +159,8 @@ class OperationKind:
             if patches
             else None
         )
-        self.kept, self.tasks, self.planes = (
-            (entry, memory, kept, listed),
+        self.keep_alive, self.tasks, self.planes = (
+            (entry, memory, keep_alive, listed),
             plane_tasks * planes,
             planes,
         )
@@ -187,9 +187,9 @@ class OperationKind:
         It is the kernel, its arguments without the patched ones, and the patches; of a copy, its
         words.
         """
-        if not isinstance(self.kept, tuple) or not isinstance(self.kept[0], TableEntry):
+        if not isinstance(self.keep_alive, tuple) or not isinstance(self.keep_alive[0], TableEntry):
             return self.words
-        memory = bytearray(self.kept[1])
+        memory = bytearray(self.keep_alive[1])
         for offset, _, size in self.patches:
             memory[offset : offset + size] = bytes(size)
         return self.words[0], bytes(memory), self.patches
@@ -214,7 +214,7 @@ class Operation:
             `everything`.
     """
 
-    __slots__ = ("_kept", "_stages", "check", "chunks", "condition", "sized", "words")
+    __slots__ = ("_keep_alive", "_stages", "check", "chunks", "condition", "sized", "words")
 
     def __init__(
         self,
@@ -226,7 +226,7 @@ class Operation:
         margin: int = 0,
         sized: int = 0,
     ) -> None:
-        self._stages, self._kept, self.chunks = (
+        self._stages, self._keep_alive, self.chunks = (
             array("Q", [word for stage in stages for word in stage.words]),
             stages,
             chunks,
@@ -249,7 +249,7 @@ class Operation:
             self.words[0],
             self.sized,
             self.condition,
-            *(stage.content() for stage in self._kept if isinstance(stage, OperationKind)),
+            *(stage.content() for stage in self._keep_alive if isinstance(stage, OperationKind)),
         )
 
     def name(self) -> str:
@@ -257,13 +257,15 @@ class Operation:
         return (
             "copy"
             if self.words[0] == COPY
-            else ", ".join(s.kept[0].kernel.key for s in self._kept if isinstance(s, OperationKind))
+            else ", ".join(
+                s.keep_alive[0].kernel.key for s in self._keep_alive if isinstance(s, OperationKind)
+            )
         )
 
     def only_if(self, condition: DeviceArray) -> Operation:
         """Return the same operation, skipped where a number, shape (1,), wp.int32, is 0."""
         made = copy.copy(self)
-        made._kept, made.condition = [*self._kept, condition], condition.ptr
+        made._keep_alive, made.condition = [*self._keep_alive, condition], condition.ptr
         return made
 
 
@@ -294,17 +296,17 @@ def ranges(stage: OperationKind, cells: int, *, ordered: bool = False, sized: in
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
 
 
-def copied(to: int, source: int, size: int, kept: object) -> Operation:
+def copied(to: int, source: int, size: int, keep_alive: object) -> Operation:
     """Return the copy of some bytes as an operation.
 
     Args:
         to: address.
         source: address; 0: zeros.
         size: bytes.
-        kept: objects that must live as long.
+        keep_alive: objects that must live as long.
     """
     stage = object.__new__(OperationKind)
-    stage.kept, stage.tasks, stage.planes, stage.patches = kept, 1, 1, ()
+    stage.keep_alive, stage.tasks, stage.planes, stage.patches = keep_alive, 1, 1, ()
     stage.words = source, 0, to, size, 1, 1, 0, 1, 0, 0
     each = max(size if get_threads() == 1 else -(-size // get_threads() // 64) * 64, COPIED)
     return Operation(COPY, [stage], max(-(-size // each), 1), each, size)
@@ -323,33 +325,33 @@ class OperationTable:
     """
 
     def __init__(self, operations: Iterable[Operation], again: DeviceArray | None = None) -> None:
-        self._kept = tuple(operations)
-        self.checks = {operation.check for operation in self._kept} - {None}
-        lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
+        self._keep_alive = tuple(operations)
+        self.checks = {operation.check for operation in self._keep_alive} - {None}
+        lanes = [min(get_threads(), operation.chunks) for operation in self._keep_alive]
         # The remaining pieces, and the cuts.
         sizes = [
             LANE_WORDS * n + operation.chunks
-            for n, operation in zip(lanes, self._kept, strict=True)
+            for n, operation in zip(lanes, self._keep_alive, strict=True)
         ]
-        at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
+        at = TABLE_WORDS + OPERATION_WORDS * len(self._keep_alive)
         self.words = array("Q", bytes(8 * (at + sum(sizes))))
         self.address = self.words.buffer_info()[0]
-        total, made = 0, []
-        for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
+        total, words = 0, []
+        for operation, count, size in zip(self._keep_alive, lanes, sizes, strict=True):
             total += operation.chunks
             places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
-            made += [total, *operation.words, count, *places, operation.sized, operation.condition]
+            words += [total, *operation.words, count, *places, operation.sized, operation.condition]
             at += size
         # A slice of the same length, so the array stays at its address.
-        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)
+        self.words[TABLE_WORDS : TABLE_WORDS + len(words)] = array("Q", words)
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = (
-            len(self._kept),
+            len(self._keep_alive),
             total,
             self.address + 8 * TABLE_WORDS,
         )
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
-        self.cut = total > len(self._kept)
-        self.asked: Arguments | None = None  # arguments of the last pool of one thread
+        self.cut = total > len(self._keep_alive)
+        self.request: Arguments | None = None  # arguments of the last pool of one thread
 
 
 class ThreadPool:
@@ -393,17 +395,17 @@ class ThreadPool:
             if share and self._posted is not table.words:
                 self._retire(table.words)
         table.words[SHARED_TIME] = 0
-        asked = Arguments(self.address, table.address, RUN, 0, share, patience(table))
+        request = Arguments(self.address, table.address, RUN, 0, share, patience(table))
         try:
-            self._do(asked)
+            self._do(request)
             while unfinished := table.words[UNFINISHED]:  # the interpreter has handled signals
                 if table.again is not None:
                     check_time()
                     for check in table.checks:  # a failure may keep the loop from ending
                         check()
-                asked.share = share + (RESUMED if unfinished == WITHIN else 0)
-                asked.limit = patience(table)
-                self._do(asked)
+                request.share = share + (RESUMED if unfinished == WITHIN else 0)
+                request.limit = patience(table)
+                self._do(request)
         except BaseException:
             self._do(Arguments(self.address, table.address, CANCEL))
             raise
@@ -417,13 +419,13 @@ class ThreadPool:
 
     def _run_alone(self, table: OperationTable) -> None:
         """Execute a table on the caller's thread."""
-        asked = table.asked
-        if asked is None or asked.team != self.address:  # of another pool, which was freed
-            asked = table.asked = Arguments(
+        request = table.request
+        if request is None or request.team != self.address:  # of another pool, which was freed
+            request = table.request = Arguments(
                 self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE
             )
         try:
-            self._do(asked)
+            self._do(request)
             while table.words[UNFINISHED]:  # the interpreter has handled signals
                 self._do(Arguments(self.address, table.address, RUN, 0, RESUMED, PATIENCE))
         except BaseException:
@@ -587,13 +589,14 @@ def prepared(
     return made[0], bytes(memory), made[1]
 
 
-def launched_alone(launch: wp.Launch, kept: object = None) -> Operation:
+def launched_alone(launch: wp.Launch, keep_alive: object = None) -> Operation:
     """Return a recorded launch as an operation that is not cut.
 
-    `kept` must live as long.
+    `keep_alive` must live as long.
     """
     return Operation(
-        ALONE, [OperationKind(TableEntry(launch), bytes(arguments_of(launch)), (launch, kept))]
+        ALONE,
+        [OperationKind(TableEntry(launch), bytes(arguments_of(launch)), (launch, keep_alive))],
     )
 
 
@@ -625,12 +628,12 @@ def _entry() -> TableEntry | None:
     Returns None, with a notice, if this Warp's launches do not work as expected.
     """
     try:
-        made = TableEntry(
+        entry = TableEntry(
             wp.launch(team_kernel, 1, [0, 0, 0, 0, 0, 0], device="cpu", record_cmd=True)
         )
         a = wp.zeros(8, dtype=wp.float32, device="cpu")
         launch = wp.launch(trial_kernel, 5, [a, 2, 3.0], device="cpu", record_cmd=True)
-        ThreadPool(1, made).run(OperationTable([launched_alone(launch)]))
+        ThreadPool(1, entry).run(OperationTable([launched_alone(launch)]))
         if a.numpy().tolist() != [0, 0, 3, 4, 5, 6, 7, 0]:
             raise RuntimeError("a test launch gave a wrong result")
     except Exception as error:
@@ -640,7 +643,7 @@ def _entry() -> TableEntry | None:
             stacklevel=2,
         )
         return None
-    return made
+    return entry
 
 
 def available_threads() -> int:

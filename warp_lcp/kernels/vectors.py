@@ -207,7 +207,7 @@ class Reduction:
         scalars: device array that receives the sums, shape (slots,), float64.
         columns: the most sums that one kernel makes.
         threads: threads of that kernel; default: those of a flat kernel.
-        across: communicator of the other parts of the fields; None if serial.
+        comm: communicator of the other parts of the fields; None if serial.
     """
 
     def __init__(
@@ -218,9 +218,9 @@ class Reduction:
         *,
         columns: int = 1,
         threads: int | None = None,
-        across: Communicator | None = None,
+        comm: Communicator | None = None,
     ) -> None:
-        self.scalars, self.columns, self._across = scalars, columns, across
+        self.scalars, self.columns, self._comm = scalars, columns, comm
         self.threads = threads or Rows.flat(n, device).places
         self.partials = zeros(columns * self.threads, wp.float64, device)
         self._folded = zeros(
@@ -246,8 +246,8 @@ class Reduction:
                 self._folded,
                 launch,
             )
-        if self._across is not None:
-            add_across(self._across, self.scalars, slice(slot, slot + columns), launch)
+        if self._comm is not None:
+            sum_over_ranks(self._comm, self.scalars, slice(slot, slot + columns), launch)
 
     def dot(
         self,
@@ -270,11 +270,11 @@ class Sums(Reduction):
         rows: of the kernels.
         columns: the most sums that one of them makes.
         slots: of `scalars`, if more than that.
-        across: communicator of the other parts of the fields; None if serial.
+        comm: communicator of the other parts of the fields; None if serial.
     """
 
     def __init__(
-        self, rows: Rows, columns: int = 1, *, slots: int = 0, across: Communicator | None = None
+        self, rows: Rows, columns: int = 1, *, slots: int = 0, comm: Communicator | None = None
     ) -> None:
         self.rows, self.reading = rows, DeviceScalar(rows.device, max(columns, slots))
         super().__init__(
@@ -283,7 +283,7 @@ class Sums(Reduction):
             self.reading.array,
             columns=columns,
             threads=rows.places,
-            across=across,
+            comm=comm,
         )
 
     def of(
@@ -293,14 +293,14 @@ class Sums(Reduction):
         stencil: KernelStencil | None = None,
         bounds: BoundOperands | None = None,
         slot: int = 0,
-        **given: KernelArgument,
+        **kernel_args: KernelArgument,
     ) -> np.ndarray:
         """Launch a kernel, bound as by `StencilKernel.bind`; return its sums.
 
         They are in `scalars` from a slot on.
         """
-        with as_one_table(self.rows.device, self._across):
-            self._launch(declared, structs, given, stencil, bounds, slot, wp.launch)
+        with as_one_table(self.rows.device, self._comm):
+            self._launch(declared, structs, kernel_args, stencil, bounds, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
     def launch(
@@ -311,23 +311,23 @@ class Sums(Reduction):
         bounds: BoundOperands | None = None,
         slot: int = 0,
         launch: Launch = launch_now,
-        **given: KernelArgument,
+        **kernel_args: KernelArgument,
     ) -> None:
         """Launch a kernel, or record it; `reading` then has its sums from a slot on."""
-        self._launch(declared, structs, given, stencil, bounds, slot, launch)
+        self._launch(declared, structs, kernel_args, stencil, bounds, slot, launch)
 
     def _launch(
         self,
         declared: StencilKernel,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, KernelArgument],
+        kernel_args: dict[str, KernelArgument],
         stencil: KernelStencil | None,
         bounds: BoundOperands | None,
         slot: int,
         launch: Launch,
     ) -> None:
-        given["out"] = self.partials
-        declared.bind_arguments(self.rows, structs, given, stencil, bounds).launch(launch)
+        kernel_args["out"] = self.partials
+        declared.bind_arguments(self.rows, structs, kernel_args, stencil, bounds).launch(launch)
         self.add_up(slot, columns=len(declared.sums), launch=launch)
         self.reading.changed()
 
@@ -363,31 +363,31 @@ class Tally:
         *structs: DataclassInstance,
         stencil: KernelStencil | None = None,
         bounds: BoundOperands | None = None,
-        **given: KernelArgument,
+        **kernel_args: KernelArgument,
     ) -> None:
         """Launch the kernel over rows, bound as by `StencilKernel.bind`.
 
         Its results replace the former ones.
         """
-        self.launch(rows, structs, given, stencil, bounds)
+        self.launch(rows, structs, kernel_args, stencil, bounds)
 
     def launch(
         self,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, KernelArgument],
+        kernel_args: dict[str, KernelArgument],
         stencil: KernelStencil | None = None,
         bounds: BoundOperands | None = None,
     ) -> None:
         """Launch as `take` does, with arguments as of `StencilKernel.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if is_recording() and device.is_cuda:
-            self._record(rows, structs, given, stencil, bounds)
+            self._record(rows, structs, kernel_args, stencil, bounds)
             return
         if self._partials.size < self._columns * self._places:
             self._partials = wp.empty(self._columns * self._places, dtype=wp.float64, device=device)
-        given["out"] = self._partials
-        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
+        kernel_args["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, kernel_args, stencil, bounds).launch()
         if self._reading is None:
             return
         sums, largest = len(self._declared.sums), len(self._declared.largest)
@@ -420,7 +420,7 @@ class Tally:
         self,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
-        given: dict[str, KernelArgument],
+        kernel_args: dict[str, KernelArgument],
         stencil: KernelStencil | None,
         bounds: BoundOperands | None,
     ) -> None:
@@ -432,8 +432,8 @@ class Tally:
         places = self._places if memory is None else memory.places
         if self._partials.size < self._columns * most:
             self._partials = wp.empty(self._columns * most, dtype=wp.float64, device=rows.device)
-        given["out"] = self._partials
-        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
+        kernel_args["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, kernel_args, stencil, bounds).launch()
         for kernel, count, before in ((add_up_kernel, sums, 0), (largest_kernel, largest, sums)):
             if count:
                 fold(
@@ -473,8 +473,8 @@ class Tally:
         )
 
 
-def add_across(
-    across: Communicator,
+def sum_over_ranks(
+    comm: Communicator,
     scalars: wp.array[wp.float64],
     slots: slice,
     launch: Launch = launch_now,
@@ -483,7 +483,7 @@ def add_across(
     """Add the sums of the other processes, now or among the launches of a program.
 
     Args:
-        across: communicator.
+        comm: communicator.
         scalars: sums of this process, which are replaced.
         slots: those that are added up.
         launch: of a program.
@@ -492,17 +492,17 @@ def add_across(
     """
 
     def operation() -> Operation:
-        adding = across.adding(scalars.numpy()[slots])
+        adding = comm.adding(scalars.numpy()[slots])
         return adding if condition is None else adding.only_if(condition)
 
     Task(
-        partial(_add_across, across, scalars, slots, condition),
+        partial(_sum_over_ranks, comm, scalars, slots, condition),
         operation if scalars.device.is_cpu else None,
     ).launch(launch)
 
 
-def _add_across(
-    across: Communicator,
+def _sum_over_ranks(
+    comm: Communicator,
     scalars: wp.array[wp.float64],
     slots: slice,
     condition: wp.array[wp.int32] | None,
@@ -511,9 +511,9 @@ def _add_across(
         return
     if scalars.device.is_cpu:
         sums = scalars.numpy()[slots]
-        sums[...] = across.sum(sums)
+        sums[...] = comm.sum(sums)
     else:
-        scalars[slots].assign(across.sum(scalars[slots].numpy()))
+        scalars[slots].assign(comm.sum(scalars[slots].numpy()))
 
 
 def rows_of(field: DeviceArray) -> Rows:

@@ -159,7 +159,7 @@ class ConjugateGradient:
             Otherwise rows that a large shift makes stiff would decide when to stop.
         rows: of the unknowns, where fields contain other cells, such as ghost cells; None: all of a
             field.
-        across: communicator; None if serial.
+        comm: communicator; None if serial.
     """
 
     _end_kernel: ClassVar[wp.Kernel] = end_kernel
@@ -171,7 +171,7 @@ class ConjugateGradient:
         *,
         weight: DeviceArray | None = None,
         rows: Rows | None = None,
-        across: Communicator | None = None,
+        comm: Communicator | None = None,
     ) -> None:
         self._product, self._preconditioner, self._rows, r = (
             product,
@@ -180,13 +180,13 @@ class ConjugateGradient:
             preconditioner.r,
         )
         self._allocate(r, SLOTS, int(RR))
-        self._q, self._shared = zeros_like(r), across is not None
+        self._q, self._shared = zeros_like(r), comm is not None
         self._reduction = Reduction(
             r.size,
             r.device,
             self._scalars.array,
             threads=None if rows is None else rows.places,
-            across=across,
+            comm=comm,
         )
         rows = rows or rows_of(r)
         self._direction = DIRECTION.bind(

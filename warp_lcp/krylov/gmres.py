@@ -170,13 +170,13 @@ class GMRES:
         count: int,
         *,
         sign: float = 1.0,
-        of: DeviceArray | None = None,
+        other_basis: DeviceArray | None = None,
     ) -> None:
         """Compute x += sign times the sum of factors_j v_j.
 
         Over the first `count` vectors; the last of the sums becomes x'x.
         """
-        basis = self._basis if of is None else of
+        basis = self._basis if other_basis is None else other_basis
         self._sums.of(
             COMBINE,
             slot=self._restart + 1,
@@ -228,7 +228,7 @@ class GMRES:
                 y[k] = (g[k] - H[k, k + 1 :] @ y[k + 1 : columns]) / H[k, k]
         self._factors.assign(y)
         if columns <= KEPT:
-            self._combine(self._factors, self.x, columns, of=self._images)
+            self._combine(self._factors, self.x, columns, other_basis=self._images)
             return
         # x += M (V y), with one more application of M.
         r = self._preconditioner.r

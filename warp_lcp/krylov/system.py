@@ -39,7 +39,7 @@ class KrylovSystem:
         method: KrylovMethod,
         weight: DeviceArray | None,
         rows: Rows | None = None,
-        across: Communicator | None = None,
+        comm: Communicator | None = None,
     ) -> None:
         """Set the Krylov method.
 
@@ -49,7 +49,7 @@ class KrylovSystem:
         self._krylov, self.e, self._norms, self._weighted_by = (
             method,
             method.x,
-            Sums(rows or rows_of(self.r), across=across),
+            Sums(rows or rows_of(self.r), comm=comm),
             weight,
         )
 

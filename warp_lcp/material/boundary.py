@@ -100,7 +100,7 @@ class Boundary(Protocol):
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""
 
-    def met(self) -> tuple[int, int, int]:
+    def collision_counts(self) -> tuple[int, int, int]:
         """Return numbers of particles that met a wall, were pushed, and are stuck.
 
         During the last advection; stuck inside a solid.
@@ -248,7 +248,7 @@ class WholeCells:
             self.grid, fields, self._room, self._dt, position, self._stopped.array, self._endless
         )
 
-    def met(self) -> tuple[int, int, int]:
+    def collision_counts(self) -> tuple[int, int, int]:
         """Return the number of particles that met a wall."""
         return int(self._stopped.numpy()[0]), 0, 0
 
@@ -445,7 +445,7 @@ class CutBoundary:
         if self.moves:
             push_out(self.grid, distance, position, counts[1:2], counts[2:3], open_sides=sides)
 
-    def met(self) -> tuple[int, int, int]:
+    def collision_counts(self) -> tuple[int, int, int]:
         """Return numbers of particles that met a wall, were pushed, and are stuck."""
         met, pushed, stuck = (int(n) for n in self._counts.numpy())
         return met, pushed, stuck

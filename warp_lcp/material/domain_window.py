@@ -166,13 +166,17 @@ def start_of(scene: ParticleScene, device: wp.DeviceLike) -> tuple[DomainWindow,
 
     The grid covers the materials at the start and the sources.
     """
-    whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
+    domain_grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
     boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
     corners = [
-        cells_between(box[0], box[1], whole.spacing, START) for box in boxes if box is not None
+        cells_between(box[0], box[1], domain_grid.spacing, START)
+        for box in boxes
+        if box is not None
     ]
     follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
-    coverage = DomainWindow(whole, follows, tuple(corners[: len(scene.source)]), scene.endless)
+    coverage = DomainWindow(
+        domain_grid, follows, tuple(corners[: len(scene.source)]), scene.endless
+    )
     low, high = zip(*corners, strict=True) if follows else ([0], [0])
     return coverage, coverage.around(np.min(low, axis=0), np.max(high, axis=0))
 

@@ -288,9 +288,9 @@ class NarrowBand:
         shift = (self._steps * step) % 1.0
         for number, part in zip(self._shift, shift, strict=True):
             number.value = float(part)
-        self._quota.run(variant=self._here)
+        self._quota.run(variant=self._owns_cells)
         self.fresh = int(self._sum.numpy()[0])
-        if self._here and self.fresh:
+        if self._owns_cells and self.fresh:
             self._seed(particles, saved, first)
         self.held -= self._sum_over_ranks(self.fresh)
 
@@ -304,7 +304,7 @@ class NarrowBand:
             dt: time step [s].
         """
         self._way.value = dt / self.grid.spacing
-        self._carrying.run(velocity, variant=self._here)
+        self._carrying.run(velocity, variant=self._owns_cells)
         self.interior = self._summed(self._window, launched=True)
         self._at_rest.value = self.density
 
@@ -328,14 +328,14 @@ class NarrowBand:
                 way=self._way,
             )
         self.grid.part.fill(self.depth, *self.velocity)
-        if self._here:
+        if self._owns_cells:
             self._launch_sums(self._owned)
 
     def _launch_quota(self) -> None:
         """Launch the count of fresh particles of each cell."""
         clear(self._total)
         where = [self.boundary.base, self._now, self.depth, self._total.reshape(self.grid.shape)]
-        if self._here:
+        if self._owns_cells:
             self._owned.launch(
                 kernels.quota_kernel,
                 [self._numbered, self.width, self._each, self._seeds, self._shift[0], *where],
@@ -375,16 +375,16 @@ class NarrowBand:
     def state(self) -> dict[str, np.ndarray]:
         """Return the state of the band; unused values are 0, for better compression."""
         depth = self.depth.numpy()
-        wanted = depth > min(self.width - BEYOND, self.full - 1.0)
+        deep = depth > min(self.width - BEYOND, self.full - 1.0)
         faces = {}
         for axis, field in enumerate(self.velocity):
-            near = wanted | np.roll(wanted, 1, axis=2 - axis)
+            near = deep | np.roll(deep, 1, axis=2 - axis)
             faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
         # All sums but the counts of bad values. They include cells where solids were, in an order
         # that depends on windows.
         inside = list(vars(self.interior).values())[:7]
         sums = np.hstack([self.held, self.width, *inside])
-        return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
+        return {"depth": np.where(deep, depth, np.float32(0.0)), "interior": sums} | faces
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore `state`.
@@ -423,7 +423,7 @@ class NarrowBand:
         for number, end in zip(self._last, window.high, strict=False):
             number.value = end - 1
         own = window.common(self._own)
-        self._here = own is not None  # whether any of its cells are this grid's own
+        self._owns_cells = own is not None  # whether any of its cells are this grid's own
         if own is not None:
             self._owned.move_to(own)
 
@@ -469,7 +469,7 @@ class NarrowBand:
         `fallen` passes have been made. The shortest path to the surface may cross several ranks.
         """
         self._relax_here(fallen)
-        part, falls = self.grid.part, self.grid.part.across is not None
+        part, falls = self.grid.part, self.grid.part.comm is not None
         while falls:
             before = self._now.numpy().copy()
             part.fill(self._now)

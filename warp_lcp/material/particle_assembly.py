@@ -112,7 +112,7 @@ def make_bodies(
     walls = domain_walls(
         scene.domain.size, open_sides=side_bits(scene.domain.open), endless=scene.endless
     )
-    others = [
+    other_shapes = [
         obstacle(solid, scene.dimension)
         for number, solid in enumerate(placed, start=1)
         if number not in motions
@@ -132,7 +132,7 @@ def make_bodies(
         bodies,
         shapes,
         list(motions),
-        (walls, *others),
+        (walls, *other_shapes),
         scene.dimension,
         **({"joints": joints} if joints else {}),
     )

@@ -54,7 +54,7 @@ class ParticleCheckpoints(ParticleFrames):
         """Continue on another grid of the same domain."""
 
     @abstractmethod
-    def _lay_anew(self, grid: StaggeredGrid) -> None:
+    def _move_window(self, grid: StaggeredGrid) -> None:
         """Allocate another grid; its fields have no values yet."""
 
     @abstractmethod
@@ -216,7 +216,7 @@ class ParticleCheckpoints(ParticleFrames):
 
         Its particles and fields have no values yet.
         """
-        self._lay_anew(part.grid)
+        self._move_window(part.grid)
         part.ranks.free_ended()
 
     def _take_pieces(self, pieces: Sequence[Piece], expected: int) -> None:
@@ -232,10 +232,10 @@ class ParticleCheckpoints(ParticleFrames):
             self.bodies.state() if self.bodies is not None else {},
         )
         band = self.band.state() if self.band is not None else {}
-        own = self.own_state() | band
-        solids = None if self.boundary.moves else own["cells"]
+        own_state = self.own_state() | band
+        solids = None if self.boundary.moves else own_state["cells"]
         particles, cells, numbers = part.take_pieces(
-            pieces, names, own | bodies, signature(self.scene, self.grid), solids
+            pieces, names, own_state | bodies, signature(self.scene, self.grid), solids
         )
         interior = int(numbers["interior"][0]) if self.band is not None else 0
         everyone = int(part.ranks.sum(len(particles["place"]))) + interior
@@ -244,10 +244,12 @@ class ParticleCheckpoints(ParticleFrames):
         self.particles.exchange.assign(particles, particles["place"])
         self._faces_know = False
         self.rearrangement.expect(cells)
-        state = own | self.rearrangement.state()
+        state = own_state | self.rearrangement.state()
         for name, values in cells.items():
             part.box_of(state[name])[...] = values
-        self._take_fields(state | {name: numbers[name] for name in own.keys() & numbers.keys()})
+        self._take_fields(
+            state | {name: numbers[name] for name in own_state.keys() & numbers.keys()}
+        )
         self._take_clock(numbers)
 
     def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:

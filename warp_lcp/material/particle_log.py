@@ -28,7 +28,9 @@ COLUMNS = (
 )
 
 
-def columns(own: Sequence[str], told: Mapping[str, bool], bodies: Sequence[str]) -> tuple[str, ...]:
+def columns(
+    model_columns: Sequence[str], optional_columns: Mapping[str, bool], bodies: Sequence[str]
+) -> tuple[str, ...]:
     """Return the names of the log's columns.
 
     Units are SI; in 2-D mass and energies are per meter of depth. Energies are the particles' own;
@@ -55,11 +57,16 @@ def columns(own: Sequence[str], told: Mapping[str, bool], bodies: Sequence[str])
     other, or nearly do.
 
     Args:
-        own: columns of the material's own models.
-        told: names of further columns, and whether a scene has them.
+        model_columns: columns of the material's own models.
+        optional_columns: names of further columns, and whether a scene has them.
         bodies: columns of the rigid bodies.
     """
-    return (*COLUMNS, *own, *(name for name, wanted in told.items() if wanted), *bodies)
+    return (
+        *COLUMNS,
+        *model_columns,
+        *(name for name, wanted in optional_columns.items() if wanted),
+        *bodies,
+    )
 
 
 class Moved(NamedTuple):

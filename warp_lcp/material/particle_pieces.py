@@ -75,20 +75,20 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
         if all(name in piece for piece in pieces)
     }
     like = {name: values for name, values in like.items() if name not in LATER} | later
-    whole, covered, fields = {}, 0, fields_of(like)
+    state, covered, fields = {}, 0, fields_of(like)
     for name, values in like.items():
         if name in fields:
-            whole[name] = np.array(values)
+            state[name] = np.array(values)
         elif values.ndim == 2 and name not in ALIKE:
-            whole[name] = np.concatenate([piece[name] for piece in pieces])[order]
+            state[name] = np.concatenate([piece[name] for piece in pieces])[order]
         else:
-            whole[name] = np.asarray(pieces[0][name])
+            state[name] = np.asarray(pieces[0][name])
     for piece in pieces:
         low, high = piece["box"] + 1  # a ring of cells lies around the domain
         covered += int(np.prod(high - low))
         for name in fields:
             z, y, x = (slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
-            whole[name][..., z, y, x] = piece[name]
+            state[name][..., z, y, x] = piece[name]
     if covered != np.prod(pieces[0]["counts"]):
         raise ValueError("the pieces do not cover the domain: some are missing or duplicated")
-    return whole
+    return state

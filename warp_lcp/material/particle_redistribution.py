@@ -67,7 +67,7 @@ class ParticleRedistribution:
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
         if scene.density_correction is not None and settings is not None:
-            self.correction = self._made()
+            self.correction = self._make_correction()
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
         severe = SEVERE if boundary.thin is None or not boundary.thin.moves else SEVERE_THIN
@@ -151,7 +151,7 @@ class ParticleRedistribution:
             with watch.stage("reseeding", *particles.arrays().values()):
                 row["reseeded"] = self.reseeding.apply(particles, window, step)
         if self._parts(step):
-            correction = self.correction = self.correction or self._made()
+            correction = self.correction = self.correction or self._make_correction()
             with watch.stage(
                 "density correction",
                 particles.position,
@@ -252,12 +252,14 @@ class ParticleRedistribution:
     def expect(self, state: Mapping[str, np.ndarray]) -> None:
         """Prepare for a state from before or after the first correction."""
         if self.density_monitor is not None:
-            self.correction = (self.correction or self._made()) if STATE in state else None
+            self.correction = (
+                (self.correction or self._make_correction()) if STATE in state else None
+            )
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from a checkpoint's `state`."""
         if self.correction is not None:
             self.correction.x.assign(state[STATE])
 
-    def _made(self) -> DensityCorrection:
+    def _make_correction(self) -> DensityCorrection:
         return make_density_correction(self._scene, self._grid, self._boundary)

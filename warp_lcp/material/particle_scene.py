@@ -230,28 +230,28 @@ class ParticleScene(Scene):
     def complaints(self) -> list[Complaint]:
         """Return errors that concern several keys."""
         key, materials = self.materials()
-        found = (
+        complaints = (
             []
             if materials or self.source
             else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
         )
-        found += self.shape_complaints(key, materials, inside=True)
-        found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints(
-            "drain", self.drain, inside=True
-        )
+        complaints += self.shape_complaints(key, materials, inside=True)
+        complaints += self.shape_complaints(
+            "source", self.source, inside=True
+        ) + self.shape_complaints("drain", self.drain, inside=True)
         if self.particles.narrow_band is not None and not self.carried_by_grid:
             message = "is for liquids only: the state of sand is stored on its particles"
-            found.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(Complaint(("particles", "narrow_band"), None, message))
         if self.output.forces and not self.carried_by_grid:
-            found.append(Complaint(("output", "forces"), True, "is for liquids only"))
+            complaints.append(Complaint(("output", "forces"), True, "is for liquids only"))
         for number, source in enumerate(self.source if not self.carried_by_grid else []):
             if source.viscosity is not None:
-                found.append(
+                complaints.append(
                     Complaint(
                         ("source", number, "viscosity"), source.viscosity, "is for liquids only"
                     )
                 )
-        return super().complaints() + found + self._reseed_complaints()
+        return super().complaints() + complaints + self._reseed_complaints()
 
     def notes(self) -> list[str]:
         """Return settings that look like mistakes."""
@@ -317,12 +317,12 @@ class ParticleScene(Scene):
 
     def _source_sites(self, source: Source, *, later: bool) -> int:
         """Return the most particles of a source, at its start and until the run ends."""
-        held = self._sites(source.bounds(self.dimension), whole_cells=True)
-        at_start = int(held.prod()) if later or source.begin == 0.0 else 0
+        sites = self._sites(source.bounds(self.dimension), whole_cells=True)
+        at_start = int(sites.prod()) if later or source.begin == 0.0 else 0
         seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
         speed = np.abs(source.velocity)
         # A lattice that moves along an axis may have one more point there.
-        across = held + (speed > 0.0)
+        across = sites + (speed > 0.0)
         layers = np.where(
             speed > 0.0,
             np.ceil(speed * seconds * self.particles.per_axis / self.spacing) + 1.0,
@@ -332,7 +332,7 @@ class ParticleScene(Scene):
             layers[axis] * np.delete(across, axis).prod(dtype=float)
             for axis in range(self.dimension)
         )
-        return at_start + (int(min(let_in, 2.0**62)) if later and held.all() else 0)
+        return at_start + (int(min(let_in, 2.0**62)) if later and sites.all() else 0)
 
     def _band_volume(self, shape: MaterialProperties, width: float) -> float:
         """Return the volume of a shape's box in a narrow band [m^3; m^2 in 2-D].

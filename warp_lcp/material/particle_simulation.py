@@ -201,12 +201,12 @@ class ParticleSimulation(ParticleCheckpoints):
             state: the state to continue from; None for the current one.
         """
         before, kept = self.grid, self._fields() if state is None else state
-        self._lay_anew(grid)
+        self._move_window(grid)
         if state is None:
             self.rearrangement.expect(kept)
             self._take_fields(carry_over(kept, before, grid, self._fields()))
 
-    def _lay_anew(self, grid: StaggeredGrid) -> None:
+    def _move_window(self, grid: StaggeredGrid) -> None:
         """Allocate another grid; its fields have no values yet."""
         assert self._make_parts is not None, "this grid is kept"
         for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
@@ -577,7 +577,7 @@ class ParticleSimulation(ParticleCheckpoints):
         )
         if not early:
             after = self._totals_after_move("after")
-            stopped, pushed, stuck = self.met()
+            stopped, pushed, stuck = self.collision_counts()
         rearranged: Row = {"max_density": self.rearrangement.max_density}
         if self.rearrangement.due(self.step_count):
             fill = self.band.fill_interior if self.band is not None else None
@@ -592,7 +592,7 @@ class ParticleSimulation(ParticleCheckpoints):
                 )
             if early:
                 # As read with the solve, before particles have been displaced.
-                stopped, pushed, stuck = self.met()
+                stopped, pushed, stuck = self.collision_counts()
             if (
                 early
                 or self.rearrangement.moved
@@ -665,12 +665,14 @@ class ParticleSimulation(ParticleCheckpoints):
             if self.boundary.thin is not None:
                 self.boundary.thin.stop(self.particles.position, still=not self.boundary.moves)
 
-    def met(self) -> tuple[int, int, int]:
+    def collision_counts(self) -> tuple[int, int, int]:
         """Return numbers of particles that met a wall, were pushed, and are stuck.
 
         They are those of all ranks. The counts are those of the last `carry`.
         """
-        met, pushed, stuck = self.grid.part.ranks.sum(np.array(self.boundary.met())).tolist()
+        met, pushed, stuck = self.grid.part.ranks.sum(
+            np.array(self.boundary.collision_counts())
+        ).tolist()
         return met, pushed, stuck
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
@@ -690,7 +692,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
         See `warp_lcp.material.particle_log.columns`.
         """
-        told = {
+        optional_columns = {
             **{
                 "stopped": True,
                 "pushed": self.boundary.moves,
@@ -704,7 +706,9 @@ class ParticleSimulation(ParticleCheckpoints):
             "departed": bool(self.scene.domain.open),
         }
         return columns(
-            self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ()
+            self.own_columns(),
+            optional_columns,
+            self.bodies.columns() if self.bodies is not None else (),
         )
 
     def notes(self) -> list[str]:

@@ -56,13 +56,13 @@ def check_state(
             "the state's particles are a narrow band: this scene has no particles.narrow_band"
         )
     for name, value in expected.items():
-        given = np.asarray(state[name])
+        array = np.asarray(state[name])
         if name in changing:
             value = np.empty((len(state["position"]), 3), dtype=value.dtype)
-        if given.shape != value.shape or given.dtype != value.dtype:
-            found, wanted = f"{given.dtype}{given.shape}", f"{value.dtype}{value.shape}"
+        if array.shape != value.shape or array.dtype != value.dtype:
+            found, wanted = f"{array.dtype}{array.shape}", f"{value.dtype}{value.shape}"
             raise ValueError(f"the state's {name} is {found}: this scene has {wanted}")
-        if given.dtype.kind == "f" and not np.isfinite(given).all():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"the state's {name} holds values that are not finite")
     if not solids_move and not np.array_equal(state["cells"] == SOLID, expected["cells"] == SOLID):
         raise ValueError("the state's solids are not this scene's")
@@ -107,11 +107,11 @@ def particle_trouble(
             "position",
             ((position < 0.0) | (position > end))[:, : grid.dimension].any(axis=1),
         )
-    found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
-    if not len(found):
+    indices, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
+    if not len(indices):
         return ""
     # The cell into which it was last sorted.
-    k, j, i = np.unravel_index(int(particles.key.numpy()[found[0]]), grid.shape)
+    k, j, i = np.unravel_index(int(particles.key.numpy()[indices[0]]), grid.shape)
     # Counted from 0.
     cell = tuple(int(c) - 1 + before for c, before in zip((i, j, k), grid.origin, strict=True))
-    return f"{field} is {wrong} in cell (x, y, z) = {cell} ({len(found)} particles)"
+    return f"{field} is {wrong} in cell (x, y, z) = {cell} ({len(indices)} particles)"

@@ -69,18 +69,18 @@ def resampled(
         ).astype(np.int64)
     size = grid.extent[:dimension]
     margin = 1.1 * MARGIN * grid.spacing  # more than is asked for: float32 rounds
-    placed = _placed(position[parent], offset, admits, margin, size - margin)
-    moved = np.linalg.norm(placed - position[parent] - offset, axis=1) > grid.spacing * MARGIN
+    positions = _placed(position[parent], offset, admits, margin, size - margin)
+    moved = np.linalg.norm(positions - position[parent] - offset, axis=1) > grid.spacing * MARGIN
     velocity = state["velocity"].astype(np.float64)[parent]
     arrays = {
         name: value[parent] for name, value in state.items() if name.startswith(("affine_", "kept"))
     }
     for axis in range(dimension if "affine_0" in arrays else 0):
-        velocity[:, axis] += (arrays[f"affine_{axis}"] * (placed - position[parent])).sum(axis=1)
+        velocity[:, axis] += (arrays[f"affine_{axis}"] * (positions - position[parent])).sum(axis=1)
     if len(parent):
         velocity += state["velocity"].mean(axis=0, dtype=np.float64) - velocity.mean(axis=0)
     return arrays | {
-        "position": placed.astype(np.float32),
+        "position": positions.astype(np.float32),
         "velocity": velocity.astype(np.float32),
     }, int(moved.sum())
 
@@ -124,11 +124,11 @@ def _placed(
         points[:, :dimension] = np.clip(points[:, :dimension], low, high)
         return points
 
-    placed, plain = inside(start + offset), inside(start.copy())
-    wrong = ~admits(placed)
-    placed[wrong] = plain[wrong]
-    wrong[wrong] = ~admits(placed[wrong])
+    positions, plain = inside(start + offset), inside(start.copy())
+    wrong = ~admits(positions)
+    positions[wrong] = plain[wrong]
+    wrong[wrong] = ~admits(positions[wrong])
     if wrong.any() and not wrong.all():
-        free = placed[~wrong]
-        placed[wrong] = free[cKDTree(free).query(placed[wrong])[1]]
-    return placed
+        free = positions[~wrong]
+        positions[wrong] = free[cKDTree(free).query(positions[wrong])[1]]
+    return positions

@@ -78,7 +78,7 @@ class Reseeding:
         low, high = grid.part.owned.low, grid.part.owned.high
         beside = grid.window(low[::-1], [n - 1 for n in high[::-1]], grow=1).common(grid.domain)
         assert beside is not None, "a process has cells"
-        self._asked = beside  # cells that may take: this process's, and those beside them
+        self._candidates = beside  # cells that may take: this process's, and those beside them
         self._inside = ActiveWindow(grid.domain)  # those of a step
         self._setting = self._settings()
         self._seed, self._list = Scalar(), ListMemory(grid.device)
@@ -118,7 +118,7 @@ class Reseeding:
             return 0
         particles.arrange(SORTED)
         # Beyond open sides is air without particles; beyond that are no cells.
-        inside = window.common(self._asked)
+        inside = window.common(self._candidates)
         self._seed.value = step
         if inside is not None:
             self._inside.move_to(inside)

@@ -236,20 +236,22 @@ class Sources:
         Particles may have entered cells that another process owns.
         """
         self._counting.run(particles)
-        mine, part = np.asarray(self._counts.numpy()), self.grid.part
-        if part.across is None:
-            return mine
+        own_counts, part = np.asarray(self._counts.numpy()), self.grid.part
+        if part.comm is None:
+            return own_counts
         nx, ny, _ = self.grid.domain_counts
         k, j, i = (self._cells + np.array(self.grid.origin)[::-1]).T.astype(np.int64)
         cells = (k * ny + j) * nx + i
-        found = np.flatnonzero(mine)
-        everyone = np.concatenate(part.ranks.collect(np.stack([cells[found], mine[found]])), axis=1)
+        found = np.flatnonzero(own_counts)
+        all_counts = np.concatenate(
+            part.ranks.collect(np.stack([cells[found], own_counts[found]])), axis=1
+        )
         order = np.argsort(cells)
-        place = np.searchsorted(cells[order], everyone[0])
+        place = np.searchsorted(cells[order], all_counts[0])
         known = place < len(cells)
-        known[known] = cells[order][place[known]] == everyone[0][known]
+        known[known] = cells[order][place[known]] == all_counts[0][known]
         total = np.zeros(len(cells), dtype=np.int64)
-        np.add.at(total, order[place[known]], everyone[1][known])
+        np.add.at(total, order[place[known]], all_counts[1][known])
         return total
 
     def _count(self, particles: Particles) -> None:
@@ -320,7 +322,7 @@ class Sources:
             "grazed": GRAZED,
             "margin": 1.1 * MARGIN * grid.spacing,
         }
-        given = {
+        kernel_args = {
             "slots": self._fields[0].flatten(),
             "owner": self._fields[1],
             "span": self._span.array,
@@ -330,7 +332,7 @@ class Sources:
             kernels.ENTER,
             int(self._lattice.count.value),
             grid,
-            **given,
+            **kernel_args,
             **numbers,
             **lengths,
             **size,

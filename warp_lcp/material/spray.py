@@ -106,15 +106,15 @@ class Spray:
             time: time at the start of the step [s].
             dt: its length [s].
         """
-        own, dx, before = self.particles, particles.grid.spacing, particles.count
-        if own.count:
+        spray, dx, before = self.particles, particles.grid.spacing, particles.count
+        if spray.count:
             reach = 0.5 * AWAY * dx
-            near = self._within(own, totals.low - reach, totals.high + reach) | self._meets(
-                own, time, dt, dx
+            near = self._within(spray, totals.low - reach, totals.high + reach) | self._meets(
+                spray, time, dt, dx
             )
-            self._move(own, particles, near)
+            self._move(spray, particles, near)
         if self.active and step % EVERY == 0 and particles.count:
-            self._move(particles, own, self._leaves(particles, time, dt, dx))
+            self._move(particles, spray, self._leaves(particles, time, dt, dx))
         return totals if particles.count == before else particles.totals()
 
     def fly(self, change: np.ndarray, dt: float) -> None:
@@ -137,13 +137,13 @@ class Spray:
 
     def behind(self, name: str, array: np.ndarray) -> np.ndarray:
         """Append the spray's array to that of the particles on the grid, (n, 3)."""
-        own = self.particles.arrays().get(name)
+        own_array = self.particles.arrays().get(name)
         return np.concatenate(
             [
                 array,
                 np.zeros((self.particles.count, 3), dtype=array.dtype)
-                if own is None
-                else own.numpy(),
+                if own_array is None
+                else own_array.numpy(),
             ]
         )
 

@@ -298,7 +298,7 @@ class MonotoneAggregation:
         more = suits_multigrid(operator.matrix())
         while more:
             host, n = operator.matrix(), operator.unknowns
-            found = _aggregates(host) if n > COARSEST else None
+            aggregates = _aggregates(host) if n > COARSEST else None
             x, b, lower, upper, y = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(5))
             self._levels.append(
                 AggregateLevel(
@@ -308,12 +308,14 @@ class MonotoneAggregation:
                     lower,
                     upper,
                     y,
-                    None if found is None else Aggregation.of(found, device),
+                    None if aggregates is None else Aggregation.of(aggregates, device),
                 )
             )
-            more = found is not None
-            if found is not None:
-                operator = SparseOperator(found.T @ host @ found, device=device, dtype=wp.float64)
+            more = aggregates is not None
+            if aggregates is not None:
+                operator = SparseOperator(
+                    aggregates.T @ host @ aggregates, device=device, dtype=wp.float64
+                )
         return len(self._levels) > 1
 
     def cycle(self, x: DeviceArray, b: DeviceArray, lower: DeviceArray, upper: DeviceArray) -> None:

@@ -146,11 +146,11 @@ class LineLevel:
     def factoring(self) -> list[BoundKernel]:
         """Return the kernels that factor the lines' tridiagonal systems."""
         _, ny, nx = self.padding.counts
-        made = []
+        bound_kernels = []
         for rows, (pivots, multiples), step, count in zip(
             (self.rows, self.columns), self.lines, (1, self.padding.row), (nx, ny), strict=True
         ):
-            made.append(
+            bound_kernels.append(
                 FACTOR.bind(
                     rows,
                     self.fields,
@@ -162,7 +162,7 @@ class LineLevel:
                     count=count,
                 )
             )
-        return made
+        return bound_kernels
 
     def coarsening(self, coarse: LineLevel) -> BoundKernel:
         """Return the kernel that computes the next level's matrix."""

@@ -22,14 +22,14 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
     An aggregate has so many cells along x, y, z. Its neighbors are those of its cells, and theirs
     along axes that are aggregated.
     """
-    found = set()
+    places = set()
     for offset in pattern.offsets:
         steps = [
             {step, 0} if factor == 2 else {step}
             for step, factor in zip(offset, factors, strict=True)
         ]
-        found |= {tuple(place) for place in itertools.product(*steps)}
-    offsets = sorted(found - {(0, 0, 0)}, key=lambda o: o[::-1])
+        places |= {tuple(place) for place in itertools.product(*steps)}
+    offsets = sorted(places - {(0, 0, 0)}, key=lambda o: o[::-1])
     return Pattern(
         tuple(o for o in offsets if not pattern.symmetric or o[::-1] < (0, 0, 0)),  # type: ignore[misc]
         pattern.symmetric,

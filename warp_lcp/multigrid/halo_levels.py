@@ -107,7 +107,7 @@ def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner
 
     They are boxes low <= (k, j, i) < high that do not overlap.
     """
-    low, high, found = [0, 0, 0], list(stencil.padding.counts), list[tuple[Corner, Corner]]()
+    low, high, boxes = [0, 0, 0], list(stencil.padding.counts), list[tuple[Corner, Corner]]()
     for axis, end in stencil.ghosts.cuts if stencil.ghosts is not None else ():
         a, first, last = 2 - axis, low.copy(), high.copy()
         if end:
@@ -116,8 +116,8 @@ def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner
         else:
             low[a] = min(low[a] + depth, high[a])
             last[a] = low[a]
-        found.append((first, last))
-    return found
+        boxes.append((first, last))
+    return boxes
 
 
 def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
@@ -131,7 +131,7 @@ def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> It
     ]:
         yield from level.stencil.fillings(field)
     s, (first, second) = level.stencil, level.settings.weights
-    everywhere, inside = Rows.stored(s.padding, s.device), s.rows.after_ghosts()
+    all_rows, inside = Rows.stored(s.padding, s.device), s.rows.after_ghosts()
     into_ring = level.sweeping(
         level.t,
         level.x,
@@ -139,7 +139,7 @@ def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> It
         projected=projected,
         from_zero=True,
         kind=passes.SWEEP_INTO_RING,
-        rows=everywhere,
+        rows=all_rows,
     )
     out_of_ring = level.sweeping(
         level.x, level.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING, rows=inside

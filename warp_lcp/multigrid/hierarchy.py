@@ -361,8 +361,8 @@ class Hierarchy:
         All axes are coarsened, or only the strong ones where axes differ much.
         """
         s, counts = fine.stencil, fine.stencil.padding.counts
-        whole = whole_counts(s)
-        factors = self._factors(whole)
+        total_counts = whole_counts(s)
+        factors = self._factors(total_counts)
         nz, ny, nx = (-(-n // f) for n, f in zip(counts, reversed(factors), strict=True))
         padding = Padding((nz, ny, nx), s.padding.small_pages)
         # A coarse face sums as many finer ones as cells are aggregated along the other axes.
@@ -397,7 +397,7 @@ class Hierarchy:
         level.factors, level.block = factors, block
         # If the cells are only halved, visiting every level twice would cost as much on each of
         # them: only every second level is visited twice.
-        level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
+        level.shrunk = fine.shrunk * math.prod(total_counts) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:
             most = (
                 self.settings.revisited_cuda if self.device.is_cuda else self.settings.revisited_cpu
@@ -410,13 +410,15 @@ class Hierarchy:
         """Return the number of cells in an aggregate along x, y and z."""
         long = [n > 1 for n in reversed(counts)]
         strongest = max(w for w, more in zip(self._strength, long, strict=True) if more)
-        chosen = [
+        coarsened = [
             more and w >= self.settings.semicoarsening_threshold * strongest
             for w, more in zip(self._strength, long, strict=True)
         ]
         # An axis of one cell may be aggregated with its ghost cell. The result is the same, and
         # isotropic grids keep one variant of their kernels.
-        return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
+        return tuple(
+            1 if more and not take else 2 for more, take in zip(long, coarsened, strict=True)
+        )  # type: ignore[return-value]
 
 
 def _finest_level(

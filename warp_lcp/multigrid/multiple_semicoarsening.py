@@ -146,7 +146,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
     relative = logs - logs.max(axis=1, keepdims=True)
     # Blocks are grouped by their strong axes: those within TURN of the strongest one.
     ways, way_of = np.unique(relative > -math.log(TURN), axis=0, return_inverse=True)
-    mean, found = np.log(np.maximum(np.array(stencil.mean_weights)[long], 1e-300)), []
+    mean, strengths = np.log(np.maximum(np.array(stencil.mean_weights)[long], 1e-300)), []
     for way in range(len(ways)):
         members = relative[way_of == way]
         if len(members) < SHARE * len(relative):
@@ -156,8 +156,8 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
         if _mismatch(typical[None], mean)[0] > math.log(TURN):
             strength = np.full(3, LEAST)
             strength[long] = np.exp(typical)
-            found.append(strength.tolist())
-    return found
+            strengths.append(strength.tolist())
+    return strengths
 
 
 def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ class FloatingComponents:
     Args:
         label: component of each stored cell, -1 where there is none.
         device: of the fields.
-        across: communicator if components reach over several ranks; None if serial.
+        comm: communicator if components reach over several ranks; None if serial.
         left: w, a flat stored field; None: 1.
         right: v, likewise.
     """
@@ -144,12 +144,12 @@ class FloatingComponents:
         self,
         label: np.ndarray,
         device: wp.Device,
-        across: Communicator | None = None,
+        comm: Communicator | None = None,
         *,
         left: np.ndarray | None = None,
         right: np.ndarray | None = None,
     ) -> None:
-        self.device, self.label, self._across = device, label, across
+        self.device, self.label, self._comm = device, label, comm
         self.left, self.right = left, right
         self.count = int(self._largest(label.max())) + 1
         self.sizes = self._total(
@@ -163,36 +163,34 @@ class FloatingComponents:
 
     def _total(self, sums: np.ndarray) -> np.ndarray:
         """Return sums over all ranks."""
-        return sums if self._across is None else self._across.sum(sums)
+        return sums if self._comm is None else self._comm.sum(sums)
 
     def _largest(self, values: np.ndarray) -> np.ndarray:
         """Return the largest values over all ranks."""
-        return values if self._across is None else self._across.max(values)
+        return values if self._comm is None else self._comm.max(values)
 
-    def without(self, gone: np.ndarray) -> FloatingComponents | None:
+    def without(self, removed: np.ndarray) -> FloatingComponents | None:
         """Return the components except some that are not floating.
 
         None if none is left.
 
         Args:
-            gone: mask of the components to remove, bool of shape (count,).
+            removed: mask of the components to remove, bool of shape (count,).
         """
-        if not gone.any():
+        if not removed.any():
             return self
-        if gone.all():
+        if removed.all():
             return None
-        number = np.where(gone, -1, np.cumsum(~gone) - 1).astype(np.int32)
+        number = np.where(removed, -1, np.cumsum(~removed) - 1).astype(np.int32)
         label = np.where(self.label >= 0, number[self.label], -1).astype(np.int32)
-        return FloatingComponents(
-            label, self.device, self._across, left=self.left, right=self.right
-        )
+        return FloatingComponents(label, self.device, self._comm, left=self.left, right=self.right)
 
     def transposed(self) -> FloatingComponents:
         """Return the floating components of A'."""
         if self.left is None and self.right is None:
             return self
         return FloatingComponents(
-            self.label, self.device, self._across, left=self.right, right=self.left
+            self.label, self.device, self._comm, left=self.right, right=self.left
         )
 
     def unattainable(self, b: DeviceArray, lower: DeviceArray, upper: DeviceArray) -> float:
@@ -242,9 +240,9 @@ class FloatingComponents:
             [self._label, free, r, self._sums, self._held],
             device=self.device,
         )
-        if self._across is not None:
-            self._sums.assign(self._across.sum(self._sums.numpy()))
-            self._held.assign(self._across.max(self._held.numpy()))
+        if self._comm is not None:
+            self._sums.assign(self._comm.sum(self._sums.numpy()))
+            self._held.assign(self._comm.max(self._held.numpy()))
         wp.launch(
             remove_means_kernel,
             n,
@@ -345,10 +343,10 @@ class ComponentFinder:
 
         `scratch` as in GridPoisson.floating_components.
         """
-        A, across = self._A, self._A.layout.across
-        if A._ghosts is not None and across is not None:
+        A, comm = self._A, self._A.layout.comm
+        if A._ghosts is not None and comm is not None:
             parent, grounded = self._grow(scratch, A.cells)
-            if not across.any(bool(self._count.numpy()[0])):
+            if not comm.any(bool(self._count.numpy()[0])):
                 return None
             number = self._numbers(parent.numpy(), grounded.numpy())
             held = (A.cells.numpy() == FLUID).ravel() & (number < 0)
@@ -357,7 +355,7 @@ class ComponentFinder:
                 for face, one in zip(A.faces, A.uniform, strict=True)
             ]
             label = A._ghosts.join_components(number, held, faces)
-            return None if label is None else FloatingComponents(label, A.device, across)
+            return None if label is None else FloatingComponents(label, A.device, comm)
         tell = self.look(scratch)
         if tell():
             return None
@@ -404,7 +402,7 @@ class ComponentFinder:
 
         `scratch` as of `find`. On ranks it searches this rank's cells alone, see `held_here`.
         """
-        shared = self._A.layout.across is not None
+        shared = self._A.layout.comm is not None
         self._search(scratch, self._A.cells if shared else self._A.cells_around, launch)
 
     @property

@@ -21,7 +21,7 @@ from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.problem.data_types import Matrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Derivatives
 from warp_lcp.problem.scale import scale_of_matrix
 
@@ -88,7 +88,9 @@ class DenseOperator(Pickled):
 
     def __reduce__(self) -> Reduced:
         """Pickle the current matrix."""
-        return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
+        return rebuilt_from(
+            DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype
+        )
 
     @property
     def unknowns(self) -> int:

@@ -74,7 +74,7 @@ class GridOperator(Pickled):
     _found: tuple[int, FloatingComponents | None] | None = None
     stencil: PaddedStencil
     _ghosts: Ghosts | None = None  # of a box of cells among others
-    _across: Communicator | None = None
+    _comm: Communicator | None = None
     _rounding = 0.0  # largest relative rounding of coefficients that were given as arrays
     outside = SOLID  # cell type beyond the array
     # Whether setting cells reads nothing from the device, so that it is recorded once.
@@ -95,7 +95,7 @@ class GridOperator(Pickled):
             device if device is not None else cells.device if isinstance(cells, wp.array) else None
         )
         self.dtype, self.shape = dtype, host.shape
-        self.layout = PaddedLayout(host.shape, self.device, self._across)
+        self.layout = PaddedLayout(host.shape, self.device, self._comm)
         counts = self.layout.padding.counts
         # Axes of one cell, too.
         self._wraps = flags = (*(bool(p) for p in periodic), False, False, False)[:3]
@@ -256,8 +256,8 @@ class GridOperator(Pickled):
 
         Of those given in float64; sums on the diagonal do not count.
         """
-        across = self.layout.across
-        return self._rounding if across is None else float(across.max(self._rounding))
+        comm = self.layout.comm
+        return self._rounding if comm is None else float(comm.max(self._rounding))
 
     def masked(self, free: Values, shift: Values | None = None) -> Self:
         """Return the principal system P A P + P D P.
@@ -313,7 +313,7 @@ class GridOperator(Pickled):
         Raises:
             TypeError: it is a part of a grid that ranks share, or a principal system.
         """
-        if self.layout.across is not None:
+        if self.layout.comm is not None:
             raise TypeError(
                 f"{type(self).__name__} is distributed over ranks and cannot be pickled: pickle "
                 "its cells and coefficients on each rank"
@@ -334,14 +334,14 @@ class GridOperator(Pickled):
 
         Of all ranks; collective.
         """
-        count, across = (
+        count, comm = (
             sum(
                 int(np.count_nonzero(plane == FLUID))
                 for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1]
             ),
-            self.layout.across,
+            self.layout.comm,
         )
-        return count if across is None else int(across.sum(count))
+        return count if comm is None else int(comm.sum(count))
 
     def _take_coefficients(self, cells: np.ndarray, *args: Any, **given: Any) -> None:
         """Check and store the data of the rows."""

@@ -27,7 +27,7 @@ from warp_lcp.operators.components import (
 from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import CellDecomposition, PaddedStencil
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import OnHost, Reduced, made_again
+from warp_lcp.problem.pickling import OnHost, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID, Derivatives
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
@@ -123,7 +123,7 @@ class GridPoisson(GridOperator):
             super().__init__(cells, coefficients, periodic, device, dtype)
             return
         decomposition.check_operator(np.shape(cells), periodic, coefficients)
-        self._ghosts, self._across = decomposition.ghosts, decomposition.across
+        self._ghosts, self._comm = decomposition.ghosts, decomposition.comm
         with decomposition.together():
             super().__init__(cells, coefficients, periodic, device, dtype)
 
@@ -253,7 +253,7 @@ class GridPoisson(GridOperator):
             type(self) is GridPoisson
             and self._mask is None
             and self._ghosts is None
-            and self.layout.across is None
+            and self.layout.comm is None
         )
         if not plain or self.device.is_cuda or self.layout.chunks is not None:
             return None
@@ -309,7 +309,7 @@ class GridPoisson(GridOperator):
             name: OnHost(v) if isinstance(v, wp.array) else v
             for name, v in self._arguments().items()
         }
-        return made_again(GridPoisson, cells, device=self.device, **given, **options)
+        return rebuilt_from(GridPoisson, cells, device=self.device, **given, **options)
 
     def _arguments(self) -> dict[str, Any]:
         faces = {
@@ -402,9 +402,9 @@ class GridPoisson(GridOperator):
         """Return the mean of the coefficients that are not 0."""
         if face.size == 0:
             return uniform
-        values, across = face.numpy(), self.layout.across
+        values, comm = face.numpy(), self.layout.comm
         sums = np.array([values.sum(dtype=np.float64), np.count_nonzero(values)])
-        total, count = sums if across is None else across.sum(sums)
+        total, count = sums if comm is None else comm.sum(sums)
         return float(total / max(count, 1))
 
     @property

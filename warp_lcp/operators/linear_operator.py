@@ -18,7 +18,7 @@ from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.problem.data_types import HasShape, Matrix, Multiplies, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
 
@@ -96,7 +96,7 @@ class LinearOperator(Pickled, Operator):
         transpose: Product | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
-        self._given = (A, shape, symmetric, diagonal, transpose)
+        self._arguments = (A, shape, symmetric, diagonal, transpose)
         self.shape = _shape_of(A, shape)
         self.device = checked_device("cpu" if device is None else device)
         self.layout = Layout(self.shape, self.device)
@@ -125,7 +125,7 @@ class LinearOperator(Pickled, Operator):
 
     def __reduce__(self) -> Reduced:
         """Pickle the constructor's arguments."""
-        return made_again(_made, *self._given, device=self.device)
+        return rebuilt_from(_made, *self._arguments, device=self.device)
 
     def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x, x of `shape` and type wp.float32 or wp.float64."""

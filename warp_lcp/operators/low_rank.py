@@ -19,10 +19,10 @@ from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.kernels.vectors import Communicator, Reduction, add_across
+from warp_lcp.kernels.vectors import Communicator, Reduction, sum_over_ranks
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Operator, layout_of
 
 
@@ -87,10 +87,10 @@ class BlockColumns:
         values: of type dtype, shape (capacity * width,), entry by entry.
         count: number of entries, and number of entries to be written, int32, shape (2,).
         sums: result of `gather`, float64, shape (rank,).
-        across: communicator if other ranks have rows of U; None if serial.
+        comm: communicator if other ranks have rows of U; None if serial.
     """
 
-    across: Communicator | None = None
+    comm: Communicator | None = None
 
     def __init__(
         self, size: int, blocks: int, width: int, dtype: DataType, device: wp.Device
@@ -205,8 +205,8 @@ class BlockColumns:
         ).launch(launch)
         if self._reduction is not None:
             self._reduction.add_up(0, columns=self.rank, launch=launch)
-        if self.across is not None:
-            add_across(self.across, self.sums, slice(0, self.rank), launch)
+        if self.comm is not None:
+            sum_over_ranks(self.comm, self.sums, slice(0, self.rank), launch)
         return self.sums
 
     def scatter(
@@ -331,7 +331,7 @@ class LowRankOperator(Pickled):
         user[self.layout.places()] = np.arange(int(np.prod(self.shape)))
         entries = (user[rows], blocks.copy(), values.copy())
         sizes = (self.shape, self.columns.rank // self.columns.width, self.columns.width)
-        return made_again(
+        return rebuilt_from(
             _of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype
         )
 
@@ -444,7 +444,7 @@ class LowRankOperator(Pickled):
 
     def _make(self, layout: Layout, columns: BlockColumns, weights: Values) -> None:
         """Set all attributes from stored columns and weights."""
-        self.layout, self.columns, columns.across = layout, columns, layout.across
+        self.layout, self.columns, columns.comm = layout, columns, layout.comm
         self.shape, self.device, self.dtype, self.rank, self.version = (
             layout.shape,
             layout.device,

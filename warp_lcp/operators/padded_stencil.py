@@ -137,13 +137,13 @@ class CellDecomposition(Protocol):
 
     Attributes:
         ghosts: fills ghost cells; None: there is one process.
-        across: communicator; None if serial.
+        comm: communicator; None if serial.
     """
 
     @property
     def ghosts(self) -> Ghosts | None: ...  # noqa: D102
     @property
-    def across(self) -> Communicator | None: ...  # noqa: D102
+    def comm(self) -> Communicator | None: ...  # noqa: D102
 
     def together(self) -> AbstractContextManager[object]:
         """Return a block that raises an exception of one process on all processes."""

@@ -69,14 +69,14 @@ class RestatedProblem:
             return wp.array(x.numpy()[self.place], dtype=x.dtype, device=self.given.device)
         return x if self.grid is None else x.flatten()
 
-    def result(self, found: SolveResult) -> SolveResult:
+    def result(self, inner_result: SolveResult) -> SolveResult:
         """Convert a result to the original problem."""
         if self.is_given:
-            return found
-        grid = found.grid if self.grid is None else self.grid
+            return inner_result
+        grid = inner_result.grid if self.grid is None else self.grid
         return replace(
-            found,
-            x=self.field(found.x),
+            inner_result,
+            x=self.field(inner_result.x),
             grid=grid,
             problem=self.given,
             version=version_of(self.given.A),

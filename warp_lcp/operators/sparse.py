@@ -32,7 +32,7 @@ from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.renumbering import Renumbering, renumbering
 from warp_lcp.problem.data_types import Matrix, SparseMatrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced, made_again
+from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Derivatives
 from warp_lcp.problem.scale import scale_of_matrix
 
@@ -170,7 +170,7 @@ class SparseOperator(Pickled):
 
     def __reduce__(self) -> Reduced:
         """Pickle the current matrix."""
-        return made_again(
+        return rebuilt_from(
             SparseOperator,
             self.matrix(),
             device=self.device,
@@ -530,9 +530,9 @@ def _check_indices(matrix: SparseMatrix) -> None:
         ) from reason
 
 
-def _near_null_space(given: Values, n: int) -> np.ndarray:
+def _near_null_space(vectors: Values, n: int) -> np.ndarray:
     """Return fields as an array of shape (n, k), float64."""
-    B = real_array(given, "near_null_space").astype(np.float64)
+    B = real_array(vectors, "near_null_space").astype(np.float64)
     B = B[:, None] if B.ndim == 1 else B
     if B.ndim != 2 or B.shape[0] != n or not 1 <= B.shape[1] <= 12:
         raise ValueError(

@@ -26,7 +26,7 @@ from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import OnHost, Reduced, made_again
+from warp_lcp.problem.pickling import OnHost, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID, Derivatives, Scratch
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
@@ -228,7 +228,7 @@ class Stencil(GridOperator):
         self.stencil.wrap(x)
         rows, cells = Rows.of(self.layout.padding, self.device), self.cells_around.flatten()
 
-        def of(offset: Offset, shape: tuple[int, ...]) -> DeviceArray | float:
+        def gradient_of(offset: Offset, shape: tuple[int, ...]) -> DeviceArray | float:
             """Return the derivative by the coefficients of an offset, of a given shape."""
             part = self.layout.zeros(wp.float64) if shape else None
             step, row, plane = (
@@ -257,8 +257,11 @@ class Stencil(GridOperator):
             for o, f in self._given.items()
         }
         given = self._shift_given
-        found = {_named(o, len(self.shape)): of(o, shape) for o, shape in shapes.items()}
-        return {"coefficients": found, "shift": None if given is None else of(CENTER, given)}
+        found = {_named(o, len(self.shape)): gradient_of(o, shape) for o, shape in shapes.items()}
+        return {
+            "coefficients": found,
+            "shift": None if given is None else gradient_of(CENTER, given),
+        }
 
     def transposed(self) -> Stencil:
         """Return A' as a stencil of arrays, without SOLID cells.
@@ -556,7 +559,7 @@ class Stencil(GridOperator):
             for o, f in self.given.items()
         }
         shift = OnHost(self.shift) if self.shift.size else None
-        return made_again(
+        return rebuilt_from(
             Stencil,
             cells,
             **self._arguments() | {"coefficients": coefficients, "shift": shift},

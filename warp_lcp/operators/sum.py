@@ -225,7 +225,5 @@ def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool
     columns = (blocks[inside, None] * k + np.arange(k)).astype(np.int64)
     np.add.at(sums_and_sizes[0], (at[inside, None], columns), values[inside])
     np.add.at(sums_and_sizes[1], (at[inside, None], columns), np.abs(values[inside]))
-    sums, sizes = (
-        sums_and_sizes if low.layout.across is None else low.layout.across.sum(sums_and_sizes)
-    )
+    sums, sizes = sums_and_sizes if low.layout.comm is None else low.layout.comm.sum(sums_and_sizes)
     return np.asarray((np.abs(sums) > FELT * sizes).any(axis=1))

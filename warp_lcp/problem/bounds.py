@@ -227,8 +227,8 @@ class Bounds:
 
     def _other_values(self) -> float:
         """Return the number of finite nonzero values in the last coding, on all ranks."""
-        found, across = float(self._others.reading.numpy()[0]), self.layout.across
-        return found if across is None else float(across.sum(found))
+        found, comm = float(self._others.reading.numpy()[0]), self.layout.comm
+        return found if comm is None else float(comm.sum(found))
 
     def as_field(self, side: int) -> DeviceArray:
         """Return a stored float64 field of the lower (0) or the upper bound (1)."""
@@ -265,11 +265,7 @@ class Bounds:
         Returns False, with nothing done, if their finite values differ or one is NaN. On ranks
         either all code their fields, or none.
         """
-        code, values, across = (
-            self.layout.host_zeros(wp.uint8),
-            list(self.values),
-            self.layout.across,
-        )
+        code, values, comm = (self.layout.host_zeros(wp.uint8), list(self.values), self.layout.comm)
         for side in (0, 1):
             host = real_array(sides[side], NAMES[side])
             if not self.varying[side]:
@@ -277,12 +273,12 @@ class Bounds:
                 continue
             takes = self.layout.fits(host) and host.dtype.kind in "fiu"
             value = float(host.max() if side == 0 else host.min()) if takes else math.nan
-            if across is not None:
-                value = float(across.max(value) if side == 0 else across.min(value))
+            if comm is not None:
+                value = float(comm.max(value) if side == 0 else comm.min(value))
             coded = not (value == -INFINITE[side] or np.isnan(value)) and self._code_rows(
                 side, host, value, code
             )
-            if not coded if across is None else across.any(not coded):
+            if not coded if comm is None else comm.any(not coded):
                 return False
             values[side] = value
         self.values = values

@@ -159,7 +159,7 @@ class LCP(Pickled):
             if self.in_place
             else self.b.numpy().copy()
         )
-        M = None if self.preconditioner is None else self.preconditioner.given
+        M = None if self.preconditioner is None else self.preconditioner.matrix
         return _made, (self.A, b, *self.bounds.given_again(), M)
 
     @property
@@ -275,7 +275,7 @@ class LCP(Pickled):
 
     def _totals(self, found: np.ndarray) -> list[int]:
         return [
-            int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))
+            int(n) for n in (found if self.layout.comm is None else self.layout.comm.sum(found))
         ]
 
     def _check(self) -> None:

@@ -42,7 +42,7 @@ def merits_at(problem: LCP, x: DeviceArray, y: DeviceArray) -> Merits:
         y: stored float64 field that receives A x + b.
     """
     problem.apply_plus(x, problem.b, y)
-    inside, across = problem.unknown.numpy() == 1, problem.layout.across
+    inside, comm = problem.unknown.numpy() == 1, problem.layout.comm
     at, slope, lower, upper = (v.numpy()[inside] for v in (x, y, problem.lower, problem.upper))
     by_upper = np.isfinite(upper) & ((slope < 0) | np.isinf(lower))
     by_lower = np.isfinite(lower) & ~by_upper
@@ -51,6 +51,6 @@ def merits_at(problem: LCP, x: DeviceArray, y: DeviceArray) -> Merits:
         terms = np.where(by_upper, -slope, slope)
         sums = np.array([distance @ terms, distance @ np.abs(terms)])
     largest = float(np.abs(at).max(initial=0.0))
-    if across is not None:
-        sums, largest = np.asarray(across.sum(sums)), float(across.max(largest))
+    if comm is not None:
+        sums, largest = np.asarray(comm.sum(sums)), float(comm.max(largest))
     return Merits(largest, abs(float(sums[0])), float(sums[1]))

@@ -68,7 +68,7 @@ class FieldsOnHost(Pickled):
         return type(self), tuple(OnHost(v) if isinstance(v, wp.array) else v for v in values)
 
 
-def made_again(
+def rebuilt_from(
     make: Callable[..., Made], *arguments: object, device: wp.Device, **options: object
 ) -> Reduced:
     """Return the value of an operator's `__reduce__`.

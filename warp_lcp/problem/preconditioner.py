@@ -43,7 +43,7 @@ class Preconditioner:
             )
         if shape != (n, n):
             raise ValueError(f"preconditioner has shape {shape}: expected {(n, n)}")
-        self.given = M
+        self.matrix = M
         u, v = np.random.default_rng(19520811).standard_normal((2, n))
         Mu, Mv = self(u), self(v)
         if not (np.isfinite(Mu).all() and np.isfinite(Mv).all()):
@@ -60,7 +60,7 @@ class Preconditioner:
         Raises:
             ValueError: the product is not real, or of another shape.
         """
-        z = np.asarray(self.given @ r)
+        z = np.asarray(self.matrix @ r)
         if z.shape != r.shape or z.dtype.kind not in "biuf":
             raise ValueError(
                 f"preconditioner gives products of shape {z.shape} and type {z.dtype}: expected "

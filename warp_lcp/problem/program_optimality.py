@@ -319,17 +319,22 @@ def has_no_solution(program: ProgramWithRows) -> str:
         [np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)],
         axis=1,
     )
-    still = _stacked(p.Q, p.C)
+    equalities = _stacked(p.Q, p.C)
     more = {"A_ub": -p.G, "b_ub": np.zeros(len(p.h))} if len(p.h) else {}
     program_result = linprog(
-        p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more
+        p.c,
+        A_eq=equalities,
+        b_eq=np.zeros(equalities.shape[0]),
+        bounds=sides,
+        method="highs",
+        **more,
     )
     if program_result.status != 0:
         return ""
     e = _without_rounding(np.clip(program_result.x, sides[:, 0], sides[:, 1]))
-    moved, up = np.abs(still @ e), p.G @ e
+    moved, up = np.abs(equalities @ e), p.G @ e
     small = 1e-2 * PROVED
-    flat = (moved <= small * (abs(still) @ np.abs(e)) + 1e-300).all() and (
+    flat = (moved <= small * (abs(equalities) @ np.abs(e)) + 1e-300).all() and (
         up >= -small * (abs(p.G) @ np.abs(e))
     ).all()
     return "unbounded" if flat and -float(p.c @ e) > PROVED * float(np.abs(p.c) @ np.abs(e)) else ""

@@ -57,7 +57,7 @@ class NaturalResidual:
         self.unit = float(stencil.unit) if stencil else 1.0
         # Of an operator whose scale is a copy.
         self._diagonal_of = None if stencil else version_of(problem.A)
-        self._sums = Sums(Rows.of_fields(layout), across=layout.across)
+        self._sums = Sums(Rows.of_fields(layout), comm=layout.comm)
         if not stencil:
             self.rescale()
 
@@ -226,5 +226,5 @@ class NaturalResidual:
 
     def _total(self, value: float) -> float:
         """Return the sum of a number over all ranks."""
-        across = self.problem.layout.across
-        return value if across is None else float(across.sum(value))
+        comm = self.problem.layout.comm
+        return value if comm is None else float(comm.sum(value))

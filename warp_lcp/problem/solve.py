@@ -404,12 +404,10 @@ def solve(
     reason = refusal(problem, solver)
     if reason is not None:
         raise ValueError(reason)
-    across, loop = (
-        (problem.layout.across, _LoopInBox) if isinstance(problem, LCP) else (None, _Loop)
-    )
+    comm, loop = (problem.layout.comm, _LoopInBox) if isinstance(problem, LCP) else (None, _Loop)
     stopping = stopping or StoppingCriteria()
     deadline = Deadline(
-        stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across
+        stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, comm
     )
     if workspace is None and (spare := spare_of(solver, problem)) is not None:
         result = loop(problem, solver, stopping, deadline, spare.work, callback).run(x0)
@@ -449,7 +447,7 @@ def refusal(
         return (
             f"preconditioner: {kind} does not use one: use MinimumMapNewton or PrimalDualActiveSet"
         )
-    if problem.layout.across is not None and not own.distributed:
+    if problem.layout.comm is not None and not own.distributed:
         return f"{kind} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton"
     return None
 
@@ -830,11 +828,11 @@ class _LoopInBox(_Loop):
             return
         inside = self.problem.unknown.numpy() == 1
         for name, field in (("b", self.problem.b), ("lower, upper", self.work.x)):
-            largest, across = (
+            largest, comm = (
                 float(np.abs(field.numpy()[inside]).max(initial=0.0)),
-                self.problem.layout.across,
+                self.problem.layout.comm,
             )
-            largest = largest if across is None else across.max(largest)
+            largest = largest if comm is None else comm.max(largest)
             if 0.0 < largest < SMALLEST:
                 raise ValueError(
                     f"{name}: largest value {largest:.1e}, whose square underflows in float64; "

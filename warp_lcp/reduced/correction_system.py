@@ -71,7 +71,7 @@ class CorrectionSystem:
             problem, real, bounded=problem.bounded, settings=settings.cycle
         )
         self.free = layout.zeros(wp.uint8)
-        self.sums = Sums(rows_of(x), 4, slots=SLOTS, across=layout.across)
+        self.sums = Sums(rows_of(x), 4, slots=SLOTS, comm=layout.comm)
         helped = problem.bounded and settings.safeguard
         self.cycles = (
             cold_cycles(problem, self.principal, self.sums, settings.monotone_cycles)

@@ -477,15 +477,17 @@ def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
     count, label = scipy.sparse.csgraph.connected_components(A, directed=False)
     # The largest diagonal entry of each component comes first.
     order = np.lexsort((-np.abs(A.diagonal()), label))
-    held = order[np.searchsorted(label[order], np.arange(count))]
-    rest = np.setdiff1d(np.arange(len(x)), held)
+    representatives = order[np.searchsorted(label[order], np.arange(count))]
+    rest = np.setdiff1d(np.arange(len(x)), representatives)
     # Right-hand sides for x_R (with x = 0 at the held unknowns) and for z_R (with z = 1 there).
-    sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
+    sides = np.stack(
+        [-data.b[rest], -np.asarray(A[rest][:, representatives].sum(axis=1)).ravel()], axis=1
+    )
     particular, z = np.zeros(len(x)), np.zeros(len(x))
     solved = solved_or_none(A[rest][:, rest], sides) if len(rest) else sides
     if solved is None:
         return x
-    particular[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
+    particular[rest], z[rest], z[representatives] = solved[:, 0], solved[:, 1], 1.0
     zero = np.abs(A @ z) <= NULL * (abs(A) @ np.abs(z))
     with np.errstate(divide="ignore", invalid="ignore"):
         # Shifts t with l <= particular + t z <= u: an interval for each unknown, intersected for

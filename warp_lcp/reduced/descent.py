@@ -56,7 +56,7 @@ class Descent:
         """Reset; energy and residual norm are those of the start."""
         self._energy, self._lowest, self._norm, self._least = energy, energy, norm, norm
         self.sinks, self.safe = False, False
-        self._vain, self.runs, self._left = 0, 0, 1.0
+        self._unsuccessful, self.runs, self._left = 0, 0, 1.0
         self._fell, self._owed, self._pause, self._wait = math.inf, 0.0, 0, 1
 
     @property
@@ -84,11 +84,11 @@ class Descent:
             min(norm, self._least),
         )
         if self.sinks:
-            self._lowest, self._vain = energy, 0
+            self._lowest, self._unsuccessful = energy, 0
         elif norm > LEAP * self._least:
-            self._vain = sys.maxsize
+            self._unsuccessful = sys.maxsize
         else:
-            self._vain = self._vain + 1 if above > margin or left > 1 else 0
+            self._unsuccessful = self._unsuccessful + 1 if above > margin or left > 1 else 0
         return fell if abs(fell) > margin else 0.0
 
     def due(self, patience: int) -> int:
@@ -97,9 +97,9 @@ class Descent:
         0 until `patience` steps set no new least energy, or the residual of one of them has leapt;
         then twice as many each time.
         """
-        if self._vain < patience:
+        if self._unsuccessful < patience:
             return 0
-        self._vain, self._fell, self.runs = 0, math.inf, self.runs + 1
+        self._unsuccessful, self._fell, self.runs = 0, math.inf, self.runs + 1
         return int(2 ** (self.runs - 1))
 
     def creeps(self, fell: float, *, moved: bool) -> bool:

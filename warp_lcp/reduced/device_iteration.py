@@ -28,7 +28,7 @@ from warp_lcp.kernels.launch_graph import (
 from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import CONVERT, add_across
+from warp_lcp.kernels.vectors import CONVERT, sum_over_ranks
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
@@ -266,9 +266,9 @@ class DeviceIteration:
 
     def __init__(self, work: MultigridWorkspace, *, rebuilds: bool = True) -> None:
         self._work, self._rebuilds, device = work, rebuilds, work.A.device
-        self._shared = work.problem.layout.across is not None
+        self._shared = work.problem.layout.comm is not None
         self.rows = deque[np.ndarray]()
-        self._found, self._judged = (
+        self._results, self._judged = (
             DeviceScalar(device, ROWS * int(ROW)),
             DeviceScalar(device, JUDGED),
         )
@@ -289,7 +289,7 @@ class DeviceIteration:
         CPU.
         """
         plain = type(work.hierarchy) is Hierarchy and isinstance(work.A, GridPoisson)
-        alone = work.problem.layout.across is None
+        alone = work.problem.layout.comm is None
         return plain and loops_on_device(work.A.device) and (alone or work.A.device.is_cpu)
 
     def steps(self, tolerance: float, left: int) -> bool:
@@ -366,7 +366,7 @@ class DeviceIteration:
             work.descent.noise,
         )
         if self._beginning is None or not self._beginning.fits(guess, counted):
-            self._beginning = Beginning(work, guess, counted, self._found, self._judge_first)
+            self._beginning = Beginning(work, guess, counted, self._results, self._judge_first)
         for number, value in zip(self._numbers, numbers, strict=True):
             number.value = value
         if work.A.device.is_cuda:
@@ -407,7 +407,7 @@ class DeviceIteration:
         *arguments, noise = self._numbers
         memory = [
             self._work.residual.scalars,
-            self._found.array,
+            self._results.array,
             self._judged.array,
             self._going,
             self._stale,
@@ -432,11 +432,11 @@ class DeviceIteration:
 
     def _take_rows(self) -> None:
         """Read the rows of a loop; waits for the device."""
-        for reading in (self._found, self._judged, *self._work.readings):
+        for reading in (self._results, self._judged, *self._work.readings):
             reading.changed()
         count = int(self._judged.numpy()[int(TAKEN)])
         self._work.free_set_noted = self._work.A.device.is_cuda
-        self.rows.extend(self._found.numpy()[: count * int(ROW)].reshape(count, -1).copy())
+        self.rows.extend(self._results.numpy()[: count * int(ROW)].reshape(count, -1).copy())
 
     def _loop(self, *, rebuilds: bool) -> CommandBuffer | None:
         """Return the program of a step, None while parts of it have not run.
@@ -465,7 +465,7 @@ class DeviceIteration:
                 work.correction.note(loop.launch)
             memory = [
                 work.residual.scalars,
-                self._found.array,
+                self._results.array,
                 self._judged.array,
                 self._going,
                 self._stale,
@@ -494,14 +494,14 @@ class Beginning:
         work: MultigridWorkspace,
         guess: DeviceArray,
         counted: DeviceArray | None,
-        found: DeviceScalar,
+        results: DeviceScalar,
         judge: Callable[[DeviceArray | None, Launch], None],
     ) -> None:
-        self._work, self._guess, self._counted, self._found, device = (
+        self._work, self._guess, self._counted, self._results, device = (
             work,
             guess,
             counted,
-            found,
+            results,
             work.A.device,
         )
         self._key, self._finder = (
@@ -567,7 +567,7 @@ class Beginning:
         No component floats, the guess is finite, and bounds are coded as before.
         """
         bounds = self._work.problem.bounds
-        if self._work.problem.layout.across is not None:
+        if self._work.problem.layout.comm is not None:
             floating, faults, others = self._unusual.numpy()
             return floating == faults == 0.0 and bounds.stays_with(others)
         return bounds.stays and self._finder.none() and not self._faults.numpy()[0]
@@ -591,14 +591,14 @@ class Beginning:
         r.launch_square_of_b(launch)
         launch(take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
         r.assess(x, classify=False, launch=launch)
-        launch(keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
+        launch(keep_row_kernel, 1, [r.scalars, self._results.array, 0], device=device)
         if isinstance(search, Conditional):
             assert self._program is not None
             self._program.record(search)
         elif search is not None:
             search(work.scratch)
         self._faults = p.look_at(self._guess, launch)
-        if p.layout.across is not None:
+        if p.layout.comm is not None:
             memory = [
                 self._finder.held_here,
                 self._faults.array,
@@ -606,7 +606,7 @@ class Beginning:
                 self._unusual.array,
             ]
             launch(join_unusual_kernel, 1, memory, device=device)
-            add_across(p.layout.across, self._unusual.array, slice(0, 3), launch)
+            sum_over_ranks(p.layout.comm, self._unusual.array, slice(0, 3), launch)
         if device.is_cuda:
             copy(x, self._guess)
         else:

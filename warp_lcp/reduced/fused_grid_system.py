@@ -50,8 +50,8 @@ class MinimumMapResidual(ResidualAndActiveSet):
     @property
     def away(self) -> bool:
         """Whether held unknowns are not at their bounds, on any rank; read back."""
-        found, across = bool(self._away.numpy().any()), self.problem.layout.across
-        return found if across is None else across.any(found)
+        found, comm = bool(self._away.numpy().any()), self.problem.layout.comm
+        return found if comm is None else comm.any(found)
 
     def hold(self, x: DeviceArray) -> None:
         """Move held unknowns onto their bounds, and update the right-hand side.

@@ -114,7 +114,7 @@ def suits(A: Operator) -> TypeGuard[DenseOperator | SparseOperator]:
     """
     return (
         isinstance(A, (DenseOperator, SparseOperator))
-        and A.layout.across is None
+        and A.layout.comm is None
         and (A.unknowns <= MOST or bandwidth(A) <= NARROW)
     )
 
@@ -129,7 +129,7 @@ class HostResidual(NaturalResidual):
         matrix: its A.
     """
 
-    _taken = False  # whether A, b and the bounds have been read
+    _evaluated = False  # whether A, b and the bounds have been read
 
     def __init__(self, problem: LCP, matrix: SmallMatrix | NarrowMatrix) -> None:
         self.problem, self.matrix = problem, matrix
@@ -154,7 +154,7 @@ class HostResidual(NaturalResidual):
         self.lower, self.upper, self.b = bounds.host(0), bounds.host(1), self.problem.b.numpy()
         self.scale = self.problem.A.scale()  # type: ignore[attr-defined]
         self.__dict__.pop("diagonal", None)
-        self._taken = True
+        self._evaluated = True
 
     def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u)."""
@@ -165,7 +165,7 @@ class HostResidual(NaturalResidual):
 
     def evaluate(self, x: DeviceArray) -> float:
         """Compute y and return the norm of the natural residual at x."""
-        if not self._taken:  # a block among others is evaluated before it is solved
+        if not self._evaluated:  # a block among others is evaluated before it is solved
             self._take()
         values, y, d = self.values(x), self._y, self.scale
         np.add(self.matrix.product(values), self.b, out=y)
@@ -207,11 +207,11 @@ class HostIterate(WorkspaceBase):
 
     def keep(self) -> None:
         """Store x on the host."""
-        self._kept = self.read().copy()
+        self._saved = self.read().copy()
 
     def restore(self) -> None:
         """Set x to the best iterate."""
-        self.write(self._kept)
+        self.write(self._saved)
 
     def read(self) -> np.ndarray:
         """Return x on the host, shape (n,): its own memory on the CPU."""
@@ -279,9 +279,9 @@ class HostSystem:
             self._matrix.refresh()
             self._lower, self._upper = bounds.host(0), bounds.host(1)
             self._d = residual.diagonal.numpy().astype(np.float64)
-        self._seen: set[bytes] = set()
+        self._visited: set[bytes] = set()
         self._wait = PLAIN  # steps before nested iteration
-        self._begun = self._nested = False
+        self._started = self._nested = False
         self._left: float = math.inf
         self._least, self._idle = math.inf, 0
 
@@ -300,11 +300,11 @@ class HostSystem:
             self._nested = True
             coarse = nested_iteration(self._matrix.banded, self._b, self._lower, self._upper)
             if coarse is not None:
-                self._seen.clear()
+                self._visited.clear()
                 self._left = NARROW_STEPS
                 self._go(coarse)
                 return Step("nested iteration", 1, None, interim=True)
-        if self._begun:  # the residual of the start says nothing about later steps
+        if self._started:  # the residual of the start says nothing about later steps
             self._least, self._idle = (
                 (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
             )
@@ -322,12 +322,12 @@ class HostSystem:
     def solve(self) -> int | None:
         """Factor A_FF and solve; None where steps make no progress."""
         below, above = self._below, self._above
-        if self._left < 0 or self._idle >= IDLE or self._comes_again(below, above):
+        if self._left < 0 or self._idle >= IDLE or self._revisits_set(below, above):
             return None
-        self._held = below | above
+        self._at_bound = below | above
         # Held unknowns at their bounds; A_FF e_F = -(A start + b)_F.
         start = np.where(below, self._lower, np.where(above, self._upper, self._x))
-        e = self._matrix.solve(~self._held, -(self._matrix.product(start) + self._b))
+        e = self._matrix.solve(~self._at_bound, -(self._matrix.product(start) + self._b))
         if e is None or not np.isfinite(e).all():
             return None
         self._end = start + e
@@ -340,7 +340,7 @@ class HostSystem:
 
     def _go(self, values: np.ndarray) -> None:
         """Set x, within its bounds once the residual meets the tolerance."""
-        iterate, residual, self._begun = self.iterate, self.iterate.residual, True
+        iterate, residual, self._started = self.iterate, self.iterate.residual, True
         iterate.write(values)
         # x may violate its bounds by what the criteria allow.
         if residual.evaluate(iterate.x) <= self._target:
@@ -352,7 +352,7 @@ class HostSystem:
 
     def accept(self, iterations: int) -> Step:
         """Return the accepted step; whole steps may first raise the residual."""
-        return Step("active set", iterations, int(np.count_nonzero(self._held)), interim=True)
+        return Step("active set", iterations, int(np.count_nonzero(self._at_bound)), interim=True)
 
     def fall_back(
         self, iterations: int, norms: deque[float], best: float, length: float
@@ -366,10 +366,10 @@ class HostSystem:
         searched.start(warm=self._warm, tolerance=self._target, floating=self._floating)
         return searched
 
-    def _comes_again(self, below: np.ndarray, above: np.ndarray) -> bool:
+    def _revisits_set(self, below: np.ndarray, above: np.ndarray) -> bool:
         """Return whether an active set has recurred: whole steps would cycle."""
         key = below.tobytes() + above.tobytes()
-        if key in self._seen:
+        if key in self._visited:
             return True
-        self._seen.add(key)
+        self._visited.add(key)
         return False

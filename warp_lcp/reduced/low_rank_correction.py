@@ -202,7 +202,7 @@ class WoodburyCorrection:
             if self._read_products is not None
             else wp.zeros(0, dtype=wp.float64, device=device)
         )
-        at_once = low.layout.across is not None
+        at_once = low.layout.comm is not None
         self._squaring, self._exciting, self._multiplying, self._filling = (
             LaunchGraph(device, record, at_once=at_once)
             for record in (
@@ -291,8 +291,8 @@ class WoodburyCorrection:
             self.prepare()
             self._squaring.run(variant=self._columns.rows.ptr)
             self.noted.changed()
-        found, width, across = self.noted.numpy().copy(), self._columns.width, low.layout.across
-        found = found if across is None else across.sum(found)
+        found, width, comm = self.noted.numpy().copy(), self._columns.width, low.layout.comm
+        found = found if comm is None else comm.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
         # Ratio of added to own inertia of column q: W_qq U_q'A^-1 U_q, estimated from the rows that
         # it touches.
@@ -301,12 +301,12 @@ class WoodburyCorrection:
         ).tolist()
         if begins:
             self._seen[:] = 0.0
-        chosen = strong != self._slot_columns
-        if chosen:
+        slots_changed = strong != self._slot_columns
+        if slots_changed:
             self._choose(strong)
         seen, now = self._seen.tolist(), squares.tolist()
         stale = [q for q in strong if not seen[q] / CHANGED <= now[q] <= seen[q] * CHANGED]
-        made = made and begins and not chosen
+        made = made and begins and not slots_changed
         if made:
             self._seen[stale] = squares[stale]
         else:
@@ -314,7 +314,7 @@ class WoodburyCorrection:
         overwritten, products_known = (
             bool(stale),
             self._read_products is not None
-            and (made or (noted and not begins and not chosen and not stale)),
+            and (made or (noted and not begins and not slots_changed and not stale)),
         )
         if strong and not self._invert(W, known=products_known) and len(stale) < len(strong):
             self._fill([q for q in strong if q not in stale], squares)
@@ -385,14 +385,14 @@ class WoodburyCorrection:
 
     def _bind(self, slots: int) -> tuple[Reduction, BoundKernel, BoundKernel]:
         """Return the launches for a number of slots: sums Z'r, products, z -= Z t."""
-        finest, rows, n, across = (
+        finest, rows, n, comm = (
             self._hierarchy.finest,
             self._hierarchy.finest.stencil.rows,
             self._size,
-            self._low.layout.across,
+            self._low.layout.comm,
         )
         dots = Reduction(
-            n, self._low.device, self._sums, columns=slots, threads=rows.places, across=across
+            n, self._low.device, self._sums, columns=slots, threads=rows.places, comm=comm
         )
         multiply = DOTS.bind(rows, r=finest.b, out=dots.partials, Z=self._Z, slots=slots, size=n)
         return (
@@ -412,7 +412,7 @@ class WoodburyCorrection:
     def _fill(self, columns: list[int], squares: np.ndarray) -> None:
         """Compute the potentials B U_q of columns."""
         finest, n = self._hierarchy.finest, self._size
-        if self.calm is not None and self._low.layout.across is None:
+        if self.calm is not None and self._low.layout.comm is None:
             for q in columns:
                 slot = self._slot_columns.index(q)
                 self._filling.run(slot, variant=(*self.key, self._columns.rows.ptr))

@@ -48,14 +48,14 @@ class CoupledGridSystem(KrylovSystem):
         self._extra = zeros_like(self.r)
         self._free: DeviceArray | None = None
         self._weight = zeros_like(self.r) if shifted else None
-        across = A.layout.across
+        comm = A.layout.comm
         # Without ghost cells, which other ranks sum.
-        rows = None if across is None else grid.stencil.rows
+        rows = None if comm is None else grid.stencil.rows
         self._iterate_by(
-            ConjugateGradient(self._product, self, weight=self._weight, rows=rows, across=across),
+            ConjugateGradient(self._product, self, weight=self._weight, rows=rows, comm=comm),
             self._weight,
             rows,
-            across,
+            comm,
         )
         self._take_diagonal()
 

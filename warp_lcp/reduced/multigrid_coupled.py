@@ -107,16 +107,16 @@ class CoupledWorkspace(MultigridWorkspace):
         self.correction = WoodburyCorrection(low, self.hierarchy)
         self._ahead = DeviceIteration(self, rebuilds=False) if DeviceIteration.suits(self) else None
         self._evaluation = LaunchGraph(
-            problem.device, self._launch_evaluation, at_once=problem.layout.across is not None
+            problem.device, self._launch_evaluation, at_once=problem.layout.comm is not None
         )
         self._monotone = LaunchGraph(
-            problem.device, self._launch_monotone, at_once=problem.layout.across is not None
+            problem.device, self._launch_monotone, at_once=problem.layout.comm is not None
         )
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self.readings = (low.products, *self.correction.readings)
         self._prepared = False  # whether potentials have been computed as the solve began
-        low.products_of = self.x if problem.layout.across is None else None
+        low.products_of = self.x if problem.layout.comm is None else None
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None

@@ -140,12 +140,12 @@ class MultigridWorkspace(WorkspaceBase):
         # Steps since the best iterate; whether it has memory of its own.
         self._past, self._stored = 0, False
         self.cycles_left, self.descent = 0, Descent(self.precision.epsilon)
-        self._tolerance, self._taken = 0.0, 0  # steps of this solve
+        self._tolerance, self._steps_taken = 0.0, 0  # steps of this solve
         self._ahead = DeviceIteration(self) if ahead and DeviceIteration.suits(self) else None
         self._one_table = self._ahead is not None  # whether nothing is read back within a step
         self._built = 0  # the version of the free set that the hierarchy was built for
         # Steps that the device may take without the host; whether it has begun the solve.
-        self._budget, self._begun = 0, False
+        self._budget, self._started = 0, False
 
     @property
     def stale(self) -> bool:
@@ -183,7 +183,7 @@ class MultigridWorkspace(WorkspaceBase):
             return None
         self.floating = None
         reference = self._ahead.begin(guess, criteria, min(steps, AHEAD))
-        self._begun = reference is not None
+        self._started = reference is not None
         return reference
 
     @property
@@ -284,9 +284,9 @@ class MultigridWorkspace(WorkspaceBase):
         self.floating = floating
         self.cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self.descent.start(self.residual.energy, self.residual.norm)
-        self._tolerance, self._taken = tolerance, 0
-        if self._begun:
-            self._begun = False
+        self._tolerance, self._steps_taken = tolerance, 0
+        if self._started:
+            self._started = False
             return
         self.forget_direction()
         if self.scratch is not None:
@@ -340,10 +340,10 @@ class MultigridWorkspace(WorkspaceBase):
         descent = self.descent
         self._leave()
         self._budget -= 1
-        self._taken += 1
+        self._steps_taken += 1
         classify = self.cycles_left == 1  # truncated cycles come next
         with (
-            as_one_table(self.problem.device, self.problem.layout.across)
+            as_one_table(self.problem.device, self.problem.layout.comm)
             if self._one_table
             else nullcontext()
         ):
@@ -394,7 +394,7 @@ class MultigridWorkspace(WorkspaceBase):
         active = self.residual.active
         self._leave()
         self._budget -= 1
-        self._taken += 1
+        self._steps_taken += 1
         if not self._has_run_ahead():
             self.rebuild(classify=True)
             if self.floating is None:
@@ -417,7 +417,7 @@ class MultigridWorkspace(WorkspaceBase):
 
         Returns whether it has; the results of one step are then read.
         """
-        ahead, left = self._ahead, min(self._budget + 1, AHEAD - self._taken)
+        ahead, left = self._ahead, min(self._budget + 1, AHEAD - self._steps_taken)
         if ahead is None or self.floating is not None:
             return False
         # From the best iterate, where steps cannot be undone.

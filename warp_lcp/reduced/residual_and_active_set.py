@@ -52,7 +52,7 @@ class ResidualAndActiveSet(NaturalResidual):
             self.scalars,
             columns=4,
             threads=places,
-            across=problem.layout.across,
+            comm=problem.layout.comm,
         )
         self.classified, self.free_set, self.active, self.energy, self._norm_of_b = (
             False,
@@ -69,7 +69,7 @@ class ResidualAndActiveSet(NaturalResidual):
         A guess is classified, a cold start is not.
         """
         self.renew()
-        with as_one_table(x.device, self.problem.layout.across):
+        with as_one_table(x.device, self.problem.layout.comm):
             super().start(x, keep=keep)
             if not keep:
                 self.launch_square_of_b()
@@ -121,7 +121,7 @@ class ResidualAndActiveSet(NaturalResidual):
         plain = (
             type(self).assess is ResidualAndActiveSet.assess
         )  # subclasses may launch by Warp alone
-        with as_one_table(x.device, self.problem.layout.across) if plain else nullcontext():
+        with as_one_table(x.device, self.problem.layout.comm) if plain else nullcontext():
             self.assess(x, classify=classify)
         return self.read(classified=classify)
 

@@ -100,8 +100,8 @@ class Actors:
         """Replace the meshes of a group; return the actors of those with points."""
         for number in range(self._counts[group]):
             self.plotter.remove_actor(f"{group} {number}", render=False)
-        drawn = [(mesh, looks) for mesh, looks in meshes if mesh.n_points]
-        self._counts[group] = len(drawn)
+        visible = [(mesh, looks) for mesh, looks in meshes if mesh.n_points]
+        self._counts[group] = len(visible)
         return [
             self.plotter.add_mesh(
                 mesh,
@@ -111,7 +111,7 @@ class Actors:
                 show_scalar_bar=False,
                 **looks,
             )
-            for number, (mesh, looks) in enumerate(drawn)
+            for number, (mesh, looks) in enumerate(visible)
         ]
 
 

@@ -143,14 +143,18 @@ class Picture:
         size, width = self.scene.domain.size, self.samples
         solids = self._solids.meshes(moving)
         self.actors.exchange("moving", solids)
-        shown = frame.surface
-        if shown is not None and self._wet:
+        visible_surface = frame.surface
+        if visible_surface is not None and self._wet:
             poses = [
                 (geometry, motion.pose(frame.time) if motion else Pose.identity())
                 for geometry, motion in self._wet
             ]
-            shown = apart(shown, poses, self.scene.spacing)
-        surface = [] if shown is None else surface_meshes(shown, self.scene.palette, size, width)
+            visible_surface = apart(visible_surface, poses, self.scene.spacing)
+        surface = (
+            []
+            if visible_surface is None
+            else surface_meshes(visible_surface, self.scene.palette, size, width)
+        )
         self.actors.exchange("surface", surface)
         bodies = body_meshes(frame.bodies, self.bodies_at_first, 1.5 * width, 2.0 * self.front)
         self.actors.exchange("bodies", bodies)

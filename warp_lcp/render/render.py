@@ -60,7 +60,7 @@ def render_run(
     looks: Looks | None = None,
     out: Path | None = None,
     sheet: bool = False,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
 ) -> Iterator[Path]:
     """Draw frames of a run; yield each finished file.
@@ -74,7 +74,7 @@ def render_run(
         looks: appearance of the images.
         out: folder of the images. Default: `folder / "images"`.
         sheet: draw the frames side by side into one image, `sheet.png`.
-        told: called with the number of finished images, and the total number.
+        on_progress: called with the number of finished images, and the total number.
         estimated: called with the estimated time of one core [s], before drawing begins, if there
             are several frames.
 
@@ -100,10 +100,10 @@ def render_run(
         stack.enter_context(closing(page.painter))
         if len(numbers) > 1:
             estimated(expected_seconds(recording, numbers, looks))
-        told(0, len(groups))
+        on_progress(0, len(groups))
         for done, (file, group) in enumerate(groups.items(), 1):
             _save(page.draw(group), out / file, folder)
-            told(done, len(groups))
+            on_progress(done, len(groups))
             yield out / file
 
 
@@ -113,7 +113,7 @@ def film_run(
     *,
     looks: Looks | None = None,
     rate: float | None = None,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
 ) -> Iterator[int]:
     """Draw all frames of a run into a film; yield the number of each drawn frame.
@@ -123,7 +123,7 @@ def film_run(
         film: the file; `.mp4` or `.gif`.
         looks: appearance of the images.
         rate: frames per second of the film [1/s]. Default: that of the scene, for real time.
-        told: called with the number of finished images, and the total number.
+        on_progress: called with the number of finished images, and the total number.
         estimated: called with the estimated time of one core [s], before drawing begins, if there
             are several frames.
 
@@ -143,10 +143,10 @@ def film_run(
         )
         if len(recording.numbers) > 1:
             estimated(expected_seconds(recording, recording.numbers, looks))
-        told(0, len(recording.numbers))
+        on_progress(0, len(recording.numbers))
         for done, number in enumerate(recording.numbers, 1):
             reel.add(partial(page.draw, [number]))
-            told(done, len(recording.numbers))
+            on_progress(done, len(recording.numbers))
             yield number
 
 

@@ -102,15 +102,15 @@ class Section:
             return
         cells, h = frame.cells, self.scene.spacing
         across, up, through = self.scene.cell_counts
-        here = (
+        in_section = (
             np.ones(len(cells.index), dtype=bool)
             if self.at is None
             else cells.index[:, 2] == min(int(self.at / h), through - 1)
         )
         table = np.full((up, across), np.nan)
-        column, row = cells.index[here, 0], cells.index[here, 1]
+        column, row = cells.index[in_section, 0], cells.index[in_section, 1]
         colored = self.recording.color is Color.PRESSURE
-        table[row, column] = np.asarray(cells.fields["pressure"])[here] if colored else 0.0
+        table[row, column] = np.asarray(cells.fields["pressure"])[in_section] if colored else 0.0
         scale = self.recording.scale
         looks = (
             {"cmap": scale.mappable.cmap, "norm": scale.mappable.norm}

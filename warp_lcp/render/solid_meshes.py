@@ -272,13 +272,13 @@ def apart(surface: Surface, solids: Sequence[tuple[Geometry, Pose]], spacing: fl
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     middle = corners.mean(axis=1)
-    here, ahead = (
+    distance, ahead = (
         nearest_distance(
             solids, wp.array(middle + step * spacing * normal, dtype=wp.vec3, device="cpu")
         )
         for step in (0.0, TOUCHING)
     )
-    touches = (here < TOUCHING * spacing) & (ahead < here - 0.5 * TOUCHING * spacing)
+    touches = (distance < TOUCHING * spacing) & (ahead < distance - 0.5 * TOUCHING * spacing)
     return replace(surface, corners=surface.corners[~touches])
 
 

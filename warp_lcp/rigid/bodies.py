@@ -172,31 +172,31 @@ class RigidBodies:
         Raises:
             RuntimeError: there was no `begin_step`.
         """
-        begun = self._begun
-        if begun is None:
+        pending = self._begun
+        if pending is None:
             raise RuntimeError("solve_contacts: call begin_step first")
-        impulses = begun.impulses
-        if self.bodies.given.any():
-            momenta = begun.free + self.bodies.given
+        impulses = pending.impulses
+        if self.bodies.received_impulse.any():
+            momenta = pending.free + self.bodies.received_impulse
             self.bodies.momentum[:], self.bodies.angular_momentum[:] = (
                 momenta[:, :3],
                 momenta[:, 3:],
             )
             impulses = self._solve.push_apart(
-                begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt
+                pending.contacts, pending.impulses, dt=pending.dt, kick_dt=pending.kick_dt
             )
             self.contact_residual, self.contact_iterations = (
                 self._solve.residual,
                 self._solve.iterations,
             )
         self._begun = _Begun(
-            begun.states,
-            begun.free,
-            begun.contacts,
+            pending.states,
+            pending.free,
+            pending.contacts,
             impulses,
-            begun.detour,
-            begun.dt,
-            begun.kick_dt,
+            pending.detour,
+            pending.dt,
+            pending.kick_dt,
             True,
         )
         self.contact_residual = self._ranks.share(self.contact_residual)
@@ -213,13 +213,13 @@ class RigidBodies:
         if self._begun is None or not self._begun.settled:
             self.solve_contacts()
         assert self._begun is not None
-        begun = self._begun
-        self._solve.remember(begun.contacts, begun.impulses)
-        self.contacts = len(begun.contacts)
-        ways = self._solve.separation(begun.contacts, dt, begun.detour)
+        pending = self._begun
+        self._solve.remember(pending.contacts, pending.impulses)
+        self.contacts = len(pending.contacts)
+        ways = self._solve.separation(pending.contacts, dt, pending.detour)
         self.bodies.release()
         self.bodies.advance(dt)
-        for way in (begun.detour, ways):
+        for way in (pending.detour, ways):
             if way is not None:
                 self.bodies.shift(way)
         self._begun = None
@@ -233,13 +233,13 @@ class RigidBodies:
         """
         if self._ranks.size == 1:
             return
-        mine = (
+        own_values = (
             self.state(),
             [body.hold for body in self.bodies],
             self.contacts,
             self.contact_residual,
         )
-        state, holds, self.contacts, self.contact_residual = self._ranks.share(mine)
+        state, holds, self.contacts, self.contact_residual = self._ranks.share(own_values)
         self._take(state)
         for body, hold in zip(self.bodies, holds, strict=True):
             body.hold = hold
@@ -435,7 +435,7 @@ class RigidBodies:
             self._surfaces = [
                 body_surface(geometry, self.dimension) for geometry in self._geometries
             ]
-        placed, gone = [], self.gone()
+        surfaces, gone = [], self.gone()
         for number, (body, motion, surface) in enumerate(
             zip(self.bodies, self.motions, self._surfaces, strict=True)
         ):
@@ -447,14 +447,14 @@ class RigidBodies:
             }
             shown = surface.corners[:0] if gone[number] else surface.corners
             kept = slice(0, 0 if gone[number] else None)
-            placed.append(
+            surfaces.append(
                 BodySurface(
                     points[kept].astype(np.float32),
                     shown,
                     {name: values[kept] for name, values in fields.items()},
                 )
             )
-        return BodySurface.joined(placed)
+        return BodySurface.joined(surfaces)
 
     def _states(self) -> np.ndarray:
         return self.bodies.values[:, :STATE].copy()

@@ -122,7 +122,7 @@ class RigidBody:
     angular_momentum = _part(SPINNING)
     angle = _number(ANGLE)
     time = _number(TIME)
-    given = _part(GIVEN)
+    received_impulse = _part(GIVEN)
 
     @property
     def velocity(self) -> np.ndarray:
@@ -197,7 +197,7 @@ class RigidBody:
         Shape (k,) [N s, N m s].
         """
         impulse = np.asarray(impulse, dtype=np.float64)
-        self.given = self.given + in_space(impulse)
+        self.received_impulse = self.received_impulse + in_space(impulse)
         self.push(impulse if self.hold is None else self.hold @ impulse)
 
     def push(self, impulse: np.ndarray) -> None:
@@ -237,15 +237,15 @@ class RigidBody:
 
     def momenta(self) -> tuple[np.ndarray, ...]:
         """Return the momenta, for `restore_momenta`."""
-        return self.momentum, self.angular_momentum, self.given
+        return self.momentum, self.angular_momentum, self.received_impulse
 
     def restore_momenta(self, kept: tuple[np.ndarray, ...]) -> None:
         """Restore the momenta: undo all impulses since `momenta`."""
-        self.momentum, self.angular_momentum, self.given = kept
+        self.momentum, self.angular_momentum, self.received_impulse = kept
 
     def release(self) -> None:
         """Remove the supports of the body, and reset the impulses received."""
-        self.hold, self.given = None, np.zeros(6)
+        self.hold, self.received_impulse = None, np.zeros(6)
 
 
 class BodyStates(Sequence[RigidBody]):
@@ -277,7 +277,7 @@ class BodyStates(Sequence[RigidBody]):
         self.position, self.momentum, self.angular_momentum = (
             self.values[:, part] for part in (POSITION, MOMENTUM, SPINNING)
         )
-        self.rotation, self.given = (
+        self.rotation, self.received_impulse = (
             self.values[:, ROTATION].reshape(-1, 3, 3),
             self.values[:, GIVEN],
         )
@@ -339,7 +339,7 @@ class BodyStates(Sequence[RigidBody]):
 
         Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each body.
         """
-        self.given += in_space(impulses)
+        self.received_impulse += in_space(impulses)
         if all(body.hold is None for body in self._bodies):
             self.push(impulses)
             return
@@ -370,7 +370,7 @@ class BodyStates(Sequence[RigidBody]):
 
     def release(self) -> None:
         """Remove the supports of all bodies, and reset the impulses received."""
-        self.given[:] = 0.0
+        self.received_impulse[:] = 0.0
         for body in self:
             body.hold = None
 

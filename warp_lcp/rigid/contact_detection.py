@@ -109,7 +109,7 @@ def between(
     one: ContactShape,
     at: Pose | Place,
     other: ContactShape,
-    there: Pose | Place,
+    other_pose: Pose | Place,
     margin: float,
     dimension: int,
 ) -> ContactPoints:
@@ -123,14 +123,14 @@ def between(
         one: a shape, as placed.
         at: its pose.
         other: the other shape.
-        there: its pose.
+        other_pose: its pose.
         margin: gap [m] up to which there is a contact.
         dimension: 2 or 3.
     """
     if one.boxes and other.boxes:
         return ContactPoints.joined(
             [
-                _boxes(_moved(a, at), _moved(b, there), margin, dimension)
+                _boxes(_moved(a, at), _moved(b, other_pose), margin, dimension)
                 for a in one.boxes
                 for b in other.boxes
             ]
@@ -138,23 +138,29 @@ def between(
     single = [len(shape.points) == 1 for shape in (one, other)]  # one point: the center of a ball
     candidates = []
     if not single[1] or single[0]:
-        candidates.append(_points_of(one, at, other, there, margin, one.points))
+        candidates.append(_points_of(one, at, other, other_pose, margin, one.points))
     if not single[0] and len(other.points):
-        candidates.append(_points_of(other, there, one, at, margin, other.points).turned())
+        candidates.append(_points_of(other, other_pose, one, at, margin, other.points).turned())
     if dimension == 3:
         candidates.append(
-            _points_of(one, at, other, there, margin, _nearest_of(one, at, other, there, margin))
+            _points_of(
+                one, at, other, other_pose, margin, _nearest_of(one, at, other, other_pose, margin)
+            )
         )
         candidates.append(
             _points_of(
-                other, there, one, at, margin, _nearest_of(other, there, one, at, margin)
+                other, other_pose, one, at, margin, _nearest_of(other, other_pose, one, at, margin)
             ).turned()
         )
     return ContactPoints.joined(candidates)
 
 
 def _nearest_of(
-    one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float
+    one: ContactShape,
+    at: Pose | Place,
+    other: ContactShape,
+    other_pose: Pose | Place,
+    margin: float,
 ) -> np.ndarray:
     """Return the points of one shape's edges that are nearest to the other.
 
@@ -162,16 +168,16 @@ def _nearest_of(
     """
     if not len(one.edges) or len(other.points) == 1:
         return np.zeros((0, 3))
-    ends = (at.apply(one.edges.reshape(-1, 3)) - there.translation) @ there.rotation
+    ends = (at.apply(one.edges.reshape(-1, 3)) - other_pose.translation) @ other_pose.rotation
     points = other.nearest_on(ends.reshape(-1, 2, 3), margin + one.radius)
-    return np.asarray((there.apply(points) - at.translation) @ at.rotation)
+    return np.asarray((other_pose.apply(points) - at.translation) @ at.rotation)
 
 
 def _points_of(
     one: ContactShape,
     at: Pose | Place,
     other: ContactShape,
-    there: Pose | Place,
+    other_pose: Pose | Place,
     margin: float,
     points: np.ndarray,
 ) -> ContactPoints:
@@ -180,7 +186,7 @@ def _points_of(
     Points are in the axes in which the shape is placed.
     """
     centers = at.apply(points)
-    local = (centers - there.translation) @ there.rotation
+    local = (centers - other_pose.translation) @ other_pose.rotation
     if other.closed and len(local) > 1:  # most points are far away
         reach = margin + one.radius
         near = ((local >= other.low - reach) & (local <= other.high + reach)).all(axis=1)
@@ -190,7 +196,7 @@ def _points_of(
     distance, direction = other.distance(local)
     gap = distance - one.radius
     near = gap <= margin
-    normal = direction[near] @ there.rotation.T
+    normal = direction[near] @ other_pose.rotation.T
     return ContactPoints(
         centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near]
     )
@@ -439,7 +445,7 @@ class ContactDetection:
     def _with_obstacle(
         self,
         number: int,
-        there: Pose,
+        obstacle_pose: Pose,
         poses: list[Place],
         middle: np.ndarray,
         half: np.ndarray,
@@ -448,18 +454,18 @@ class ContactDetection:
         """Return the contacts of bodies with an obstacle."""
         shape, n = self.obstacles[number].shape, len(poses)
         if shape is None:
-            return self._with_planes(number, there, poses, middle, half, margins)
+            return self._with_planes(number, obstacle_pose, poses, middle, half, margins)
         near = np.ones(n, dtype=bool)
         if shape.closed:
             center, reach = (
-                there.apply(0.5 * (shape.low + shape.high)),
-                np.abs(there.rotation) @ (0.5 * (shape.high - shape.low)),
+                obstacle_pose.apply(0.5 * (shape.low + shape.high)),
+                np.abs(obstacle_pose.rotation) @ (0.5 * (shape.high - shape.low)),
             )
             near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
         first, points = np.flatnonzero(near), []
         for i in first.tolist():
             touch = between(
-                self.shapes[i], poses[i], shape, there, float(margins[i]), self.dimension
+                self.shapes[i], poses[i], shape, obstacle_pose, float(margins[i]), self.dimension
             )
             points.append(self._kept(touch, min(self.shapes[i].size, shape.size)))
         return FoundContacts.of(first, np.full(len(first), n), number, points)
@@ -467,7 +473,7 @@ class ContactDetection:
     def _with_planes(
         self,
         number: int,
-        there: Pose,
+        obstacle_pose: Pose,
         poses: list[Place],
         middle: np.ndarray,
         half: np.ndarray,
@@ -478,7 +484,10 @@ class ContactDetection:
         All balls, with one point each, are tested at once.
         """
         obstacle, n = self.obstacles[number], len(poses)
-        points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
+        points, normals = (
+            obstacle_pose.apply(obstacle.points),
+            obstacle.normals @ obstacle_pose.rotation.T,
+        )
         heights = middle @ normals.T - (points * normals).sum(axis=1)
         i, m = np.nonzero(heights - half @ np.abs(normals).T <= margins[:, None])
         balls = self._ball[i]

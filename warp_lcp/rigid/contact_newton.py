@@ -73,14 +73,14 @@ class _Pairs:
 
     def length(self, step: _Pairs, normals: np.ndarray) -> float:
         """Return the largest length of a step, at most 1, without negative values."""
-        mine = np.concatenate(
+        falling = np.concatenate(
             [self.x[normals], self.normal, self.low, self.up, self.below, self.above]
         )
         change = np.concatenate(
             [step.x[normals], step.normal, step.low, step.up, step.below, step.above]
         )
         falls = change < 0.0
-        return float(min(1.0, (-mine[falls] / change[falls]).min(initial=np.inf)))
+        return float(min(1.0, (-falling[falls] / change[falls]).min(initial=np.inf)))
 
 
 class ContactNewton:

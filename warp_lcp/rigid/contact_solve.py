@@ -161,8 +161,8 @@ class ContactSolve:
             AHEAD * self._obstacle_way(obstacle.motion, time, dt)
             for obstacle in self.detection.obstacles
         ]
-        everywhere = gone is None or not gone.any()
-        planar = self._planar if everywhere else None
+        all_inside = gone is None or not gone.any()
+        planar = self._planar if all_inside else None
         if (
             planar is not None
             and (touching := planar.find(time, dt, falls, near, brought)) is not None
@@ -177,7 +177,7 @@ class ContactSolve:
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
         detected = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
-        if gone is not None and not everywhere:
+        if gone is not None and not all_inside:
             out = np.append(gone, False)
             detected = detected.where(~(out[detected.first] | out[detected.second]))
         return self.assembled(detected, time, dt, gravity)
@@ -245,23 +245,23 @@ class ContactSolve:
         gap = np.maximum(gap, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):  # for contacts that do not meet
             t = 2.0 * gap / (np.sqrt(np.maximum(v**2 - 2.0 * a * gap, 0.0)) - v)
-        met = may & (t >= 0.0) & (t <= dt)
-        t = np.where(met, t, 0.0)
-        for k in np.flatnonzero(met & (contacts.second < len(self.bodies))).tolist():
+        hits = may & (t >= 0.0) & (t <= dt)
+        t = np.where(hits, t, 0.0)
+        for k in np.flatnonzero(hits & (contacts.second < len(self.bodies))).tolist():
             self._meet(contacts, k, float(t[k]), V)
-        free[met] = contacts.velocities(V)[met, 0]
+        free[hits] = contacts.velocities(V)[hits, 0]
         after, rest = -e * (free + a * (t - 0.5 * dt)), dt - t
         # Smaller bounces, not apart at the end of the step, are ignored.
-        met &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)
-        contacts.target[met] = (after + a * (0.5 * dt - t))[met]
+        hits &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)
+        contacts.target[hits] = (after + a * (0.5 * dt - t))[hits]
         order, starts = problem.islands()
         # Contacts of an island with an impact act at its time.
         for begin, end in pairwise(starts):
             mine = order[begin:end]
-            if met[mine].any():
-                contacts.when[mine] = np.where(met[mine], t[mine], t[mine][met[mine]].mean())
+            if hits[mine].any():
+                contacts.when[mine] = np.where(hits[mine], t[mine], t[mine][hits[mine]].mean())
         # Contacts moved by an impact elsewhere: gaps close from that time on.
-        along = ~met & (contacts.when > 0.0)
+        along = ~hits & (contacts.when > 0.0)
         left = np.maximum(contacts.gap + contacts.when * free, 0.0)[along] / np.maximum(
             dt - contacts.when[along], TINY * dt
         )
@@ -393,8 +393,8 @@ class ContactSolve:
                 replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x
             )
             x = result.impulses
-            impulses, held = x[: start.size].reshape(start.shape), x[start.size :]
-            pushes = contacts.on_bodies(impulses, n) + (J.T @ held).reshape(n, q)
+            impulses, joint_impulses = x[: start.size].reshape(start.shape), x[start.size :]
+            pushes = contacts.on_bodies(impulses, n) + (J.T @ joint_impulses).reshape(n, q)
             after = (
                 rows.errors(self._moved(pushes, dt), self.dimension) / dt
                 - J @ (V + self._answer(pushes)).ravel()
@@ -405,7 +405,7 @@ class ContactSolve:
             self.residual, self.iterations = result.residual, self.iterations + result.iterations
             if off <= JOINED * min(1.0, float(self._size.min())):
                 break
-        self.joint_rows, self.joint_impulses = rows, held
+        self.joint_rows, self.joint_impulses = rows, joint_impulses
         return impulses, pushes
 
     def motor_torques(self) -> dict[int, float]:
@@ -558,7 +558,7 @@ class ContactSolve:
         return found.without(self._joined)
 
     def assembled(
-        self, found: FoundContacts, time: float, dt: float, gravity: np.ndarray | None
+        self, detected: FoundContacts, time: float, dt: float, gravity: np.ndarray | None
     ) -> Contacts:
         """Return the contacts with their rows.
 
@@ -569,20 +569,20 @@ class ContactSolve:
             len(self.bodies),
             self.dimension,
         )
-        first, second = found.first, found.second
-        point, normal, gap = found.points.point, found.points.normal, found.points.gap
+        first, second = detected.first, detected.second
+        point, normal, gap = detected.points.point, detected.points.normal, detected.points.gap
         moved = np.zeros_like(point)
         for number, obstacle in enumerate(self.detection.obstacles):
-            if obstacle.motion is not None and (here := found.obstacle == number).any():
+            if obstacle.motion is not None and (here := detected.obstacle == number).any():
                 moved[here] = _carried(obstacle.motion, point[here], time, dt)
         at = np.concatenate([self.bodies.position, np.zeros((1, 3))])
-        mine, second_arms = point - at[first], point - at[second]
+        first_arms, second_arms = point - at[first], point - at[second]
         ways: tuple[tuple[np.ndarray, float], ...] = ()
         if gravity is not None and dim == 3:  # in a plane there is one tangent
             six = np.concatenate([self.bodies.velocities(), np.zeros((1, 6))])
             slip = (
                 six[first, :3]
-                + cross(six[first, 3:], mine)
+                + cross(six[first, 3:], first_arms)
                 - six[second, :3]
                 - cross(six[second, 3:], second_arms)
                 - moved
@@ -592,7 +592,7 @@ class ContactSolve:
                 (slip, ALONG_SLIP * falls),
             )
         frames = contact_frames(normal, dim, ways)
-        one, other = _rows(mine, frames, dim), -_rows(second_arms, frames, dim)
+        one, other = _rows(first_arms, frames, dim), -_rows(second_arms, frames, dim)
         standing = second == n
         other[standing] = 0.0
         wall = -(frames @ moved[:, :, None])[:, :, 0]

@@ -132,14 +132,18 @@ class ContactMemory:
         low, high = (np.searchsorted(before[order], keys, side=side) for side in ("left", "right"))
         # All pairs of a new and an old contact of the same two bodies.
         fresh = np.repeat(np.arange(len(keys)), high - low)
-        known = order[np.arange(len(fresh)) - np.repeat(np.cumsum(high - low) - high, high - low)]
-        way = lengths(places[fresh] - old[known, 2:5])
-        mine, theirs = _least(fresh, known, way), _least(known, fresh, way)
+        old_index = order[
+            np.arange(len(fresh)) - np.repeat(np.cumsum(high - low) - high, high - low)
+        ]
+        way = lengths(places[fresh] - old[old_index, 2:5])
+        mine, theirs = _least(fresh, old_index, way), _least(old_index, fresh, way)
         nearest = np.zeros((2, len(way)), dtype=bool)
         nearest[0, mine] = nearest[1, theirs] = True
         both = np.flatnonzero(nearest[0] & nearest[1])
         both = both[way[both] < SAME_PLACE * contacts.size[fresh[both]]]
-        start[fresh[both]] = (contacts.frames[fresh[both]] @ old[known[both], 5:, None])[:, :, 0]
+        start[fresh[both]] = (contacts.frames[fresh[both]] @ old[old_index[both], 5:, None])[
+            :, :, 0
+        ]
         return start
 
 

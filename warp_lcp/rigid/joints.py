@@ -127,14 +127,16 @@ class Joint:
         axis = self.side(bodies, self.first)[2] @ self.axis
         return contact_frames(axis[None], 3)[0, 1:]
 
-    def errors(self, bodies: Sequence[RigidBody], held: np.ndarray, dimension: int) -> np.ndarray:
+    def errors(
+        self, bodies: Sequence[RigidBody], locked_axes: np.ndarray, dimension: int
+    ) -> np.ndarray:
         """Return the position errors of the rows (m, rad).
 
         Errors of equations, distances to limits, 0 for a motor.
 
         Args:
             bodies: all bodies in their current state.
-            held: directions of `held`, from when the rows were built.
+            locked_axes: directions of `locked_axes`, from when the rows were built.
             dimension: 2 or 3.
         """
         (_, anchor, R), (_, other_anchor, S) = (
@@ -142,11 +144,11 @@ class Joint:
         )
         if self.kind == "fixed":  # R S' = 1 + [e]x for a small relative rotation e
             T = R @ S.T
-            turned = held @ (
+            turned = locked_axes @ (
                 0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
             )
         else:
-            turned = -held @ np.cross(R @ self.axis, S @ self.axis)
+            turned = -locked_axes @ np.cross(R @ self.axis, S @ self.axis)
         angle = self.angle(bodies) if np.isfinite(self.limits).any() else 0.0
         distances = [
             side * (angle - limit)
@@ -165,15 +167,19 @@ class Joint:
     def rows(self, bodies: Sequence[RigidBody], dt: float, dimension: int = 3) -> JointRows:
         """Return the rows for the impulses over a time [s].
 
-        With y = J v' + c: the anchors' relative velocity and the angular velocity about `held`
-        directions are equations (y = 0, x free). For a limit, the angle's rate plus its distance to
-        the limit over the step is >= 0, complementary to x >= 0. For a motor, y is the rate less
-        the target rate, with |x| <= torque dt.
+        With y = J v' + c: the anchors' relative velocity and the angular velocity about
+        `locked_axes` directions are equations (y = 0, x free). For a limit, the angle's rate plus
+        its distance to the limit over the step is >= 0, complementary to x >= 0. For a motor, y is
+        the rate less the target rate, with |x| <= torque dt.
         """
         (arm, anchor, R), (other_arm, other_anchor, _) = (
             self.side(bodies, number) for number in (self.first, self.second)
         )
-        apart, held, axis = anchor - other_anchor, self.held(bodies, dimension), R @ self.axis
+        apart, locked_axes, axis = (
+            anchor - other_anchor,
+            self.held(bodies, dimension),
+            R @ self.axis,
+        )
         # Both impulses act at one point, which conserves angular momentum.
         arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart
         linear = [
@@ -186,19 +192,19 @@ class Joint:
         motor = [axis] if self.motor_torque > 0.0 else []
         turns = [
             np.concatenate([np.zeros(3), d, np.zeros(3), -d])
-            for d in (*held, *(side * axis for side in sides), *motor)
+            for d in (*locked_axes, *(side * axis for side in sides), *motor)
         ]
-        each, equations = np.array([*linear, *turns])[:, None], len(linear) + len(held)
+        each, equations = np.array([*linear, *turns])[:, None], len(linear) + len(locked_axes)
         columns = np.arange(6) if dimension == 3 else np.array(PLANAR)
         torque = [self.motor_torque * dt] * len(motor)
         m, n = len(each), len(bodies)
         return JointRows(
-            sources=((self, held),),
+            sources=((self, locked_axes),),
             first=np.full(m, self.first),
             second=np.full(m, n if self.second == WORLD else self.second),
             one=each[..., columns],
             other=each[..., 6 + columns],
-            error=self.errors(bodies, held, dimension),
+            error=self.errors(bodies, locked_axes, dimension),
             wanted=np.array([0.0] * (m - len(motor)) + [self.motor_speed] * len(motor)),
             lower=np.array(
                 [-np.inf] * equations + [0.0] * len(sides) + [-value for value in torque]

@@ -333,13 +333,13 @@ class PlanarContacts:
         impulses, memory, squares, roots, ways, holding = (
             reals[start:end].copy() for start, end in pairwise(ends)
         )
-        held = np.flatnonzero(holding).tolist() if not stacked[0] else None
+        active = np.flatnonzero(holding).tolist() if not stacked[0] else None
         of_body = (
             None
-            if held is None
+            if active is None
             else {
                 i: (squares[9 * i : 9 * i + 9].reshape(3, 3), roots[3 * i : 3 * i + 3])
-                for i in held
+                for i in active
             }
         )
         apart = ways.reshape(n, 3) if deep[0] else None

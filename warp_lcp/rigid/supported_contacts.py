@@ -75,11 +75,11 @@ class SupportedContacts:
             (self.second, contacts.first, contacts.one, contacts.second),
         )
         for rows, mine, J, beyond in sides:
-            here = np.flatnonzero((mine == number) & (beyond < self.bodies))
-            if not len(here):
+            touching = np.flatnonzero((mine == number) & (beyond < self.bodies))
+            if not len(touching):
                 continue
-            yields = [np.square(J[here] @ root).sum(axis=2) for root in (left, free)]
-            fresh = self.held[here] & (yields[0] < STILL * yields[1])
-            rows[here] |= fresh
-            reached += beyond[here[fresh.any(axis=1)]].tolist()
+            yields = [np.square(J[touching] @ root).sum(axis=2) for root in (left, free)]
+            fresh = self.held[touching] & (yields[0] < STILL * yields[1])
+            rows[touching] |= fresh
+            reached += beyond[touching[fresh.any(axis=1)]].tolist()
         return list(dict.fromkeys(reached))

@@ -193,7 +193,7 @@ class Run:
 
     def _set_up(
         self,
-        given: ResolvedScene,
+        resolved: ResolvedScene,
         request: RunRequest,
         device: str | None,
         frames: int | None,
@@ -204,11 +204,11 @@ class Run:
             not isinstance(frames, int) or isinstance(frames, bool) or frames < 0
         ):
             raise RunError(f"frames = {frames!r}: must be a whole number of at least 0, or None")
-        self.scene: Scene = given.scene
+        self.scene: Scene = resolved.scene
         self.row: Mapping[str, Value] = {}
         self.notes: list[str] = []
         self._request = replace(
-            request, device=choose_device(device), overrides=given.overrides, last_frame=frames
+            request, device=choose_device(device), overrides=resolved.overrides, last_frame=frames
         )
         self._callbacks: list[Callable[[Run], object]] = []
         self._stopped, self._used, self._loop, self._index = "", False, None, -1

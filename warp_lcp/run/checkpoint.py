@@ -198,15 +198,15 @@ class CheckpointFolder:
         return self.path(checkpoint.step)
 
     @on_root
-    def prune(self, kept: int) -> None:
-        """Delete all but the newest `kept` checkpoints and the spared ones.
+    def prune(self, keep: int) -> None:
+        """Delete all but the newest `keep` checkpoints and the spared ones.
 
         Parts without a checkpoint are deleted, too.
 
         Raises:
             OSError: a file cannot be deleted.
         """
-        for step in self.steps()[kept:]:
+        for step in self.steps()[keep:]:
             if step not in self.spared:
                 self.path(step).unlink()
         steps = self.steps()

@@ -216,13 +216,13 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path}: is not a folder")
         _probe(self.path)
-        own, foreign = self._contents()
+        own_files, foreign = self._contents()
         # Empty, or a run that was killed while it wrote its first files.
-        if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):
+        if not foreign and all(path.name.startswith(f".{RECORD}") for path in own_files):
             return
         if foreign or not holds_run(self.path):
             shown = ", ".join(
-                one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3]
+                one_line(str(path.relative_to(self.path))) for path in [*foreign, *own_files][:3]
             )
             raise OutputError(
                 f"{self.path}: holds files that do not belong to a run ({shown}), which --force "
@@ -271,14 +271,14 @@ class RunFolder:
             continuation: Continuation | None = self._continuation()
             if continuation is not None and not self._shared:
                 return continuation
-            whole: Mapping[str, np.ndarray] = {}
+            saved_state: Mapping[str, np.ndarray] = {}
             # The states are too large for a message.
             if (
                 continuation
                 and continuation.checkpoint
                 and PIECES not in continuation.checkpoint.state
             ):
-                whole, continuation = (
+                saved_state, continuation = (
                     continuation.checkpoint.state,
                     replace(continuation, checkpoint=replace(continuation.checkpoint, state={})),
                 )
@@ -290,7 +290,7 @@ class RunFolder:
             if not checkpoint.state:
                 with self.collective.together():
                     state = (
-                        whole
+                        saved_state
                         if self.collective.ranks.is_root
                         else self.checkpoints.read(checkpoint.step).state
                     )
@@ -320,7 +320,7 @@ class RunFolder:
                 f"checkpoint's time, {checkpoint.time:.6g} s: "
                 "frames would be lost; choose a longer duration"
             )
-        lost = [
+        missing = [
             name
             for name, found in (
                 (RECORD, read_record(self.path)),
@@ -331,9 +331,9 @@ class RunFolder:
         remarks = [
             *refused,
             *self._other_versions(),
-            *(f"{name}: was missing or damaged; rewritten" for name in lost),
+            *(f"{name}: was missing or damaged; rewritten" for name in missing),
         ]
-        if RECORD in lost:
+        if RECORD in missing:
             remarks.append(
                 "earlier --set values are unknown: pass them again, else those of the scene are "
                 "used"
@@ -563,7 +563,7 @@ class RunFolder:
 
     def _contents(self) -> tuple[list[Path], list[Path]]:
         """Return the files of runs, and all other files."""
-        own: list[Path] = []
+        own_files: list[Path] = []
         foreign: list[Path] = []
         for path, pattern in _walk(self.path):
             is_own = (
@@ -571,8 +571,8 @@ class RunFolder:
                 and not path.is_symlink()
                 and pattern.fullmatch(_written_as(path.name))
             )
-            (own if is_own else foreign).append(path)
-        return own, foreign
+            (own_files if is_own else foreign).append(path)
+        return own_files, foreign
 
 
 def holds_run(folder: Path) -> bool:

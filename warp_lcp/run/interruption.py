@@ -56,7 +56,7 @@ class Interruption:
         signals: Sequence[signal.Signals] = SIGNALS,
     ) -> None:
         self._say, self._early, self._last, self._signals = say, at_once, last, signals
-        self._taken = threading.Event()
+        self._handled = threading.Event()
         self.name = ""
         self._previous: dict[signal.Signals, Handler] = {}
 
@@ -92,12 +92,12 @@ class Interruption:
         os.close(self._read)
         os.close(self._write)
 
-    def _take(self, given: int, frame: FrameType | None) -> None:
-        number = signal.Signals(given)
+    def _take(self, signal_number: int, frame: FrameType | None) -> None:
+        number = signal.Signals(signal_number)
         # SIGTERM may arrive several times, for the process and for its group.
         if number == signal.SIGINT:
             signal.signal(number, self._previous[number])
-        self._taken.set()
+        self._handled.set()
         if not self.name:
             self.name = number.name
             if self._early:
@@ -115,7 +115,7 @@ class Interruption:
                 f"{number.name}: stopping "
                 f"{'before the first step has ended' if early else f'after this step{again}'}"
             )
-            if early and self._last is not None and not self._taken.wait(GRACE):
+            if early and self._last is not None and not self._handled.wait(GRACE):
                 self._last(number.name)
                 # Nothing else ends a compiler; no step is lost, and no result file is half-written.
                 os._exit(FAILED)

@@ -134,14 +134,14 @@ def running_scene(
         OutputError: the folder cannot be used for the run; on all ranks, like all errors here.
         SceneError: the scene cannot be simulated, or not on ranks.
     """
-    scene, everyone = request.scene, collective or Collective.of_one()
+    scene, group = request.scene, collective or Collective.of_one()
     if collective is not None and request.record_problems is not None:
         raise OutputError(
             "--record-problems cannot be combined with --engine petsc: each rank has only a part "
             "of the problem"
         )
-    share = everyone.share_of_device(request.device)
-    with everyone.together():
+    share = group.share_of_device(request.device)
+    with group.together():
         if collective is not None:
             check_ranks(scene)
         output_notes = check_output(scene) if request.out is not None else []
@@ -158,7 +158,7 @@ def running_scene(
     with folder.held(resume=request.resume) if folder else nullcontext(list[str]()) as remarks:
         record.warnings = [*remarks, *output_notes]
         continued = _open(folder, request, record) if folder else None
-        with everyone.together():
+        with group.together():
             simulation, notes = _simulation(request, folder, collective, continued)
         record.warnings += notes
         for note in record.warnings:
@@ -166,7 +166,7 @@ def running_scene(
         for change in record.changed:
             observer.note(f"changed: {change}")
         checkpoint = continued.checkpoint if continued else None
-        run = RunLoop(simulation, scene, folder, record, observer, profile, everyone)
+        run = RunLoop(simulation, scene, folder, record, observer, profile, group)
         with profile.kernels_apart() if profile else nullcontext():
             yield run
             return (
@@ -303,7 +303,7 @@ class RunLoop:
         self._somewhere = collective.ranks.any
         # Surfaces of bodies are part of every frame.
         self._has_bodies = any(solid.is_body for solid in scene.solid)
-        self._begun = clock.perf_counter()
+        self._start_time = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
         # Whether the frame at the time of the checkpoint is missing.
@@ -364,7 +364,7 @@ class RunLoop:
         finally:
             if self.record.status == "running":
                 self._fail("the program ended unexpectedly")
-            self._tell_missed()
+            self._report_missed_tolerance()
             self._try_to(self._write_record)
             if self.profile and self.folder:
                 self._try_to(partial(self._write_profile, self.profile, self.folder))
@@ -482,9 +482,11 @@ class RunLoop:
                 )
             raise
 
-    def _interrupted(self, asked: bool | str) -> str:
+    def _interrupted(self, requested: bool | str) -> str:
         """Return the stop request of any rank."""
-        names = [name if isinstance(name, str) else "" for name in self.collective.exchange(asked)]
+        names = [
+            name if isinstance(name, str) else "" for name in self.collective.exchange(requested)
+        ]
         rank = next((rank for rank, name in enumerate(names) if name), 0)
         return (
             f"interrupted by {names[rank]}{f' on rank {rank}' if rank else ''}"
@@ -494,7 +496,7 @@ class RunLoop:
 
     def _step(self, end: float) -> dict[str, Value]:
         """Run a step toward a time [s] and return its log row."""
-        begun = clock.perf_counter()
+        start_time = clock.perf_counter()
         stable, number = stable_dt(self.simulation), self.simulation.step_count + 1
         if stable < self.time.dt_min and not self._below_dt_min:
             self._below_dt_min = True  # one warning is enough: the log column cfl has the rest
@@ -503,7 +505,7 @@ class RunLoop:
                 "steps may be unstable"
             )
         dt, retries, values = take_step(self.simulation, stable, end, self.time)
-        seconds = clock.perf_counter() - begun
+        seconds = clock.perf_counter() - start_time
         return {
             "step": self.simulation.step_count,
             "time": self.simulation.time,
@@ -604,14 +606,14 @@ class RunLoop:
         if self.writer and self.writer.newest is not None:
             self.record.frames = self.writer.newest
         self.record.steps, self.record.time = self.simulation.step_count, self.simulation.time
-        self.record.seconds = round(clock.perf_counter() - self._begun, 3)
+        self.record.seconds = round(clock.perf_counter() - self._start_time, 3)
 
     def _write_record(self) -> None:
         self._count()
         if self.folder:
             self.folder.write_record(self.record)
 
-    def _tell_missed(self) -> None:
+    def _report_missed_tolerance(self) -> None:
         """Warn about steps of this run whose solve missed its tolerance."""
         if self._missed:
             (worst, step), steps = max(self._missed), self.simulation.step_count - self._first_step

@@ -56,14 +56,14 @@ def gaps(
             f"{frames.frames.name}: {listed} are missing or truncated; "
             f"{_again(checkpoints, lambda _, time: time < first)}"
         )
-    lost = [
+    missing_series = [
         part.name
         for part in frame
         if frames.has_collection(part) and not (frames.folder / f"{part.name}.pvd").is_file()
     ]
     return [
         *lines,
-        *(f"{name}.pvd: was missing; rebuilt from the existing frames" for name in lost),
+        *(f"{name}.pvd: was missing; rebuilt from the existing frames" for name in missing_series),
     ]
 
 

@@ -112,13 +112,13 @@ class Profile:
     def stage(self, name: str, *arrays: wp.array | None) -> Iterator[None]:
         """Measure a stage of the run's own thread."""
         self._wait()
-        loading, begun, shared = self._loads.seconds, time.perf_counter(), shared_seconds()
+        loading, start_time, shared = self._loads.seconds, time.perf_counter(), shared_seconds()
         try:
             yield
         finally:
             self._wait()
             stage = self.stages.setdefault(name, ProfileStage())
-            stage.add(time.perf_counter() - begun - (self._loads.seconds - loading))
+            stage.add(time.perf_counter() - start_time - (self._loads.seconds - loading))
             stage.shared += shared_seconds() - shared
             stage.bytes += sum(
                 array.size * wp.types.type_size_in_bytes(array.dtype)

@@ -187,14 +187,14 @@ class Count:
         """Update the number of finished items; the first call, with 0, starts."""
         if not done:
             _begin(self._progress, 0.0, of)
-            self._told = self._clock()
+            self._last_report = self._clock()
             return
         self._progress.update(self._task, completed=done)
         text = f"{self._doing}: {done} of {of} {self._things}  {time_left(self._progress)}"
         if self._console.is_terminal:
             self._status.update(text)
-        elif done < of and self._clock() - self._told >= LINE_EVERY:
-            self._told = self._clock()
+        elif done < of and self._clock() - self._last_report >= LINE_EVERY:
+            self._last_report = self._clock()
             say(self._console, text)
 
 

@@ -113,34 +113,38 @@ class RankLauncher(Launcher):
         self._folder = request.out
         return super().run(request, observer=observer, stop=stop, profile=profile)
 
-    def agree(self, given: TableView) -> None:
+    def agree(self, arguments: TableView) -> None:
         """Check that all ranks have the same values, by name.
 
         Raises:
             OutputError: they differ; the message names the difference.
         """
         digests = self.collective.exchange(
-            hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest()
+            hashlib.blake2b(
+                pickle.dumps(sorted(arguments.items(), key=lambda item: item[0]))
+            ).digest()
         )
         if digests.count(digests[0]) == len(digests):
             return
-        everyone = self.collective.exchange(dict(given))
+        all_values = self.collective.exchange(dict(arguments))
         names = sorted(
             {
                 name
-                for values in everyone
+                for values in all_values
                 for name in values
-                if any(other.get(name) != values[name] for other in everyone)
+                if any(other.get(name) != values[name] for other in all_values)
             }
         )
         lines = []
         for name in names[:SHOWN]:
             rank = next(
-                r for r, values in enumerate(everyone) if values.get(name) != everyone[0].get(name)
+                r
+                for r, values in enumerate(all_values)
+                if values.get(name) != all_values[0].get(name)
             )
             lines.append(
-                f"{name}: {_shown(everyone[0].get(name))} on rank 0, "
-                f"{_shown(everyone[rank].get(name))} on rank {rank}"
+                f"{name}: {_shown(all_values[0].get(name))} on rank 0, "
+                f"{_shown(all_values[rank].get(name))} on rank {rank}"
             )
         if len(names) > SHOWN:
             lines.append(f"and {len(names) - SHOWN} more")

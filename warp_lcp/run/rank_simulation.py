@@ -84,7 +84,7 @@ class RankSimulation:
             with self._collective.together():
                 row = self._simulation.step(dt)
         except RankFailed as error:
-            raise self._collective.told_as(SimulationFailed(str(error))) from error
+            raise self._collective.local_exception(SimulationFailed(str(error))) from error
         except StepFailed as error:
             # The other ranks have continued: there is no state to retry from.
             if len(self._collective.failed) < self._collective.ranks.size:

@@ -68,16 +68,19 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
     """
     if not holds_run(folder):
         raise OutputError(f"{folder}: there is no run to resume")
-    own, new_keys = folder / SCENE, [override_key(override) for override in overrides]
+    own_scene, new_keys = folder / SCENE, [override_key(override) for override in overrides]
     before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in new_keys]
-    if source is None or (own.is_file() and Path(source).is_file() and own.samefile(source)):
+    if source is None or (
+        own_scene.is_file() and Path(source).is_file() and own_scene.samefile(source)
+    ):
         return ResolvedScene(
-            load_scene(own, overrides), [*before, *({"set": override} for override in overrides)]
+            load_scene(own_scene, overrides),
+            [*before, *({"set": override} for override in overrides)],
         )
 
     earlier = [entry["set"] for entry in before if not _edited(entry, source)]
     scene = load_scene(source, [*earlier, *overrides])
-    ran, now = (recorded_keys(own) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
+    ran, now = (recorded_keys(own_scene) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
     if ran not in (None, now) and RESOLUTION not in new_keys:
         raise OutputError(
             f"{folder}: {RESOLUTION} is {ran}, but {now} in {source}: use --set {RESOLUTION}={now} "

@@ -93,14 +93,14 @@ class Trial:
             ValueError: the two runs have values at different times.
         """
         shares = []
-        for own, other in zip(self.looks[1:], reference.looks[1:], strict=True):
-            if own.mass.shape != other.mass.shape or abs(own.time - other.time) > SAME_TIME:
+        for look, other in zip(self.looks[1:], reference.looks[1:], strict=True):
+            if look.mass.shape != other.mass.shape or abs(look.time - other.time) > SAME_TIME:
                 raise ValueError(
                     "the two runs were sampled in different boxes or at different times"
                 )
             total = float(other.mass.sum())
             shares.append(
-                0.5 * float(np.abs(own.mass - other.mass).sum()) / total if total > 0.0 else 0.0
+                0.5 * float(np.abs(look.mass - other.mass).sum()) / total if total > 0.0 else 0.0
             )
         return float(np.mean(shares))
 

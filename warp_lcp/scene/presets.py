@@ -116,16 +116,18 @@ def preset_line(scene: Scene) -> str | None:
     own_values = {
         key: (value, value_of(scene, key)) for key, value in prices.presets[name].settings.items()
     }
-    taken = [f"{key} {value:g}" for key, (value, is_now) in own_values.items() if is_now == value]
-    own = [
+    preset_values = [
+        f"{key} {value:g}" for key, (value, is_now) in own_values.items() if is_now == value
+    ]
+    scene_values = [
         f"{key} {is_now:g}" if isinstance(is_now, float | int) else f"{key} {is_now}"
         for key, (value, is_now) in own_values.items()
         if is_now not in (value, None)
     ]
     return f"{name}: " + "; ".join(
         [
-            *([", ".join(taken)] if taken else []),
-            *([f"the scene's own: {', '.join(own)}"] if own else []),
+            *([", ".join(preset_values)] if preset_values else []),
+            *([f"the scene's own: {', '.join(scene_values)}"] if scene_values else []),
         ]
     )
 

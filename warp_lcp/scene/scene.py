@@ -445,9 +445,9 @@ class Scene(Table):
         """
         complaints = []
         for index, shape in enumerate(shapes):
-            own = shape.complaints(self.dimension)
-            if inside and not own and self.enclosed_volume(shape) == 0.0:
-                own = [
+            own_complaints = shape.complaints(self.dimension)
+            if inside and not own_complaints and self.enclosed_volume(shape) == 0.0:
+                own_complaints = [
                     Complaint(
                         (),
                         None,
@@ -457,7 +457,7 @@ class Scene(Table):
                 ]
             complaints += [
                 Complaint((key, index, *complaint.place), complaint.value, complaint.message)
-                for complaint in own
+                for complaint in own_complaints
             ]
         return complaints
 

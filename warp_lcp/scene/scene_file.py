@@ -255,7 +255,7 @@ def _find(text: str) -> Path | Traversable:
     )
 
 
-def _near_file(path: Path, others: Iterable[str]) -> str:
+def _near_file(path: Path, other_names: Iterable[str]) -> str:
     """Return `did you mean ...?` for a scene file with a similar name, or "".
 
     "" also if the name of a built-in scene is more similar.
@@ -268,7 +268,7 @@ def _near_file(path: Path, others: Iterable[str]) -> str:
         }
     except OSError:
         return ""
-    said = nearest(path.name.removesuffix(".toml"), {*files, *others})
+    said = nearest(path.name.removesuffix(".toml"), {*files, *other_names})
     return next(
         (
             f"did you mean {file!r}?"

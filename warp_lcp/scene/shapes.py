@@ -99,13 +99,13 @@ class Shape(Table):
         from warp_lcp.grid.solids import Placement
 
         zeros = [0.0] * dimension
-        placed = Placement.from_degrees(
+        placement = Placement.from_degrees(
             self.scale,
             self.rotate or zeros[: 1 if dimension == 2 else 3],
             self.translate or zeros,
             dimension,
         )
-        return placed if self.about is None else placed.about(self.about)
+        return placement if self.about is None else placement.about(self.about)
 
     def turned_out(self, domain: list[float]) -> tuple[float, list[float]] | None:
         """Return the distance by which `rotate` moves the shape out of a domain.
@@ -141,11 +141,11 @@ class Shape(Table):
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return errors of the shape in a scene of 2 or 3 dimensions."""
-        wanted = {name: dimension for name, value in self if isinstance(value, list)}
-        wanted |= {
+        lengths = {name: dimension for name, value in self if isinstance(value, list)}
+        lengths |= {
             name: 1 if dimension == 2 else 3
             for name in ("rotate", "angular_velocity")
-            if name in wanted
+            if name in lengths
         }
         return [
             Complaint(
@@ -153,7 +153,7 @@ class Shape(Table):
                 value,
                 f"must {counted(count)} in {dimension}-D",
             )
-            for name, count in wanted.items()
+            for name, count in lengths.items()
             if len(value := getattr(self, name)) != count
         ] + (
             [Complaint(("about",), self.about, "has no effect without rotate or scale")]

@@ -214,13 +214,13 @@ def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
 
 
 def _unknown_variant(place: _Place, key: str, tag: object) -> KeyFault:
-    known = _variants(place.below)
+    variants = _variants(place.below)
     if tag is None:
         return KeyFault(
-            f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(known))}"
+            f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(variants))}"
         )
     return KeyFault(
-        f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), known)}", written(tag)
+        f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), variants)}", written(tag)
     )
 
 

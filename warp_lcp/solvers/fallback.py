@@ -326,7 +326,7 @@ class FallbackWorkspace(OptionalMembers):
         self._best: DeviceArray | None = None
         self._place = 0
         # The iterate that the current method was given, if it is a restarted one.
-        self._begun: DeviceArray | None = None
+        self._start: DeviceArray | None = None
         # Whether only the rounding floor prevents a hand-over.
         self._floored = False
         # Whether the best iterate is stored here and no longer by the first workspace.
@@ -471,7 +471,7 @@ class FallbackWorkspace(OptionalMembers):
     def _workspace(self, place: int) -> Workspace | None:
         """Return the workspace of a method, None if it does not take the problem."""
         if place not in self._works:
-            self._works[place] = self._made(self._entries[place].method)
+            self._works[place] = self._workspace_of(self._entries[place].method)
         work = self._works[place]
         return (
             None
@@ -479,7 +479,7 @@ class FallbackWorkspace(OptionalMembers):
             else work
         )
 
-    def _made(self, method: Solver) -> Workspace | None:
+    def _workspace_of(self, method: Solver) -> Workspace | None:
         """Return a workspace of a method, None if it does not take the problem.
 
         An equal method of the chain shares its workspace.
@@ -517,12 +517,12 @@ class FallbackWorkspace(OptionalMembers):
         failed = fails(self._progress)
         if not self._left_first:
             self._leave_first()
-        if before.restart and self._begun is not None:
-            wp.copy(self.x, self._begun)
+        if before.restart and self._start is not None:
+            wp.copy(self.x, self._start)
         elif failed and not self._at_best:
             wp.copy(self.x, self._best)
         if entry.restart:
-            self._begun = wp.clone(self.x)
+            self._start = wp.clone(self.x)
         self._place, self._since = place, 0
         self._progress.begin()
         assert work is not None, "`_due` returns methods that take the problem"
@@ -612,17 +612,17 @@ class FallbackWorkspace(OptionalMembers):
         return replace(done, linear_iterations=linear, interim=sank)
 
 
-def _entry(given: EntryLike, *, first: bool) -> FallbackEntry:
+def _entry(pair: EntryLike, *, first: bool) -> FallbackEntry:
     """Return an argument of `Fallback` as an entry."""
-    if isinstance(given, FallbackEntry):
-        entry = given
-    elif isinstance(given, tuple) and len(given) == 2:
-        entry = FallbackEntry(*given)
+    if isinstance(pair, FallbackEntry):
+        entry = pair
+    elif isinstance(pair, tuple) and len(pair) == 2:
+        entry = FallbackEntry(*pair)
     elif first:
-        entry = FallbackEntry(given)
+        entry = FallbackEntry(pair)
     else:
         raise ValueError(
-            f"Fallback: {given!r} must be a pair (method, condition) or an FallbackEntry"
+            f"Fallback: {pair!r} must be a pair (method, condition) or an FallbackEntry"
         )
     method = entry.method
     if not is_method(method):

@@ -449,7 +449,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         self._search.forget()
         self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance
         self._gradient = None
-        self._iterate = self._begun = self.read_iterate() / self.units
+        self._iterate = self._start = self.read_iterate() / self.units
 
     def descend(self, x: DeviceArray) -> Step:
         """Take one gradient step on the same map."""
@@ -457,7 +457,7 @@ class FischerDenseWorkspace(DenseWorkspace):
             self._gradient = DescentWorkspace(self.problem, self._descent, self.residual)
             self._gradient.start(warm=True, tolerance=self.target)
         step = self._gradient.descend(x)
-        self._iterate = self._begun = self.read_iterate() / self.units
+        self._iterate = self._start = self.read_iterate() / self.units
         return Step("gradient", step.linear_iterations)
 
     def newton_step(self, x: DeviceArray) -> Step:
@@ -550,9 +550,9 @@ class FischerDenseWorkspace(DenseWorkspace):
         self.stage += 1
         data = self.map.data
         x = (
-            self._begun
+            self._start
             if start is None
-            else np.clip(np.full(len(self._begun), start), data.lower, data.upper)
+            else np.clip(np.full(len(self._start), start), data.lower, data.upper)
         )
         y = data.affine(x)
         one_sided = np.isfinite(data.lower) & ~np.isfinite(data.upper)

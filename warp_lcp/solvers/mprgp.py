@@ -130,14 +130,14 @@ class MPRGP(Settings):
         """
         if work.wants_monotone_cycle():
             return work.monotone_step(x)
-        held = work.residual.active
+        active = work.residual.active
         release = work.residual.chopped > self.gamma**2 * work.residual.reduced
         if (release and not work.proportion()) or not work.conjugate():
-            return Step("unbounded", 1, held, SolveStatus.DIVERGED)
+            return Step("unbounded", 1, active, SolveStatus.DIVERGED)
         return Step(
             "proportioning" if release else "conjugate gradient",
             2 if release else 1,
-            held,
+            active,
             interim=work.sinks(),
         )
 

@@ -82,13 +82,13 @@ class JacobiWorkspace(SweepWorkspace):
 
     def __init__(self, problem: LCP, settings: ProjectedJacobi) -> None:
         super().__init__(problem, settings.precision)
-        self._given, self._version = settings.omega, object()
+        self._omega, self._version = settings.omega, object()
         self.omega = settings.omega or 1.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Estimate the damping if the operator is new."""
         self.d, version = self.diagonal.field(), version_of(self.problem.A)
-        if self._given is None and version != self._version:
+        if self._omega is None and version != self._version:
             self.omega = self._estimate()
             self._version = version  # last: the time limit may end the estimate before
         self.contraction.start(self.x)

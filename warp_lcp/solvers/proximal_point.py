@@ -98,7 +98,7 @@ class ProximalWorkspace(WorkspaceBase):
 
     def __init__(self, problem: LCP, inner: Solver | None) -> None:
         super().__init__(problem)
-        self._given = inner
+        self._user_method = inner
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Read the current A, b and bounds."""
@@ -115,7 +115,7 @@ class ProximalWorkspace(WorkspaceBase):
         self._operator = operator
         self._lower, self._upper = p.lower.numpy().copy(), p.upper.numpy().copy()
         self._inner = LCP(self._operator, self._b, self._lower, self._upper)
-        self._method = self._given or _inner_method(is_sparse(self._matrix))
+        self._method = self._user_method or _inner_method(is_sparse(self._matrix))
         self._work: Workspace = self._method.init(self._inner)
         self._smallest, self._idle, self._steps, self._near, self._least = (
             self.residual.norm,

@@ -285,14 +285,14 @@ class MatrixBlock:
         problem: the block's own; `couple` writes b and bounds.
     """
 
-    def __init__(self, whole: LCP, x: DeviceArray, rows: np.ndarray) -> None:
-        self._whole, self._x, self._rows = whole, x, rows
+    def __init__(self, problem: LCP, x: DeviceArray, rows: np.ndarray) -> None:
+        self._whole, self._x, self._rows = problem, x, rows
         inner, self._outer = self._entries()
-        device, size = whole.device, len(rows)
-        A = as_operator(inner, device, whole.A.dtype)
+        device, size = problem.device, len(rows)
+        A = as_operator(inner, device, problem.A.dtype)
         b, low, high = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(3))
         self.problem = LCP(A, b, low, high)
-        self._version = version_of(whole.A)
+        self._version = version_of(problem.A)
 
     def refresh(self) -> None:
         """Read A's entries again where they have changed."""
@@ -346,19 +346,22 @@ class GridBlock:
         problem: the block's own, in the layout of the whole; bounds are shared with it.
     """
 
-    def __init__(self, whole: LCP, x: DeviceArray, rows: np.ndarray) -> None:
-        A = whole.A
+    def __init__(self, problem: LCP, x: DeviceArray, rows: np.ndarray) -> None:
+        A = problem.A
         assert has(A, HasBlocks)
-        layout = whole.layout
-        self._whole, self._x = whole, x
+        layout = problem.layout
+        self._whole, self._x = problem, x
         member = np.zeros(layout.size, dtype=np.uint8)
         member[rows] = 1
-        self._member = wp.array(member, dtype=wp.uint8, device=whole.device)
+        self._member = wp.array(member, dtype=wp.uint8, device=problem.device)
         sub = A.on_cells(self._cells())
         self._b, self._y, self._z, self._guess = (layout.zeros(wp.float64) for _ in range(4))
         stored = layout.stored_shape
         self.problem = LCP(
-            sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored)
+            sub,
+            self._b.reshape(stored),
+            problem.lower.reshape(stored),
+            problem.upper.reshape(stored),
         )
         self._version = A.version
 
@@ -417,22 +420,22 @@ class GridBlock:
 Block = MatrixBlock | GridBlock
 
 
-def block_problem(whole: LCP, x: DeviceArray, rows: np.ndarray) -> Block:
+def block_problem(problem: LCP, x: DeviceArray, rows: np.ndarray) -> Block:
     """Return a block of a problem as a problem of its own.
 
     Args:
-        whole: the problem.
+        problem: the problem.
         x: the iterate that all blocks share, stored.
         rows: the block's stored indices.
 
     Raises:
         ValueError: the operator has no principal sub-operators.
     """
-    if has(whole.A, HasBlocks):
-        return GridBlock(whole, x, rows)
-    if has(whole.A, HasRows):
-        return MatrixBlock(whole, x, rows)
+    if has(problem.A, HasBlocks):
+        return GridBlock(problem, x, rows)
+    if has(problem.A, HasRows):
+        return MatrixBlock(problem, x, rows)
     raise ValueError(
-        f"{type(whole.A).__name__} cannot be split into blocks, which need "
+        f"{type(problem.A).__name__} cannot be split into blocks, which need "
         f"{described(HasRows, HasBlocks)}"
     )

@@ -101,13 +101,13 @@ class SubspaceMinimization(Settings):
             check_time()
             work.sweep.run(x, forward=True)
         work.round_iterate()
-        iterations, held = self.sweeps, 0
+        iterations, active = self.sweeps, 0
         for solve in range(self.solves):
-            moved, held = work.classify(x)
+            moved, active = work.classify(x)
             if solve > 0 and not moved:
                 break
             iterations += work.minimize(x)
-        return Step("subspace", iterations, held, work.contraction.test(x))
+        return Step("subspace", iterations, active, work.contraction.test(x))
 
 
 class SubspaceWorkspace(SweepWorkspace):

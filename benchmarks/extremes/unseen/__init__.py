@@ -46,12 +46,12 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     """
     if kind not in KINDS:
         raise ValueError(f"kind = {kind}: must be one of {', '.join(KINDS)}")
-    drawn = KINDS[kind](Draw(kind, seed, small=small))
-    if not isinstance(drawn, GridProblem):
-        return Unseen(drawn)
-    drawn = solvable(drawn)
+    problem = KINDS[kind](Draw(kind, seed, small=small))
+    if not isinstance(problem, GridProblem):
+        return Unseen(problem)
+    problem = solvable(problem)
     return Unseen(
-        drawn,
-        changed(drawn, seed) if seed % WARM_EVERY == 0 and not small else None,
+        problem,
+        changed(problem, seed) if seed % WARM_EVERY == 0 and not small else None,
         ALLOWANCE.get(kind, 1.0),
     )

@@ -88,18 +88,20 @@ class UnseenCase(Drawn):
 
     def tried(self, precision: str, device: str) -> ExtremeAttempt:
         """Solve cold and warm, and solve the equations without bounds."""
-        drawn = unseen.problem(self.kind, self.seed)
-        result, attempt = solved(drawn.problem, self.solve, device)
+        unseen_problem = unseen.problem(self.kind, self.seed)
+        result, attempt = solved(unseen_problem.problem, self.solve, device)
         attempt.facts = {
             "kind": self.kind,
             "seed": self.seed,
-            "unknowns": len(drawn.problem.exact().b),
+            "unknowns": len(unseen_problem.problem.exact().b),
             "iterations": result.iterations,
         }
-        if isinstance(drawn.problem, GridProblem):
-            self._against_equations(drawn.problem, drawn.allowance, result, attempt, device)
-        if drawn.then is not None and result:
-            self._warm(drawn.then, result, attempt, device)
+        if isinstance(unseen_problem.problem, GridProblem):
+            self._against_equations(
+                unseen_problem.problem, unseen_problem.allowance, result, attempt, device
+            )
+        if unseen_problem.then is not None and result:
+            self._warm(unseen_problem.then, result, attempt, device)
         return attempt
 
     def _against_equations(
@@ -232,12 +234,12 @@ def cases(
 
 def summary(verdicts: Sequence[ExtremeVerdict], first: int) -> tuple[RecordTable, list[str]]:
     """Return a row for each kind, and the faults of all cases together."""
-    own = [v for v in verdicts if v.case.family == FAMILY]
+    cases = [v for v in verdicts if v.case.family == FAMILY]
     rows = [
-        _row(kind, [v for v in own if isinstance(v.case, Drawn) and v.case.kind == kind])
+        _row(kind, [v for v in cases if isinstance(v.case, Drawn) and v.case.kind == kind])
         for kind in unseen.KINDS
     ]
-    counted = [v.attempt for v in own if v.attempt.facts.get("equality") is not None]
+    counted = [v.attempt for v in cases if v.attempt.facts.get("equality") is not None]
     often = [
         a for a in counted if a.status == "CONVERGED" and a.facts["iterations"] <= a.facts["often"]
     ]
@@ -248,7 +250,9 @@ def summary(verdicts: Sequence[ExtremeVerdict], first: int) -> tuple[RecordTable
         f"iterations and {more}"
     )
     beyond = [
-        v.attempt.facts["warm"] - v.attempt.facts["cold"] for v in own if "warm" in v.attempt.facts
+        v.attempt.facts["warm"] - v.attempt.facts["cold"]
+        for v in cases
+        if "warm" in v.attempt.facts
     ]
     warm_share = sum(more <= WARM_MORE for more in beyond) / max(len(beyond), 1)
     warm = (
@@ -256,7 +260,7 @@ def summary(verdicts: Sequence[ExtremeVerdict], first: int) -> tuple[RecordTable
         "than cold ones"
     )
     remark = (
-        f"Seeds from {first} on, {len(own)} problems; {within}, {warm}; the limit of both is "
+        f"Seeds from {first} on, {len(cases)} problems; {within}, {warm}; the limit of both is "
         f"{OFTEN_SHARE:.0%}. "
     )
     remark += f"`--seed {first}` runs them again."
@@ -277,10 +281,10 @@ def summary(verdicts: Sequence[ExtremeVerdict], first: int) -> tuple[RecordTable
     ), wrong
 
 
-def _row(kind: str, own: Sequence[ExtremeVerdict]) -> list[str]:
-    if not own:
+def _row(kind: str, own_verdicts: Sequence[ExtremeVerdict]) -> list[str]:
+    if not own_verdicts:
         return []
-    facts = [v.attempt.facts for v in own]
+    facts = [v.attempt.facts for v in own_verdicts]
     counts = [f["iterations"] for f in facts if "iterations" in f] or [0]
     pairs = [(f["iterations"], f["equality"]) for f in facts if f.get("equality") is not None]
     warm = [f["warm"] - f["cold"] for f in facts if "warm" in f]
@@ -291,10 +295,14 @@ def _row(kind: str, own: Sequence[ExtremeVerdict]) -> list[str]:
     )
     row = [
         kind,
-        str(len(own)),
-        str(sum(bool(v.wrong) for v in own)),
+        str(len(own_verdicts)),
+        str(sum(bool(v.wrong) for v in own_verdicts)),
         f"{np.mean(counts):.1f}",
         str(max(counts)),
         *of_equations,
     ]
-    return [*row, f"{max(warm):+d}" if warm else "-", f"{max(v.attempt.seconds for v in own):.1f}"]
+    return [
+        *row,
+        f"{max(warm):+d}" if warm else "-",
+        f"{max(v.attempt.seconds for v in own_verdicts):.1f}",
+    ]

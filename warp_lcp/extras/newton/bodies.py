@@ -65,7 +65,7 @@ class WorldBodies(RigidBodies):
         self.bodies = BodyStates(self.bodies)  # with the new masses
         self._com = model.body_com.numpy()[self.indices].astype(np.float64)
 
-    def asked(
+    def requested_state(
         self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, dt: float
     ) -> np.ndarray:
         """Return the inputs of a step of dt [s]: poses, and velocities after forces.
@@ -151,7 +151,7 @@ class WorldBodies(RigidBodies):
         """Move and rotate the bodies."""
         self._before = None
         for body, impulse in zip(self.bodies, self.impulses, strict=True):
-            impulse += body.given
+            impulse += body.received_impulse
         self.bodies.release()
         self.bodies.advance(dt)
 

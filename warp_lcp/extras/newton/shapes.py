@@ -52,7 +52,7 @@ def geometries(model: newton.Model, origin: np.ndarray) -> dict[int, list[Geomet
         name: getattr(model, f"shape_{name}").numpy()
         for name in ("body", "flags", "type", "scale", "transform")
     }
-    placed = model.body_q.numpy() if model.body_count else np.zeros((0, 7))
+    transforms = model.body_q.numpy() if model.body_count else np.zeros((0, 7))
     geometries_of: dict[int, list[Geometry]] = {}
     for shape in range(model.shape_count):
         row = {name: array[shape] for name, array in arrays.items()}
@@ -61,7 +61,7 @@ def geometries(model: newton.Model, origin: np.ndarray) -> dict[int, list[Geomet
         body = int(row["body"])
         pose = pose_of(row["transform"])
         if body >= 0:
-            pose = pose_of(placed[body]).after(pose)
+            pose = pose_of(transforms[body]).after(pose)
         geometry = _geometry(row, model.shape_source[shape], model.shape_label[shape])
         geometries_of.setdefault(body, []).append(
             geometry.moved(Pose(pose.rotation, pose.translation - origin))

@@ -85,11 +85,11 @@ class SolverLiquid(SolverBase, CouplingInterface):
         )
         self._origin, self._chosen = np.asarray(origin, dtype=np.float64), bodies
         self.row: Row = {}
-        self._coupled = self._restarts = self._again = False
+        self._coupled = self._restarts = self._restart = False
         # Whether the next step is the first since the coupler has set the bodies' poses.
         self._begins = True
-        self._kept: dict[str, np.ndarray] = {}
-        self._asked: np.ndarray | None = None
+        self._saved_state: dict[str, np.ndarray] = {}
+        self._requested: np.ndarray | None = None
         self.simulation, self.bodies = self._create()
 
     @classmethod
@@ -166,7 +166,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
             return
         poses, velocities = state_in.body_q.numpy(), state_in.body_qd.numpy()
         forces = None if state_in.body_f is None else state_in.body_f.numpy()
-        asked = bodies.asked(poses, velocities, forces, dt)
+        asked = bodies.requested_state(poses, velocities, forces, dt)
         if self._begin(asked, dt):
             if bodies.take(poses, velocities, forces, simulation.time):
                 simulation.boundary.place(simulation.time)
@@ -223,7 +223,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
     ) -> None:
         """Note that bodies have new poses, and whether the coupler repeats the step."""
         self._begins |= bool(int(flags) & POSED)
-        self._again |= iteration_restart and dt > 0.0
+        self._restart |= iteration_restart and dt > 0.0
 
     def coupling_harvest_proxy_wrenches(
         self,
@@ -273,15 +273,19 @@ class SolverLiquid(SolverBase, CouplingInterface):
         chosen = sorted(shapes) if self._chosen is None else [int(body) for body in self._chosen]
         if missing := [body for body in chosen if body not in shapes]:
             raise ValueError(f"bodies: {missing} have no shapes that collide with shapes")
-        held = {body: united(shapes[body]) for body in chosen}
+        united_shapes = {body: united(shapes[body]) for body in chosen}
         placed, separating = placed_solids(scene, Path()), scene.domain.wall == "separating"
         placed += [
             PlacedSolid(geometry=shape, separating=separating, name=f"shape {n} of the world")
             for n, shape in enumerate(standing)
         ]
-        bodies = WorldBodies(model, origin, held, first=1 + len(placed)) if held else None
+        bodies = (
+            WorldBodies(model, origin, united_shapes, first=1 + len(placed))
+            if united_shapes
+            else None
+        )
         if bodies is not None:
-            movers = zip(bodies.bodies, held.values(), bodies.motions, strict=True)
+            movers = zip(bodies.bodies, united_shapes.values(), bodies.motions, strict=True)
             placed += [
                 PlacedSolid(geometry=shape, separating=separating, name=body.name, motion=motion)
                 for body, shape, motion in movers
@@ -291,41 +295,41 @@ class SolverLiquid(SolverBase, CouplingInterface):
         stand, move = (
             ball(shape="sphere", center=[0.0] * 3, radius=1.0, mass=mass) for mass in (None, 1.0)
         )
-        solids = [*scene.solid, *[stand] * len(standing), *[move] * len(held)]
+        solids = [*scene.solid, *[stand] * len(standing), *[move] * len(united_shapes)]
         whole = scene.model_copy(update={"solid": solids})
         return SIMULATOR.assemble(
             whole, placed, bodies, device=str(model.device), folder=Path()
         ), bodies
 
-    def _begin(self, asked: np.ndarray | None, dt: float) -> bool:
+    def _begin(self, requested: np.ndarray | None, dt: float) -> bool:
         """Restore the state at the beginning of the step; return whether to run it.
 
         It is not run if the coupler repeats it and the bodies move as before, with or without
         contacts.
 
         Args:
-            asked: the result of `WorldBodies.asked`.
+            requested: the result of `WorldBodies.asked`.
             dt: time step [s].
         """
         if self._begins or not self._coupled:
-            if self._again:
-                self._again = self._begins = False
+            if self._restart:
+                self._restart = self._begins = False
                 falls = ROUNDING + ALIKE * dt * float(np.linalg.norm(self.simulation.gravity))
                 alike = np.repeat([ALIKE * self.scene.spacing, ALIKE, falls], [3, 4, 6])
                 if (
-                    asked is not None
-                    and self._asked is not None
-                    and (np.abs(asked - self._asked) < alike).all()
+                    requested is not None
+                    and self._requested is not None
+                    and (np.abs(requested - self._requested) < alike).all()
                 ):
                     return False
-                self.simulation.restore(self._kept)
+                self.simulation.restore(self._saved_state)
             elif self._restarts:
-                self._kept = self.simulation.state()
-            self._asked = asked
+                self._saved_state = self.simulation.state()
+            self._requested = requested
             if self.bodies is not None:
                 self.bodies.impulses[:] = 0.0
         else:
-            self._asked = None  # one of several substeps
+            self._requested = None  # one of several substeps
         self._begins = False
         return True
 

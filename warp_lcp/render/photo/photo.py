@@ -79,7 +79,7 @@ def photograph_run(
     frames: Sequence[int] = (),
     settings: PhotoSettings | None = None,
     out: Path | None = None,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
     noted: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Path]:
@@ -93,7 +93,7 @@ def photograph_run(
         frames: numbers of frames, negative ones counted from the end. Default: all.
         settings: settings of the pictures.
         out: folder of the pictures. Default: `folder / "photo"`.
-        told: called with the number of finished pictures, and the total number.
+        on_progress: called with the number of finished pictures, and the total number.
         estimated: called with the estimated time on this machine's cores [s], before rendering
             begins.
         noted: called with notes on kept and repeated pictures.
@@ -119,7 +119,7 @@ def photograph_run(
         variant = choose_variant()
         liquid = recording.scene.palette == "water" and recording.show is not Show.BODIES
         estimated(len(missing) * expected_seconds(settings, variant, liquid=liquid))
-    told(0, len(numbers))
+    on_progress(0, len(numbers))
     for done, number in enumerate(numbers, 1):
         if number in missing:
             quality = Quality(
@@ -129,7 +129,7 @@ def photograph_run(
             )
             radiance = render_radiance(scenes.frame(number), quality, number, variant)
             _save(developed(radiance), wanted[number], files[number], folder)
-        told(done, len(numbers))
+        on_progress(done, len(numbers))
         yield files[number]
 
 
@@ -141,7 +141,7 @@ def photograph_film(
     frames: Sequence[int] = (),
     settings: PhotoSettings | None = None,
     out: Path | None = None,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
     noted: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Path]:
@@ -156,7 +156,7 @@ def photograph_film(
         frames: as of `photograph_run`.
         settings: likewise.
         out: likewise.
-        told: likewise.
+        on_progress: likewise.
         estimated: likewise.
         noted: likewise.
 
@@ -172,7 +172,7 @@ def photograph_film(
         frames=frames,
         settings=settings,
         out=out,
-        told=told,
+        on_progress=on_progress,
         estimated=estimated,
         noted=noted,
     ):
@@ -203,16 +203,16 @@ def frame_range(text: str, numbers: Sequence[int]) -> list[int]:
     first, last = (
         None if end is None else numbers[end] if -len(numbers) <= end < 0 else end for end in ends
     )
-    chosen = [
+    selected = [
         number
         for number in numbers
         if (first is None or first <= number) and (last is None or number <= last)
     ]
-    if not chosen:
+    if not selected:
         raise RenderError(
             f"--frames {text}: there are no such frames; the run has {numbers[0]} to {numbers[-1]}"
         )
-    return chosen
+    return selected
 
 
 def expected_seconds(settings: PhotoSettings, variant: str, *, liquid: bool) -> float:
@@ -287,17 +287,17 @@ def _report(
     """Report which pictures are kept, and which are repeated and why."""
     if kept := len(wanted) - len(missing):
         noted(f"{kept} of {len(wanted)} pictures are there with these settings and are kept")
-    again = {number: before for number in missing if (before := held[number]) is not None}
-    if again:
+    outdated = {number: before for number in missing if (before := held[number]) is not None}
+    if outdated:
         keys = sorted(
             {
                 key
-                for number, before in again.items()
+                for number, before in outdated.items()
                 for key in wanted[number]
                 if before.get(key) != wanted[number][key]
             }
         )
-        noted(f"{len(again)} pictures have another {', '.join(keys)} and are rendered again")
+        noted(f"{len(outdated)} pictures have another {', '.join(keys)} and are rendered again")
 
 
 def _save(pixels: np.ndarray, settings: Tables, file: Path, folder: Path) -> None:

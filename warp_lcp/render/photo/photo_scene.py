@@ -340,15 +340,15 @@ def body_meshes(bodies: Surface, at_first: Sequence[np.ndarray]) -> list[PhotoMe
     of_point, velocity = np.asarray(bodies.fields["body"]).ravel(), bodies.fields.get("velocity")
     meshes = []
     for body in np.unique(of_point):
-        own = np.flatnonzero(of_point == body)
+        point_indices = np.flatnonzero(of_point == body)
         corners = bodies.corners[of_point[bodies.corners[:, 0]] == body]
-        local = np.searchsorted(own, corners)
+        local = np.searchsorted(point_indices, corners)
         points, triangles, normals = creased(
-            np.asarray(bodies.points[own], dtype=np.float64), local
+            np.asarray(bodies.points[point_indices], dtype=np.float64), local
         )
         color = linear_color(BODY_COLORS[body % len(BODY_COLORS)])
         first = at_first[body] if body < len(at_first) else points[:0]
-        if len(first) == len(own) and is_round(first, local):
+        if len(first) == len(point_indices) and is_round(first, local):
             middle = first[local].mean(axis=1) - 0.5 * (first.min(axis=0) + first.max(axis=0))
             wedge = (
                 np.floor(np.arctan2(middle[:, 2], middle[:, 1]) / (2.0 * np.pi) * WEDGES).astype(
@@ -357,7 +357,9 @@ def body_meshes(bodies: Surface, at_first: Sequence[np.ndarray]) -> list[PhotoMe
                 % 2
             )
             color = np.repeat(np.where(wedge[:, None] == 0, color, PALE), 3, axis=0)
-        moved = None if velocity is None else np.asarray(velocity)[own][local].reshape(-1, 3)
+        moved = (
+            None if velocity is None else np.asarray(velocity)[point_indices][local].reshape(-1, 3)
+        )
         meshes.append(
             PhotoMesh(f"body_{body}", points, triangles, Finish.SATIN, color, normals, moved)
         )

@@ -135,7 +135,7 @@ def test_built_in_scenes_have_no_notes(name: str) -> None:
         ),
     ],
 )
-def test_what_looks_like_a_mistake_in_a_liquid_is_told(more: Tables, said: str) -> None:
+def test_suspicious_liquid_settings_are_reported(more: Tables, said: str) -> None:
     (note,) = notes(POOL, **more)
     assert said in note
 
@@ -161,7 +161,7 @@ def test_what_looks_like_a_mistake_in_a_liquid_is_told(more: Tables, said: str) 
         ({"time": {"duration": 0.5, "cfl": 8.0}}, "0.5 to 1 are usual"),
     ],
 )
-def test_what_looks_like_a_mistake_in_sand_is_told(more: Tables, said: str) -> None:
+def test_suspicious_sand_settings_are_reported(more: Tables, said: str) -> None:
     (note,) = notes(SAND, **more)
     assert said in note
 
@@ -182,27 +182,25 @@ def test_what_looks_like_a_mistake_in_sand_is_told(more: Tables, said: str) -> N
         {"surface_tension": {"coefficient": 0.49, "contact_angle": 140.0}},
     ],
 )
-def test_what_may_well_be_meant_is_not_told(more: Tables) -> None:
+def test_plausible_settings_are_not_reported(more: Tables) -> None:
     assert notes(POOL, **more) == []
 
 
-def test_check_and_run_name_a_shortest_step_that_surface_tension_does_not_bear(
-    tmp_path: Path,
-) -> None:
+def test_check_and_run_report_a_dt_min_above_the_capillary_limit(tmp_path: Path) -> None:
     """Shortest step that is unstable with surface tension: named by check and run.
 
     A drop of 1 um reached many times its speed, and the only warning was about the CFL number.
     """
     scene, out = tmp_path / "drop.toml", tmp_path / "out"
     scene.write_bytes(tomli_w.dumps(DROP).encode())
-    said = "time.dt_min = 1e-06 s is longer, and steps would be unstable: use 6e-09"
+    message = "time.dt_min = 1e-06 s is longer, and steps would be unstable: use 6e-09"
     checked = CliRunner().invoke(app, ["check", str(scene), "--device", "cpu"])
     ran = CliRunner().invoke(
         app, ["run", str(scene), "--device", "cpu", "--out", str(out), "--frames", "1"]
     )
     assert checked.exit_code == ran.exit_code == 0
-    assert said in checked.stdout
-    assert said in ran.stderr.split("frame 0")[0]
+    assert message in checked.stdout
+    assert message in ran.stderr.split("frame 0")[0]
     assert (
         "step 1: the longest stable step is 5.61e-08 s, less than time.dt_min; steps may be "
         "unstable" in ran.stderr

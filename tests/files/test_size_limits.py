@@ -16,8 +16,8 @@ def gigabyte(monkeypatch):
     ("needed", "stored", "held"),
     [(0, None, None), (10**9, None, None), (50, 50, 50), (10**9, 3, 50)],
 )
-def test_what_fits_is_believed(needed, stored, held):
-    check_claim("a", needed, stored=stored, held=held)
+def test_sizes_within_the_limits_are_accepted(needed, stored, held):
+    check_claim("a", needed, stored=stored, available=held)
 
 
 @pytest.mark.parametrize(
@@ -30,16 +30,16 @@ def test_what_fits_is_believed(needed, stored, held):
         (50, 2 * 10**18, 5 * 10**6, "n: these take 2e[+]09 GB, and the file has 5 MB"),
     ],
 )
-def test_what_does_not_fit_is_refused(needed, stored, held, message):
+def test_sizes_beyond_the_limits_are_refused(needed, stored, held, message):
     with pytest.raises(ClaimError, match=message):
-        check_claim("n", needed, stored=stored, held=held)
+        check_claim("n", needed, stored=stored, available=held)
 
 
-def test_a_machine_that_does_not_tell_believes_in_its_memory(monkeypatch):
+def test_without_free_memory_figures_the_total_memory_is_the_limit(monkeypatch):
     monkeypatch.setattr(claims, "free_host_memory", lambda: None)
     check_claim("n", 10**30)
     with pytest.raises(ClaimError, match="the file has 5 bytes"):
-        check_claim("n", 6, stored=6, held=5)
+        check_claim("n", 6, stored=6, available=5)
 
 
 def test_the_limit_of_the_process_counts():
