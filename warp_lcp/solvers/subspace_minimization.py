@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 import warp as wp
+from annotated_types import Ge
 
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
@@ -23,7 +24,7 @@ from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.reduced.active_set_kernels import ON_FREE, projected_move
 from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
+from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.sweeps.sweep import sweep_for
 
