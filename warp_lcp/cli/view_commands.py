@@ -184,7 +184,7 @@ def render(
                     frames=frame,
                     settings=settings,
                     out=out,
-                    told=counter,
+                    on_progress=counter,
                     estimated=estimated,
                     noted=partial(say, console),
                 )
