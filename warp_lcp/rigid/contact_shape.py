@@ -88,7 +88,7 @@ class ContactShape:
                 f"{type(geometry).__name__.lower()}: contacts are available for boxes, spheres, "
                 "capsules, meshes and planes"
             )
-        if not getattr(geometry, "invert", False):
+        if not geometry.invert:
             return shape
 
         def outside(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

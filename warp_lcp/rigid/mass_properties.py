@@ -83,9 +83,7 @@ def mass_properties(
     """
     if (mass is None) == (density is None):
         raise ValueError("give either mass or density")
-    if getattr(geometry, "invert", False) or not isinstance(
-        geometry, (Box, Sphere, Capsule, TriangleMesh)
-    ):
+    if not isinstance(geometry, (Box, Sphere, Capsule, TriangleMesh)) or geometry.invert:
         raise ValueError(f"{type(geometry).__name__.lower()}: an unbounded shape has no mass")
     if isinstance(geometry, TriangleMesh):
         volume, center, inertia = _mesh(geometry, dimension)

@@ -12,7 +12,7 @@ import numpy as np
 
 from warp_lcp.frames.frames import frame_bytes
 from warp_lcp.grid.particles import lattice
-from warp_lcp.material.particle_assembly import inside
+from warp_lcp.grid.voxelize import inside
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.run.check import check_output
