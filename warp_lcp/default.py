@@ -68,8 +68,9 @@ def solve(
             method, and the result's `method` names the one that found x. Sparse matrices that are a
             compact stencil on a box of cells in its natural order, x first, are then solved as a
             grid problem; the result's `grid` has its shape.
-        stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that
-            `wl.recommend` gives if there is no solver.
+        stopping: the criteria, with relative and absolute tolerance `rtol` and `atol`;
+            `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there
+            is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None
             (over other sets: the current x).
         workspace: result of `solver.init(problem)`, to reuse its memory. Without it, one of a grid

@@ -149,7 +149,7 @@ class Halo:
         return Gathering(self.decomposition)
 
     def fill(self, field: DeviceArray | np.ndarray) -> None:
-        """Fill the ghost cells of a contiguous field; collective.
+        """Halo exchange: fill the ghost cells of a contiguous field; collective.
 
         The field has shape `shape`, or as many elements.
         """

@@ -437,7 +437,7 @@ class Subdomain(GridPart):
         parts: int = 1,
         forest: StarForest | None = None,
     ) -> None:
-        """Fill the ghost cells of fields of the part, or of stacks of them; collective.
+        """Halo exchange: fill the ghost cells of fields, or of stacks of them; collective.
 
         A stack has equally many layers. On the CPU the exchange may be recorded among launches,
         which all ranks then run alike.

@@ -1,4 +1,4 @@
-"""Nested tables as TOML and JSON files have them, and keyword arguments that become such tables.
+"""Nested tables of TOML and JSON files, also made of keyword arguments.
 
 Their values are numbers, text, dates, lists and further tables. Whoever reads a table checks the
 type of its values: pydantic models those of a scene, `warp_lcp.run.folder` those of run.json.

@@ -372,6 +372,8 @@ class GridPart:
     ) -> None:
         """Halo exchange: fill the ghost cells of fields from their owners; collective.
 
+        In one process there is nothing to do; on ranks see `Subdomain.fill`.
+
         Args:
             fields: arrays of any types, or stacks of equally many layers; the last axes are z, y,
                 x.

@@ -160,7 +160,7 @@ def faces_to_particles(
     saved: list[wp.array] | None = None,
     flip: float = 0.0,
 ) -> None:
-    """Grid to particles: interpolate the faces' velocities at the particles.
+    """Grid to particles (G2P): interpolate the faces' velocities at the particles.
 
     Args:
         grid: the grid; every particle lies in its domain.

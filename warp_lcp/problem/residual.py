@@ -1,9 +1,9 @@
 """Natural residual, the measure of convergence of all methods.
 
-It is always evaluated from x in float64: r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i
-= 1 / (r_i c_i) where diag(r) A diag(c) is equilibrated: |A_ii| for positive semi-definite matrices
-and on grids (`warp_lcp.problem.scale`; 1 where a row and a column are empty). r has the units of y
-and does not change when x is rescaled; it vanishes exactly at solutions.
+It is always evaluated from x in float64: r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)). The
+scale d_i is |A_ii| on grids and for positive semi-definite matrices; `warp_lcp.problem.scale` has
+the other cases (1 where a row and a column are empty). r has the units of y and does not change
+when x is rescaled; it vanishes exactly at solutions.
 """
 
 from __future__ import annotations

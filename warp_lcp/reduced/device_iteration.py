@@ -1,6 +1,7 @@
 """Device-resident iteration of projected multigrid.
 
-A GPU begins a solve and takes truncated steps as long as the host has nothing to decide.
+The device, a GPU or the threads of the CPU, begins a solve and takes truncated steps as long as the
+host has nothing to decide.
 """
 
 from __future__ import annotations

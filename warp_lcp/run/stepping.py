@@ -1,4 +1,4 @@
-"""Choose the time step (CFL number); repeat a failed step with half its length."""
+"""Time step: CFL limit, dt_min, dt_max, frame times; half of it after a failure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def stable_dt(simulation: Simulation) -> float:
     """Return the longest next step [s] that the CFL number allows.
 
     Raises:
-        SimulationFailed: it is not finite.
+        SimulationFailed: it is not a number.
     """
     stable = simulation.stable_dt()
     if math.isnan(stable):
