@@ -1,7 +1,7 @@
 """Yield set (friction cone) of sand: layout of stress fields, parameters, kernels.
 
 The projection onto it is the snippet `yield` of `headers/sand.h`; each step of a stress solve
-applies it to each cell.
+applies it to each cell. `granular.stress.YieldSet` has the values of a time step.
 
 All stresses are impulses over rho dx [m/s]: x = kick_dt p / (rho dx), and the shear stresses alike,
 so that equations contain neither spacing nor time step. A field of stresses has layers of the

@@ -211,14 +211,15 @@ def handle(mpi_object: MPI.Comm | MPI.Datatype | MPI.Op) -> ctypes.c_int | ctype
 
 
 def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
-    """Copy roots to leaves over a star forest; leaves may lie in the same array."""
+    """Halo exchange: copy roots to leaves over a star forest; they may lie in the same array."""
     exchange_all(forest, [(roots, roots if leaves is None else leaves)])
 
 
 def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-    """Copy roots to leaves of a star forest, many pairs at once.
+    """Halo exchange of many pairs at once: copy roots to leaves over a star forest.
 
-    Their messages are in transit together.
+    Roots are the cells of their owners, leaves the ghost cells. The messages of all pairs are in
+    transit together.
 
     Raises:
         RuntimeError: PETSc has failed.

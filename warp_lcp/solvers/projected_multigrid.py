@@ -25,7 +25,8 @@ from warp_lcp.settings import Count, CountOrZero, Settings
 class ProjectedMultigrid(Settings):
     """Monotone multigrid for the LCP of a grid.
 
-    It takes about as many cycles as multigrid for the linear system.
+    It takes about as many cycles as multigrid for the linear system [Kornhuber 1994; Graeser &
+    Kornhuber 2009].
 
     After a cold start, the first step is a projected (monotone) cycle, which moves whole aggregates
     on and off their bounds. Each later step evaluates y = A x + b in float64 and removes the
