@@ -211,7 +211,7 @@ def handle(mpi_object: MPI.Comm | MPI.Datatype | MPI.Op) -> ctypes.c_int | ctype
 
 
 def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
-    """Halo exchange: copy roots to leaves over a star forest; they may lie in the same array."""
+    """Halo exchange: copy roots to leaves, which may lie in the same array."""
     exchange_all(forest, [(roots, roots if leaves is None else leaves)])
 
 

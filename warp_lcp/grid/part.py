@@ -194,7 +194,7 @@ class BodyNumbers:
 
 
 def subdomain_of(grid: StaggeredGrid) -> Subdomain:
-    """Return the part of a grid that several ranks share, where `grid.part.shared` says so."""
+    """Return the part of a grid on ranks; only if `grid.part.shared`."""
     return cast("Subdomain", grid.part)
 
 

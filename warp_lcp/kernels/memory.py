@@ -120,7 +120,7 @@ class Slot:
 
 
 def slot_of(argument: KernelArgument) -> Slot | None:
-    """Return the slot of an array that is replaced between runs; None of other arguments."""
+    """Return the slot of an array that is replaced between runs, else None."""
     slot: Slot | None = vars(argument).get("slot") if isinstance(argument, wp.array) else None
     return slot
 

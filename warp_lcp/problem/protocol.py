@@ -262,7 +262,7 @@ class StoresRounded(Operator, Protocol):
 
 
 class Replicates(Operator, Protocol):
-    """Copies of an operator in memory of their own, to which others of its form are copied.
+    """Copies of an operator in their own memory, which later take others of its form.
 
     Attributes:
         form: sizes, types and numbers of operators that can take each other's data; None: this
@@ -362,7 +362,7 @@ def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
 
 @dataclass(frozen=True)
 class Declarations:
-    """Class attributes by which a method says what it does; those that it lacks have defaults.
+    """Declarations of a method: class attributes, with defaults for missing ones.
 
     Attributes:
         form: of A that it works on, for messages.
@@ -388,7 +388,7 @@ class Declarations:
 
 
 class Chain:
-    """Base of methods that hand over to others; a chain declares what its first method does."""
+    """Base of methods that hand over to others; its declarations are the first method's."""
 
     @property
     def first(self) -> Solver:
