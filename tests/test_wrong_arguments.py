@@ -371,6 +371,8 @@ def test_methods_by_name():
         ),
         ({"max_seconds": 1.0}, r"pass stopping=wl.StoppingCriteria\(max_seconds=...\)"),
         ({"omega": 1.5}, "solve takes no omega: it is a setting of a method"),
+        ({"tolerance": 1e-6}, r"stopping=wl.StoppingCriteria\(rtol=...\)"),
+        ({"maxiter": 9}, r"stopping=wl.StoppingCriteria\(max_iterations=...\)"),
     ],
 )
 def test_options_that_belong_elsewhere(option, message):

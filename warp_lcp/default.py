@@ -45,6 +45,15 @@ def default_method(problem: LCP) -> Solver:
     return recommend(problem).method
 
 
+# What other libraries call stopping criteria.
+OTHER_NAMES = {
+    "tol": "rtol",
+    "tolerance": "rtol",
+    "maxiter": "max_iterations",
+    "max_iter": "max_iterations",
+}
+
+
 def solve(
     problem: LCP | VariationalInequality,
     solver: Solver | str | None = None,
@@ -91,10 +100,11 @@ def solve(
         TypeError: an option of another name; the message says where it belongs.
     """
     for name in misplaced:
-        if name in StoppingCriteria.__dataclass_fields__:
+        criterion = OTHER_NAMES.get(name, name)
+        if criterion in StoppingCriteria.__dataclass_fields__:
             raise TypeError(
                 f"solve takes no {name}: it is a stopping criterion, pass "
-                f"stopping=wl.StoppingCriteria({name}=...)"
+                f"stopping=wl.StoppingCriteria({criterion}=...)"
             )
         raise TypeError(
             f"solve takes no {name}: it is a setting of a method, pass for example "
