@@ -25,6 +25,9 @@ from warp_lcp.granular.stress_kernels import (
 )
 from warp_lcp.granular.yield_set import CONSTANTS
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.problem.solve import OptionalMembers
+from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import (
     Count,
     CountOrZero,
@@ -46,7 +49,7 @@ APART = 3
 KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
 
-class StressWorkspace:
+class StressWorkspace(OptionalMembers):
     """Workspace of a stress solve; it iterates on the problem's own field.
 
     The last stresses are the result, even if the solve fails; see
@@ -171,6 +174,8 @@ class MomentumWorkspace(StressWorkspace):
         method: the method.
     """
 
+    device_begins = True
+
     def __init__(self, stress: Stress, method: HeavyBallProjectedGradient) -> None:
         super().__init__(stress)
         self.method = method
@@ -182,7 +187,9 @@ class MomentumWorkspace(StressWorkspace):
         self._news: int | None = None
         self._steps_counted = 0  # steps that the outer loop has counted
 
-    def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria, steps: int) -> float | None:
+    def begin_ahead(
+        self, guess: DeviceArray | None, criteria: wl.StoppingCriteria | MeanCriteria, steps: int
+    ) -> float | None:
         """Begin a solve on the device; return the residual at its start.
 
         Returns None if the host decides on the steps.
@@ -192,11 +199,11 @@ class MomentumWorkspace(StressWorkspace):
             criteria: stopping criteria; the device decides only with an absolute tolerance.
             steps: most steps of this solve without the host.
         """
-        self._leads, self._news = (
-            self._ahead is not None and steps > 0 and criteria.rtol == 0.0,
-            None,
-        )
-        if self._ahead is None or not self._leads:
+        self._leads, self._news = False, None
+        if self._ahead is None or not isinstance(criteria, wl.StoppingCriteria):
+            return None
+        self._leads = steps > 0 and criteria.rtol == 0.0
+        if not self._leads:
             return None
         self._ahead.begin(criteria.atol, steps)
         self._steps_counted = 0

@@ -275,11 +275,11 @@ class _Records:
     def claim(self, element: _Element) -> dict[str, int]:
         """Return the least size of an element's records, and that of the data left.
 
-        `stored` and `held` are in bytes, two per word of a text.
+        `stored` and `available` are in bytes, two per word of a text.
         """
         each = 2 if self.order is None else 1
         least = sum(self._width(length or kind) for _, kind, length in element.properties)
-        return {"stored": each * element.count * least, "held": each * (self._size - self.at)}
+        return {"stored": each * element.count * least, "available": each * (self._size - self.at)}
 
     def table(self, element: _Element) -> np.ndarray:
         """Return records without lists, float64 of shape (count, properties)."""
