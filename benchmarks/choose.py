@@ -20,8 +20,8 @@ from warp_lcp.benchmarks.choose_problems import KINDS, RARE, draw
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
+from warp_lcp.method_rules import RULES, method_for, steps_allowed
 from warp_lcp.recommend import Recommendation, memory_of
-from warp_lcp.rules import RULES, method_for, steps_allowed
 
 TITLE = "Rules that choose a method"
 SEED = 860  # first seed; the tests draw other seeds

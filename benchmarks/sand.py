@@ -17,10 +17,10 @@ from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordLines, Rec
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular import SIMULATOR
-from warp_lcp.granular.heavy_ball import METHODS
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.stress import Stress
+from warp_lcp.granular.stress_methods import METHODS
 
 TITLE = "Sand: pressure and friction together"
 # [s] into the collapse.

@@ -42,7 +42,7 @@ class BodyCoupling:
         bodies: the bodies.
         density: density of the liquid [kg/m^3].
         share: factor on U V in the outflow, for a problem in terms of mass, see
-            `fluids.unilateral`.
+            `fluids.unilateral_pressure`.
     """
 
     def __init__(

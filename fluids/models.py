@@ -13,7 +13,7 @@ from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
-from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.fluids.unilateral_pressure import UnilateralPressure
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.staggered import StaggeredGrid, Window

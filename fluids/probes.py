@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_lcp.fluids.tables import Probe
+from warp_lcp.fluids.drag_and_probe_tables import Probe
 from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
 from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.kernels.compiler import forward_kernel

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.fluids.tables import Probe, WallDragSettings, probe_complaints
+from warp_lcp.fluids.drag_and_probe_tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
@@ -339,7 +339,7 @@ class LiquidScene(ParticleScene):
     def settles(self) -> bool:
         """Return whether overfull cells relax to the density at rest.
 
-        False with the unilateral model, where gravity does this, see `fluids.unilateral`.
+        False with the unilateral model, where gravity does this, see `fluids.unilateral_pressure`.
         """
         return self.pressure.model == "unilateral" and any(self.physics.gravity)
 

@@ -91,8 +91,8 @@ def passing(
 ):
     """Return the flux q through the lower face of cell (k, j, i) [m/s].
 
-    See `fluids.unilateral`: relative to the flux of full cells, including the volume that solids
-    take.
+    See `fluids.unilateral_pressure`: relative to the flux of full cells, including the volume that
+    solids take.
     """
     part = open_part(s, open, k, j, i, c, b, a)
     flow = part * u[k, j, i]
@@ -109,8 +109,8 @@ def passing(
 def slack(s: UnilateralSetting, rate: wp.float64, settling: float, k: int, j: int, i: int):
     """Return y of a cell without the pressure: room, settling and net outflow [m/s].
 
-    The equation is that of `fluids.unilateral`. The rate is dx / dt [m/s]. Settling is the speed c
-    at which a full cell relaxes to the density at rest [m/s].
+    The equation is that of `fluids.unilateral_pressure`. The rate is dx / dt [m/s]. Settling is the
+    speed c at which a full cell relaxes to the density at rest [m/s].
     """
     left = passing(s, s.u, s.open_x, s.solid_x, k, j, i, k, j, i - 1)
     right = passing(s, s.u, s.open_x, s.solid_x, k, j, i + 1, k, j, i)
@@ -131,7 +131,7 @@ def slack(s: UnilateralSetting, rate: wp.float64, settling: float, k: int, j: in
     return y
 
 
-@cell_kernel("fluids.unilateral")
+@cell_kernel("fluids.unilateral_pressure")
 def prepare_kernel(
     k,
     j,
@@ -178,7 +178,7 @@ def prepare_kernel(
         shift[k, j, i] = more
 
 
-@cell_kernel("fluids.unilateral")
+@cell_kernel("fluids.unilateral_pressure")
 def push_kernel(
     k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8
 ):
@@ -205,7 +205,7 @@ def push_kernel(
     known[k, j, i] = wp.int8(mark)
 
 
-@cell_kernel("fluids.unilateral")
+@cell_kernel("fluids.unilateral_pressure")
 def contact_kernel(
     k,
     j,

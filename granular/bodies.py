@@ -32,7 +32,7 @@ from warp_lcp.granular.body_faces import (
 )
 from warp_lcp.granular.fields import StressFields
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.yield_set import F64, I32, U8
+from warp_lcp.granular.stress_layout import F64, I32, U8
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.host_array import HostArray
@@ -251,7 +251,7 @@ class SandBodies:
 
         Args:
             packing: the packing of the step.
-            numbers: parameters of the stresses, see `granular.yield_set`.
+            numbers: parameters of the stresses, see `granular.stress_layout`.
             pressure_step: length of the projected gradient step, relative to the diagonal.
             shear_step: likewise for the shear stresses.
         """

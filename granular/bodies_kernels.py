@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.granular.stress_kernels import KERNELS
-from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
+from warp_lcp.granular.stress_layout import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.layout import make_struct, put

@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_lcp.granular.fields import StressFields
 from warp_lcp.granular.packing import SHEARS, Packing
-from warp_lcp.granular.yield_set import COLUMNS
+from warp_lcp.granular.stress_layout import COLUMNS
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import Rows

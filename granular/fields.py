@@ -83,7 +83,7 @@ class StressFields:
         before: the stresses before the last step.
         point: the point at which the next gradient is taken.
         momentum: momentum of the next steps, float64.
-        numbers: parameters, float32, see `granular.yield_set`.
+        numbers: parameters, float32, see `granular.stress_layout`.
     """
 
     now: wp.array

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.granular import packing_kernels as kernels
 from warp_lcp.granular.fields import SandFields
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.sides import PeriodicSides
+from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, launch
 from warp_lcp.kernels.layout import put
@@ -51,14 +51,14 @@ class Packing:
         base: the argument of the same name.
         fraction: phi, float32.
         kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
-        flags: uint8 bits of a cell, see `granular.yield_set`.
+        flags: uint8 bits of a cell, see `granular.stress_layout`.
         drive: free volume of a cell as a velocity: at most FULL - phi, and at most the mean free
             fraction around it, times dx / dt [m/s], float32.
         mass, inverse: mass of each component's faces, in units of a full face, float32; inverse is
             0 on faces that cannot move.
         start: velocity of each component before the stresses [m/s], float32.
         share: weight of a cell's copy on the edges of each shear, float32, see
-            `granular.yield_set`.
+            `granular.stress_layout`.
         stiff: bound of the friction's diagonal in a cell, float32.
         spans: int32, first and one past the last cell of each row that stresses reach, shape
             (*grid.shape[:2], 2).

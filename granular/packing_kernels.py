@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
+from warp_lcp.granular.stress_layout import FIRM, HOLDS, PARTLY, SHEARS_HERE
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, U8, cell_below, cell_kernel, list_kernel
 from warp_lcp.kernels.layout import make_struct
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.granular.yield_set import CONSTANTS
+from warp_lcp.granular.stress_layout import CONSTANTS
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.kernels import KernelFile, StencilKernel

@@ -13,13 +13,13 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.heavy_ball import METHODS, StressWorkspace
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.percentiles import ParticlePercentiles
 from warp_lcp.granular.report import SandReport
+from warp_lcp.granular.runout import ParticlePercentiles
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.solids import SandSolids
 from warp_lcp.granular.stress import Stress, YieldSet
+from warp_lcp.granular.stress_methods import METHODS, StressWorkspace
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.part import ONE_PROCESS
@@ -40,7 +40,7 @@ from warp_lcp.material.particle_assembly import (
 )
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
-from warp_lcp.material.wall import Join, extend_velocity
+from warp_lcp.material.velocity_extrapolation import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.rigid.bodies import RigidBodies

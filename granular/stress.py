@@ -28,7 +28,7 @@ from warp_lcp.granular.stress_kernels import (
     period_kernel,
     stress_passes,
 )
-from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
+from warp_lcp.granular.stress_layout import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.launch_graph import (
@@ -147,9 +147,9 @@ class Stress(wl.VariationalInequality):
     y/d), with y = (w, -E u), where P projects onto x >= 0 first and then onto the slice at that x.
     P is not the projection onto the cones themselves, which would make sand dilate as it shears (an
     associated flow rule, whose normal velocity is k times the slip). `wl.solve` solves the problem
-    by the methods of `granular.heavy_ball`. Gradient, projection and momentum of a cell are fused
-    in one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no separate
-    functions for y and P.
+    by the methods of `granular.stress_methods`. Gradient, projection and momentum of a cell are
+    fused in one kernel (`granular.stress.step` in `headers/stress.h`), so that there are no
+    separate functions for y and P.
 
     Args:
         packing: the packing of the step.
@@ -159,7 +159,7 @@ class Stress(wl.VariationalInequality):
         bodies: rigid bodies that the stresses move, if any.
 
     Attributes:
-        now: the stresses, see `granular.yield_set`, float32.
+        now: the stresses, see `granular.stress_layout`, float32.
         kick_dt: time that forces acted in the step of these stresses [s]; 0 before the first step.
         cold: whether forces act for much longer in the current step than in the last one, as in the
             first two steps.

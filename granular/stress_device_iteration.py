@@ -15,7 +15,7 @@ from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
 
 if TYPE_CHECKING:
-    from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
+    from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
 
 
 class StressDeviceIteration:

@@ -1,7 +1,7 @@
 # mypy: ignore-errors
 """Kernels of the coupled pressure and friction of sand, in 2-D and 3-D.
 
-They run projected steps on the stresses of `granular.yield_set`, update the momentum of these
+They run projected steps on the stresses of `granular.stress_layout`, update the momentum of these
 steps, and make the decisions with which a device runs them without the host, see
 `granular.stress_device_iteration`.
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.granular.yield_set import (
+from warp_lcp.granular.stress_layout import (
     COHESION,
     COLUMNS,
     CONSTANTS,
@@ -209,7 +209,7 @@ def numbers_kernel(
     gain: float,
     halfway: float,
 ):
-    """Write the parameters of a time step, see `granular.yield_set`.
+    """Write the parameters of a time step, see `granular.stress_layout`.
 
     The steps of a method are set afterwards.
     """

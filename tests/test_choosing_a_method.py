@@ -13,8 +13,8 @@ import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.gallery import Plant, planted
 from warp_lcp.gallery.matrices import spectrum_matrix
+from warp_lcp.method_rules import RULES
 from warp_lcp.problem import reformulate
-from warp_lcp.rules import RULES
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "choosing-a-method.md").read_text()

@@ -20,16 +20,16 @@ from warp_lcp.fluids.pressure import pressure_passes
 from warp_lcp.fluids.surface_tension_kernels import push_pass
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
-from warp_lcp.granular.heavy_ball import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
+from warp_lcp.granular.stress_methods import interleaved_passes
 from warp_lcp.grid.advection import CENTERS, advect_pass, carry_pass, distance_pass
-from warp_lcp.grid.sides import wrap_kernel
+from warp_lcp.grid.domain_sides import wrap_kernel
 from warp_lcp.grid.transfer import transfer_passes
 from warp_lcp.kernels import Rows
+from warp_lcp.kernels.header_text import sections
 from warp_lcp.kernels.kernel_variant import KernelVariant
 from warp_lcp.kernels.layout import Alignment
-from warp_lcp.kernels.native import sections
 from warp_lcp.kernels.persistent_kernel import PersistentKernel
 from warp_lcp.kernels.stencil_kernel import StencilKernel
 from warp_lcp.kernels.vectors import CUDA_BLOCK

@@ -126,10 +126,10 @@ TERMS = {
     "CFL": ["warp_lcp/run/stepping.py", "warp_lcp/material/particle_simulation.py"],
     "natural residual": ["warp_lcp/problem/residual.py", "warp_lcp/problem/headers/residual.h"],
     "truncated": ["warp_lcp/reduced/multigrid_workspace.py"],
-    "friction cone": ["granular/headers/sand.h", "granular/yield_set.py"],
+    "friction cone": ["granular/headers/sand.h", "granular/stress_layout.py"],
     "P2G": ["warp_lcp/grid/transfer.py", "warp_lcp/material/particle_simulation.py"],
     "checkpoint format": ["warp_lcp/run/checkpoint.py"],
-    "default method": ["warp_lcp/rules.py"],
+    "default method": ["warp_lcp/method_rules.py"],
 }
 
 

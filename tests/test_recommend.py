@@ -13,10 +13,10 @@ from warp_lcp import gallery
 from warp_lcp.benchmarks.choose_problems import FAMILIES, KINDS, draw, make
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING
 from warp_lcp.gallery.contact_stepper import ContactStepper
+from warp_lcp.method_rules import RULES
+from warp_lcp.problem_properties import traits_of
 from warp_lcp.recommend import LEAN, memory_of
 from warp_lcp.rigid.contact_models import BoxedModel
-from warp_lcp.rules import RULES
-from warp_lcp.traits import traits_of
 
 SEEDS = range(700, 703)  # neither those of the rules nor those of the published check
 # Contacts at rest are tested below.
@@ -285,7 +285,7 @@ def test_the_default_solves_many_plain_problems(kind, seed):
 @pytest.mark.parametrize("kind", BOXES)
 def test_the_default_solves_convex_boxes_of_low_rank(kind, seed, piqp, monkeypatch):
     if not piqp:
-        monkeypatch.setattr("warp_lcp.traits.has_piqp", lambda: False)
+        monkeypatch.setattr("warp_lcp.problem_properties.has_piqp", lambda: False)
     check_default(kind, seed)
 
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import warp_lcp as wl
 from warp_lcp.contacts.inverse_kinematics import InverseKinematics
 from warp_lcp.gallery.planted import Plant
-from warp_lcp.granular.heavy_ball import METHODS as SAND
+from warp_lcp.granular.stress_methods import METHODS as SAND
 from warp_lcp.grid import staggered
 from warp_lcp.material import density_correction
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings

@@ -11,7 +11,8 @@ from typing import Never, cast
 
 from warp_lcp.default_chain import default_chain
 from warp_lcp.kernels.fields import Array
-from warp_lcp.operators.restated import RestatedProblem, renumbered
+from warp_lcp.method_rules import Attempt, method_for, steps_allowed
+from warp_lcp.operators.matrix_conversion import RestatedProblem, renumbered
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import declared
 from warp_lcp.problem.residual import EPS
@@ -20,7 +21,6 @@ from warp_lcp.problem.solve import Solver, VariationalInequality, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, criteria, recommend
-from warp_lcp.rules import Attempt, method_for, steps_allowed
 from warp_lcp.solvers.registry import method_of
 
 LEAST = 1e-9  # seconds for a solve whose set-up has used up its time

@@ -15,7 +15,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasColumns, HasRows, HasScale, HasStencil, has
 from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.reduced.cold_cycles import LARGE
+from warp_lcp.reduced.initial_cycles import LARGE
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.assembled_matrix import AssembledMatrix
 from warp_lcp.solvers.fallback import (

@@ -12,7 +12,7 @@ import warp as wp
 from warp_lcp.default import solve, solve_by_attempts
 from warp_lcp.kernels.fields import Array, real_array
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.operators.restated import RestatedProblem
+from warp_lcp.operators.matrix_conversion import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.data_types import BoundValues, Multiplies, OperatorLike

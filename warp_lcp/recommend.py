@@ -9,14 +9,14 @@ from functools import lru_cache
 from typing import Literal
 
 from warp_lcp.default_chain import default_chain
+from warp_lcp.method_rules import LONGEST, Attempt, Rule, method_for, rules_for, steps_allowed
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.solve import Solver, solve
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rules import LONGEST, Attempt, Rule, method_for, rules_for, steps_allowed
+from warp_lcp.problem_properties import TRIAL, Traits
 from warp_lcp.settings import Count, Positive, Settings, Share, checked
 from warp_lcp.solvers.fallback import Fallback
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.traits import TRIAL, Traits
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
 # Numbers of 8 bytes that methods hold besides A, for each entry of a matrix and for each unknown;

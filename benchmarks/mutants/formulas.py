@@ -131,7 +131,7 @@ FORMULAS = [
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.NON_DESCENT if stationary"),
     ),
     *_changes(
-        "reduced/descent.py",
+        "reduced/energy_monitor.py",
         NEWTON,
         ("DECREASE = 1e-4", "DECREASE = 0.3"),
         ("limit + DECREASE * length * slope", "limit - DECREASE * length * slope"),

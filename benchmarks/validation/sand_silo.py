@@ -280,7 +280,7 @@ def rest(
     flat, across, cells = grid.dimension == 2, (0, 2), x.shape[3]
     unit = GRAVITY * simulation.stress.kick_dt * cells  # load unit rho g W
     load = (x[0] + x[1] if flat else x[0] - x[2]).mean(axis=across) / unit
-    # The wall load of a row is the mean of its copies, see `granular.yield_set`.
+    # The wall load of a row is the mean of its copies, see `granular.stress_layout`.
     xy = x[2:6] if flat else x[4:8]
     sides = [xy[1::2, :, :, -1].mean(axis=(0, 1)), -xy[::2, :, :, 0].mean(axis=(0, 1))]
     if not flat and not simulation.scene.endless:

@@ -20,7 +20,7 @@ from PIL import Image
 import warp_lcp as wl
 from warp_lcp.gallery.contact_scenes import contact_scene, incline
 from warp_lcp.krylov import GMRES
-from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.reduced.energy_monitor import DECREASE, NonmonotoneSearch
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,

@@ -19,7 +19,7 @@ from warp_lcp.benchmarks.choose import (
     rule_row,
 )
 from warp_lcp.benchmarks.harness.record import MACHINE, BenchmarkRecord, read_json
-from warp_lcp.rules import RULES
+from warp_lcp.method_rules import RULES
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "choosing-a-method.md"

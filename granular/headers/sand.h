@@ -1,11 +1,11 @@
 // Snippets that kernels of sand share: the grid, the yield set, walls.
 
-// snippet shape: Field of stresses: its layers, see `granular.yield_set`; the axes of each shear;
-// offsets between layers and along each axis. Steps read 28 fields. The address of a row of each
-// takes two registers; that of a field is an argument. On CUDA they therefore count cells from the
-// first one of a field, and a thread has one cell (END). FIELD and FIELDS name fields, ROW comes
-// before the row's values. Values read with AGAIN are loaded again, since the compiler cannot know
-// that KEEP is never negative; otherwise 48 addresses are held while the cell yields.
+// snippet shape: Field of stresses: its layers, see `granular.stress_layout`; the axes of each
+// shear; offsets between layers and along each axis. Steps read 28 fields. The address of a row of
+// each takes two registers; that of a field is an argument. On CUDA they therefore count cells from
+// the first one of a field, and a thread has one cell (END). FIELD and FIELDS name fields, ROW
+// comes before the row's values. Values read with AGAIN are loaded again, since the compiler cannot
+// know that KEEP is never negative; otherwise 48 addresses are held while the cell yields.
 #ifdef __CUDA_ARCH__
 #define INLINE
 #define UNROLL

@@ -11,7 +11,7 @@ from warp_lcp.benchmarks import choose
 from warp_lcp.benchmarks.choose_problems import KINDS, RARE, draw
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.rules import RULES
+from warp_lcp.method_rules import RULES
 
 UNMET = {2}  # affine bounds with products only: no kind of problems here has them
 MEETS = {

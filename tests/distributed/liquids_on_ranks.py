@@ -22,7 +22,7 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.fluids import SIMULATOR, viscosity_multigrid
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
-from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
+from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
 from warp_lcp.kernels.thread_pool import ThreadPool
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation

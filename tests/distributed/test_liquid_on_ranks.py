@@ -28,7 +28,7 @@ from turns import Seat
 
 from small_liquids import box
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.extension import too_far
+from warp_lcp.distributed.ghost_width import too_far
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids import SIMULATOR

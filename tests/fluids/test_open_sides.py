@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidScene
-from warp_lcp.grid.sides import SIDES
+from warp_lcp.grid.domain_sides import SIDES
 
 BALL = {"shape": "sphere", "center": [0.1, 0.85, 0.1], "radius": 0.06}
 

@@ -7,8 +7,8 @@ import pytest
 
 from default_run import slow
 from small_sands import GRAVITY, box, create, scene
-from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
 from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
 
 
 def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:

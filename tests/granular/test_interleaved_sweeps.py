@@ -9,7 +9,7 @@ import warp as wp
 from test_sand_stress import make
 
 from warp_lcp.granular.fields import VelocityFields
-from warp_lcp.granular.heavy_ball import APART, colors, interleaved_passes
+from warp_lcp.granular.stress_methods import APART, colors, interleaved_passes
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.kernels import Rows
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.granular.percentiles import ParticlePercentiles
+from warp_lcp.granular.runout import ParticlePercentiles
 from warp_lcp.granular.simulator import percentile_place
 
 DEVICE = wp.get_device("cpu")

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.extrapolate import complete
-from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.scene.scene import SceneError, validate
 

@@ -14,12 +14,12 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.validation import inclined
 from warp_lcp.granular.cut_walls import CutWalls
-from warp_lcp.granular.heavy_ball import HeavyBallProjectedGradient
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
 from warp_lcp.granular.solids import SandSolids, SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
+from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solids import Plane
 from warp_lcp.grid.staggered import StaggeredGrid

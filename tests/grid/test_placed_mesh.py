@@ -10,8 +10,8 @@ from cut_cell_tools import grid_of
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Pose
+from warp_lcp.grid.moving_mesh_distance import FlatCells, PlacedMesh, tables_of
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler
-from warp_lcp.grid.placed_mesh import FlatCells, PlacedMesh, tables_of
 from warp_lcp.grid.solids import Box, Placement, Sphere, TriangleMesh, Union
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 

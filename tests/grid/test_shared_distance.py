@@ -5,10 +5,10 @@ import pytest
 import warp as wp
 
 from default_run import covering
+from warp_lcp.grid.distributed_distance import enter_layers, layer_of, measure_together
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.node_distance_kernels import FAR
 from warp_lcp.grid.part import GridPart
-from warp_lcp.grid.shared_distance import enter_layers, layer_of, measure_together
 from warp_lcp.grid.solids import Placement, TriangleMesh
 from warp_lcp.grid.staggered import StaggeredGrid
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.grid.sides import SIDES, continue_beyond, mark_gone, open_ring, side_bits
+from warp_lcp.grid.domain_sides import SIDES, continue_beyond, mark_gone, open_ring, side_bits
 from warp_lcp.grid.staggered import StaggeredGrid
 
 

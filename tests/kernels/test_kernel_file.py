@@ -8,7 +8,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.kernels import KernelFile, Rows
-from warp_lcp.kernels.native import HEADERS, sections, text
+from warp_lcp.kernels.header_text import HEADERS, sections, text
 
 ROOT = Path(wl.__file__).parent
 EVERY = """// Kernels of a test.

@@ -14,7 +14,7 @@ from code_blocks import blocks, run
 from oracle import assemble
 from warp_lcp.kernels import FusedKernel, PrecomputedProduct, Rows, StencilKernel, layout
 from warp_lcp.kernels.fields import Padding
-from warp_lcp.kernels.native import text
+from warp_lcp.kernels.header_text import text
 
 SHAPE = (5, 6, 37)
 RNG = np.random.default_rng(12345)

@@ -24,8 +24,8 @@ from warp_lcp.kernels import FusedKernel, Rows, StencilKernel
 from warp_lcp.kernels import fused_kernel as wave
 from warp_lcp.kernels import thread_pool as team
 from warp_lcp.kernels.fields import Padding
+from warp_lcp.kernels.header_text import HEADERS
 from warp_lcp.kernels.launch_graph import CommandBuffer
-from warp_lcp.kernels.native import HEADERS
 from warp_lcp.kernels.vectors import ADD, Reduction, rows_of
 
 CPU = wp.get_device("cpu")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.wall import extend_velocity, extend_velocity_cut
+from warp_lcp.material.velocity_extrapolation import extend_velocity, extend_velocity_cut
 
 FLAT = StaggeredGrid((24, 22, 1), 0.1, 2)
 SPACE = StaggeredGrid((12, 13, 11), 0.1, 3)
@@ -294,8 +294,8 @@ def test_a_box_is_treated_as_one_of_whole_cells(
 ) -> None:
     """Box as one of whole cells.
 
-    Without solids the walls are those of the domain, along the grid: `warp_lcp.material.wall` is an
-    oracle.
+    Without solids the walls are those of the domain, along the grid:
+    `warp_lcp.material.velocity_extrapolation` is an oracle.
     """
     grid = StaggeredGrid(counts, 0.1, 2 if counts[2] == 1 else 3)
     rng = np.random.default_rng(random_seed)

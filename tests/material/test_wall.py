@@ -5,7 +5,7 @@ import warp as wp
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
-from warp_lcp.material.wall import extend_velocity
+from warp_lcp.material.velocity_extrapolation import extend_velocity
 
 GRID = StaggeredGrid((5, 6, 1), 0.1, 2, "cpu")
 CEILING = GRID.counts[1] + 1  # row of the ceiling's faces

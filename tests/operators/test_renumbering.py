@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.operators.renumbering import renumbering
+from warp_lcp.operators.reordering import renumbering
 
 N = 260  # n^2 unknowns are enough for another order to pay
 

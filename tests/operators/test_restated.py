@@ -11,8 +11,8 @@ import warp_lcp as wl
 from default_run import covering
 from matrices import laplacian
 from oracle import natural_residual
-from warp_lcp.operators import renumbering
-from warp_lcp.operators.restated import as_dense, as_grid, as_sparse, renumbered
+from warp_lcp.operators import reordering
+from warp_lcp.operators.matrix_conversion import as_dense, as_grid, as_sparse, renumbered
 
 
 def small(seed, *, sparse):

@@ -11,7 +11,7 @@ from matrices import operator_of
 from oracle import lemke, natural_scale
 from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.scale import scale_by_products, scale_of_matrix
+from warp_lcp.problem.residual_scaling import scale_by_products, scale_of_matrix
 
 # The solution is x = (1, 1); (1, 1e-8) and (71, 0.95) once passed.
 TINY = (np.array([[1e-8, -1.0], [1.0, 1e-8]]), np.array([1.0, -1.0]))

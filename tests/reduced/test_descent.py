@@ -12,7 +12,7 @@ from oracle import assemble, boxed, lemke
 from warp_lcp.gallery import dam, torsion
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.problem.solve import EPS
-from warp_lcp.reduced.descent import Descent
+from warp_lcp.reduced.energy_monitor import Descent
 
 CELLS = {"strip": (1, 100), "wide-strip": (8, 2000), "vent": (60, 70), "vent-3d": (20, 22, 24)}
 

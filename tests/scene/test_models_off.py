@@ -193,8 +193,8 @@ CASES = {
     "unilateral pressure": Case(
         {"pressure": {"model": "unilateral"}},
         {"pressure": {}},
-        modules=("fluids.unilateral",),
-        files=("fluids/unilateral.py",),
+        modules=("fluids.unilateral_pressure",),
+        files=("fluids/unilateral_pressure.py",),
     ),
     "FLIP": Case({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}),
     "density correction": Case(

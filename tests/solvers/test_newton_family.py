@@ -15,7 +15,7 @@ from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.gallery.matrices import semidefinite
 from warp_lcp.gallery.obstacle import ball_obstacle
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.reduced.descent import NonmonotoneSearch
+from warp_lcp.reduced.energy_monitor import NonmonotoneSearch
 from warp_lcp.reduced.nonsmooth_map import Kink, MapForm, NonsmoothMap
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent

@@ -27,11 +27,11 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.protocol import families
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
-from warp_lcp.run.engines import launcher_of
 from warp_lcp.run.estimate import doubts, estimate_run
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
 from warp_lcp.run.interruption import Interruption
 from warp_lcp.run.launcher import default_folder
+from warp_lcp.run.launcher_choice import launcher_of
 from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profile

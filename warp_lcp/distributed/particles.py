@@ -25,7 +25,7 @@ from warp_lcp.distributed.particle_messages import (
     ParticleMessages,
     bounds_of,
 )
-from warp_lcp.distributed.place_order import PlaceOrder
+from warp_lcp.distributed.summation_order import PlaceOrder
 from warp_lcp.grid.part import ParticleExchange
 from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.particles import NEW, Particles, ParticleTotals

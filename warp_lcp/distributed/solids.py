@@ -10,7 +10,7 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
+from warp_lcp.grid.domain_sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells

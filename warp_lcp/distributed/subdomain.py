@@ -11,16 +11,16 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.balance import Balance
+from warp_lcp.distributed.ballistic_fragments import TreesAtCuts
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.extension import Refill, too_far
-from warp_lcp.distributed.flight import TreesAtCuts
+from warp_lcp.distributed.ghost_width import Refill, too_far
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchanging_all
-from warp_lcp.distributed.migration import cuts_of, migrate
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.repartition import cuts_of, migrate
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.grid.cell_box import CellBox
 from warp_lcp.grid.part import BodyNumbers, Corner, FieldT, GridPart
@@ -120,7 +120,7 @@ class Subdomain(GridPart):
 
     Attributes:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
-        cuts: has bit n set if side n of the part, see `warp_lcp.grid.sides`, is a cut.
+        cuts: has bit n set if side n of the part, see `warp_lcp.grid.domain_sides`, is a cut.
         own_faces: those whose lower faces belong to the box: its cells, and the ring beyond the
             domain's upper sides that it touches.
 

@@ -236,8 +236,8 @@ def advect_with_distance(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or
-            beyond.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: particles cross them and end on
+            them or beyond.
         endless: bit n is set if axis n is periodic, see `advect`; its sides count as open.
     """
     launch(
@@ -273,7 +273,7 @@ def push_out(
         moved: int32, shape (1,): raised by the number of particles that were put outside.
         left: int32, shape (1,): raised by the number of those for which no way out was found; they
             stay where they were.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: particles beyond stay there.
     """
     launch(
         PUSH_OUT,

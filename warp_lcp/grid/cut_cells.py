@@ -16,7 +16,10 @@ import warp as wp
 
 from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.cut_cells_kernels import integrate_kernel
+from warp_lcp.grid.distributed_distance import enter_layers, measure_together
+from warp_lcp.grid.domain_sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.motion import Motions, Pose
+from warp_lcp.grid.moving_mesh_distance import FlatCells, PlacedMesh, tables_of
 from warp_lcp.grid.node_distance import (
     NodeBox,
     NodeDistances,
@@ -25,9 +28,6 @@ from warp_lcp.grid.node_distance import (
     box_near,
     node_window,
 )
-from warp_lcp.grid.placed_mesh import FlatCells, PlacedMesh, tables_of
-from warp_lcp.grid.shared_distance import enter_layers, measure_together
-from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
@@ -57,8 +57,8 @@ class CutCells:
             a larger grid.
         left_out: numbers of solids that cut no cells; their velocities are still computed.
         held: numbers of solids that may be thinner than cells without a note.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no
-            solid closes them, and the ring is air.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: there the faces are open as far
+            as no solid closes them, and the ring is air.
 
     Attributes:
         distance: float32 signed distance to the nearest solid at nodes [cells], positive in the

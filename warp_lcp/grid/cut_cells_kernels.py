@@ -14,8 +14,8 @@ from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.header_text import text
 from warp_lcp.kernels.launch_graph import launch
-from warp_lcp.kernels.native import text
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 # Open fractions below this become 0. Raised to it, they would lift a flow along the wall; kept,

@@ -214,7 +214,7 @@ class GridPart:
         joined: periodic axes that are cut; beyond the domain's sides the part of another process
             follows.
         cuts: bit n is set if the part of another process follows beyond side n, see
-            `warp_lcp.grid.sides`.
+            `warp_lcp.grid.domain_sides`.
     """
 
     shared: ClassVar[bool] = False

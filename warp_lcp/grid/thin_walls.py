@@ -116,8 +116,8 @@ class ThinWalls:
         grid: the grid; any part of the domain's.
         solids: solids of the scene; numbers of walls are 1 + s.
         thin: numbers of the thin ones.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`: particles may leave the domain there,
-            for good or to the other end of an axis.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: particles may leave the domain
+            there, for good or to the other end of an axis.
         in_parts: whether each solid is thin in parts only; none if empty.
         thickness: the solids are thin where they are thinner [m]; used with `in_parts`.
         endless: periodic axes; solids near one side have images beyond the other.

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.domain_sides import open_ring
 from warp_lcp.grid.motion import Motion
 from warp_lcp.grid.node_distance import CHUNK, NodeSampler, nodes_near
-from warp_lcp.grid.sides import open_ring
 from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.solids_kernels import claim_cells
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -83,7 +83,7 @@ def voxelize(
         grid: the grid.
         solids: the solids, in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: beyond them cells are open.
         remarks: write notes and refuse errors at the start of a run; False once solids have moved.
         counts: fill `covered`, which waits for the device; needed for remarks.
 

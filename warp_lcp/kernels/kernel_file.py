@@ -29,7 +29,7 @@ from typing import TypedDict
 
 import warp as wp
 
-from warp_lcp.kernels.native import HeaderSection, sections
+from warp_lcp.kernels.header_text import HeaderSection, sections
 from warp_lcp.kernels.stencil_kernel import StencilKernel
 from warp_lcp.kernels.types import DataType, FieldType
 

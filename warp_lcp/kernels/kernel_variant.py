@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, SupportsIndex, TypeAlias
 import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.header_text import HEADERS, shared, text
 from warp_lcp.kernels.layout import (
     ANYWHERE,
     Alignment,
@@ -30,7 +31,6 @@ from warp_lcp.kernels.layout import (
     threads,
 )
 from warp_lcp.kernels.memory import KernelArgument, value_of
-from warp_lcp.kernels.native import HEADERS, shared, text
 from warp_lcp.kernels.thread_pool import TableEntry
 from warp_lcp.kernels.types import DataType, FieldType, StructInstance
 

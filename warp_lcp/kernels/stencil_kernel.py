@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import warp as wp
 
+from warp_lcp.kernels.header_text import sections
 from warp_lcp.kernels.kernel_variant import (
     KNOWN,
     NUMBERS,
@@ -44,7 +45,6 @@ from warp_lcp.kernels.layout import (
     threads,
 )
 from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, KernelArgument, Scalar, slot_of
-from warp_lcp.kernels.native import sections
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 from warp_lcp.kernels.types import DataType, DeviceArray, FieldType, StructInstance
 

@@ -25,8 +25,8 @@ import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.kernels.header_text import shared
 from warp_lcp.kernels.layout import STRUCT, KernelValue
-from warp_lcp.kernels.native import shared
 from warp_lcp.kernels.types import DataType, DeviceArray, Dimensions
 
 VARIABLE = "WARP_LCP_THREADS"

@@ -18,6 +18,7 @@ import warp as wp
 from warp_lcp.kernels import Rows, StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.header_text import HEADERS, text
 from warp_lcp.kernels.kernel_file import KernelFile
 from warp_lcp.kernels.launch_graph import (
     Launch,
@@ -31,7 +32,6 @@ from warp_lcp.kernels.launch_graph import (
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.layout import BoundOperands, KernelStencil
 from warp_lcp.kernels.memory import DeviceRows, KernelArgument, Scalar, value_of
-from warp_lcp.kernels.native import HEADERS, text
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.thread_pool import Operation
 from warp_lcp.kernels.types import DeviceArray

@@ -19,7 +19,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
-from warp_lcp.material import flight_kernels as kernels
+from warp_lcp.material import ballistic_fragments_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
 # [cells^2] Least second moment about an axis, per particle, of a body whose rotation the grid
@@ -87,7 +87,7 @@ class BallisticFragments:
         self._seen: Window | None = None
         self._numbers = BodyNumbers(0)
         self._growing = LaunchGraph(grid.device, self._launch_growth)
-        self._rate, self._quanta = Scalar(), Scalar()  # see `flight_kernels.add_up`
+        self._rate, self._quanta = Scalar(), Scalar()  # see `ballistic_fragments_kernels.add_up`
         self._list = ListMemory(grid.device)  # list of the bodies' particles
         self._vectors, self._start = (
             np.zeros((0, VECTORS, 3), dtype=np.float32),

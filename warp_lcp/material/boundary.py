@@ -15,10 +15,10 @@ import warp as wp
 from warp_lcp.grid.advection import advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.barriers import Barriers
 from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.domain_sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.level_set import whole_cell_capacity
 from warp_lcp.grid.motion import Motions, boxes_of, kinks
 from warp_lcp.grid.particle_loops import MARGIN
-from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.thin_walls import ThinWalls
@@ -27,7 +27,7 @@ from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy, launch
 from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material import boundary_kernels as kernels
-from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
+from warp_lcp.material.velocity_extrapolation import Join, extend_velocity, extend_velocity_cut
 
 Faces = list[wp.array]  # one field a component
 
@@ -37,8 +37,8 @@ class Boundary(Protocol):
 
     Attributes:
         sides: the periodic sides; None if there are none.
-        open_sides: open sides of the domain, see `warp_lcp.grid.sides`; they include the sides of
-            periodic axes.
+        open_sides: open sides of the domain, see `warp_lcp.grid.domain_sides`; they include the
+            sides of periodic axes.
         base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open
             sides.
         touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face
@@ -88,7 +88,7 @@ class Boundary(Protocol):
     ) -> None:
         """Extrapolate the projected velocity into air and walls.
 
-        See `warp_lcp.material.wall`, also for `join`.
+        See `warp_lcp.material.velocity_extrapolation`, also for `join`.
         """
 
     def placed(self) -> list[wp.array]:

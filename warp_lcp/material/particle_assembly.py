@@ -16,9 +16,9 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.barriers import BARRIER, Barriers
 from warp_lcp.grid.cut_cells import DEEP, CutCells
+from warp_lcp.grid.domain_sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.part import subdomain_of
 from warp_lcp.grid.particles import Particles, seed
-from warp_lcp.grid.sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
@@ -224,7 +224,8 @@ def make_thin_walls(
         scene: the scene.
         grid: its grid.
         placed: its solids.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`; those of periodic axes are added.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`; those of periodic axes are
+            added.
         crossing: only those that are too thin to cut cells; of rigid bodies only sheets, since
             other bodies are pushed by the pressure through the cells that they cut.
     """

@@ -33,7 +33,7 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import particle_trouble
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
-from warp_lcp.material.wall import Join
+from warp_lcp.material.velocity_extrapolation import Join
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
@@ -428,7 +428,7 @@ class ParticleSimulation(ParticleCheckpoints):
     ) -> None:
         """Extrapolate the velocity from the valid faces of a solve into air and walls.
 
-        See `warp_lcp.material.wall`.
+        See `warp_lcp.material.velocity_extrapolation`.
 
         Args:
             window: faces to consider.

@@ -9,9 +9,9 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import launch_list, list_kernel
+from warp_lcp.grid.domain_sides import mark_gone
 from warp_lcp.grid.particle_loops import MARGIN, ListMemory, launch
 from warp_lcp.grid.particles import GROWTH, Particles
-from warp_lcp.grid.sides import mark_gone
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.fields import zeros
@@ -478,7 +478,7 @@ class Outlets:
     Args:
         grid: the grid.
         drains: regions that swallow material.
-        open_sides: open sides of the domain, see `warp_lcp.grid.sides.side_bits`.
+        open_sides: open sides of the domain, see `warp_lcp.grid.domain_sides.side_bits`.
     """
 
     def __init__(self, grid: StaggeredGrid, drains: Sequence[Drain], open_sides: int) -> None:

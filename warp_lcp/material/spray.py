@@ -56,7 +56,7 @@ class Spray:
     Args:
         grid: any of the simulation's.
         solids: solids that it may meet.
-        open_sides: open sides of the domain, see `warp_lcp.grid.sides.side_bits`.
+        open_sides: open sides of the domain, see `warp_lcp.grid.domain_sides.side_bits`.
         active: whether any particle may fly.
         keeps: whether particles carry a number.
 

@@ -23,7 +23,7 @@ from warp_lcp.problem.data_types import Matrix, Values
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Derivatives
-from warp_lcp.problem.scale import scale_of_matrix
+from warp_lcp.problem.residual_scaling import scale_of_matrix
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
 PRODUCT = KERNELS["dense.product"]

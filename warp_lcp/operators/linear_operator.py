@@ -20,7 +20,7 @@ from warp_lcp.problem.data_types import HasShape, Matrix, Multiplies, Values
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Operator
-from warp_lcp.problem.scale import NoTranspose, estimated_scale
+from warp_lcp.problem.residual_scaling import NoTranspose, estimated_scale
 
 Product: TypeAlias = Callable[[np.ndarray], npt.ArrayLike]
 Factor: TypeAlias = Product | Multiplies  # by which A x is computed

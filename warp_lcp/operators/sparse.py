@@ -29,12 +29,12 @@ from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.dense import is_rounding
-from warp_lcp.operators.renumbering import Renumbering, renumbering
+from warp_lcp.operators.reordering import Renumbering, renumbering
 from warp_lcp.problem.data_types import Matrix, SparseMatrix, Values
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
 from warp_lcp.problem.protocol import Derivatives
-from warp_lcp.problem.scale import scale_of_matrix
+from warp_lcp.problem.residual_scaling import scale_of_matrix
 
 INDICES = wp.array(dtype=wp.int32)
 

@@ -18,7 +18,7 @@ import scipy.sparse.linalg
 from warp_lcp.problem.data_types import Matrix, is_sparse
 from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.reformulate import QuadraticProgramData
-from warp_lcp.problem.scale import scaled
+from warp_lcp.problem.residual_scaling import scaled
 
 SMALL = 400  # up to so many unknowns and rows matrices are dense, for any type of the caller's
 SWEEPS = 20  # sweeps of Ruiz's iteration, each of which halves the logarithms of rows that differ

@@ -26,7 +26,7 @@ import warp as wp
 
 from warp_lcp.kernels.fields import Layout
 from warp_lcp.kernels.types import DataType, DeviceArray, Values
-from warp_lcp.problem.scale import NoTranspose, estimated_scale
+from warp_lcp.problem.residual_scaling import NoTranspose, estimated_scale
 
 if TYPE_CHECKING:
     from warp_lcp.kernels.fields import PaddedLayout

@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_lcp.problem.data_types import Matrix, Values, dense, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.scale import scale_of_matrix
+from warp_lcp.problem.residual_scaling import scale_of_matrix
 
 Vector = np.ndarray
 Map = Callable[[Vector], Vector]

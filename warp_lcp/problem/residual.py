@@ -1,9 +1,9 @@
 """Natural residual, the measure of convergence of all methods.
 
 It is always evaluated from x in float64: r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)). The
-scale d_i is |A_ii| on grids and for positive semi-definite matrices; `warp_lcp.problem.scale` has
-the other cases (1 where a row and a column are empty). r has the units of y and does not change
-when x is rescaled; it vanishes exactly at solutions.
+scale d_i is |A_ii| on grids and for positive semi-definite matrices;
+`warp_lcp.problem.residual_scaling` has the other cases (1 where a row and a column are empty). r
+has the units of y and does not change when x is rescaled; it vanishes exactly at solutions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Sums
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
-from warp_lcp.problem.scale import estimated_scale
+from warp_lcp.problem.residual_scaling import estimated_scale
 
 EPS = float(np.finfo(np.float64).eps)
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")

@@ -22,9 +22,9 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step, WorkspaceBase
 from warp_lcp.reduced.active_set_kernels import CLASSIFY, ON_FREE, projected_move
 from warp_lcp.reduced.coarse_problem import CoarseStencilProblem, FullApproximationCorrection
-from warp_lcp.reduced.cold_cycles import LARGE, cold_cycles
 from warp_lcp.reduced.dense_system import DampedSteps, DenseSystem
 from warp_lcp.reduced.grid_step_kernels import SLOTS
+from warp_lcp.reduced.initial_cycles import LARGE, cold_cycles
 from warp_lcp.reduced.line_system import LineSystem
 from warp_lcp.reduced.principal_system import PrincipalSystem, principal_system
 from warp_lcp.reduced.sparse_system import SparseSystem

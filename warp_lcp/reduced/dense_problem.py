@@ -22,8 +22,8 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.program_optimality import PROVABLE
 from warp_lcp.problem.protocol import HasRows, has
 from warp_lcp.problem.residual import EPS
+from warp_lcp.problem.residual_scaling import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 
 # Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.

@@ -36,7 +36,7 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.protocol import Scratch
 from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
-from warp_lcp.reduced.descent import CREEP, STALL
+from warp_lcp.reduced.energy_monitor import CREEP, STALL
 from warp_lcp.reduced.grid_step_kernels import CARRY, ENERGY, MOVED, NORM, PER_SIZE, SIZE, STEP, f64
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
+from warp_lcp.problem.residual_scaling import scaled
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import Step, Workspace, WorkspaceBase
 from warp_lcp.reduced.dense_problem import (
     DenseProblem,

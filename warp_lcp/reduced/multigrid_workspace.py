@@ -28,8 +28,8 @@ from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Precision, Step, WorkspaceBase
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
-from warp_lcp.reduced.descent import Descent
 from warp_lcp.reduced.device_iteration import DeviceIteration
+from warp_lcp.reduced.energy_monitor import Descent
 from warp_lcp.reduced.residual_and_active_set import ResidualAndActiveSet
 
 if TYPE_CHECKING:

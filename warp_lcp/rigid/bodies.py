@@ -76,8 +76,8 @@ class RigidBodies:
         contact_residual: residual of the last contact problem, relative to that of no impulses.
         contact_iterations: iterations of its solve.
         exits: open sides of the domain for bodies: its size [m], and bits of
-            `warp_lcp.grid.sides.side_bits`. A body whose center of mass has crossed one is removed
-            for good: at rest outside, without contacts, in no frame.
+            `warp_lcp.grid.domain_sides.side_bits`. A body whose center of mass has crossed one is
+            removed for good: at rest outside, without contacts, in no frame.
         material: whether a material can move the bodies; else contacts that support them are not
             tracked.
 

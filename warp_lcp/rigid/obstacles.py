@@ -45,7 +45,7 @@ def domain_walls(
 
     Args:
         size: size of the domain.
-        open_sides: bits of `warp_lcp.grid.sides.side_bits`: sides without a wall.
+        open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: sides without a wall.
         endless: periodic axes, also without walls.
     """
     points, normals = [], []

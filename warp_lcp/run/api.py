@@ -18,8 +18,8 @@ import warp as wp
 from warp_lcp.files.tables import TableView
 from warp_lcp.frames.meshio_format import to_meshio
 from warp_lcp.grid.particles import Particles
+from warp_lcp.material.add_material import pour
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.material.pour import pour
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import RunRecord

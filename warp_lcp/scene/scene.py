@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.frames.meshio_format import FrameFormat
-from warp_lcp.grid.sides import SIDES
+from warp_lcp.grid.domain_sides import SIDES
 from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.scene.camera import Camera

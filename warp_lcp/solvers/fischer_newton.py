@@ -21,11 +21,11 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITY, without_far
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.residual_scaling import NoTranspose
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.reduced.dense_problem import DenseWorkspace
-from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.reduced.energy_monitor import DECREASE, NonmonotoneSearch
 from warp_lcp.reduced.grid_system import GridSystem
 from warp_lcp.reduced.multigrid_workspace import ColdStart
 from warp_lcp.reduced.nonsmooth_map import (

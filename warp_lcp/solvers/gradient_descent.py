@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
-from warp_lcp.reduced.descent import NonmonotoneSearch
+from warp_lcp.reduced.energy_monitor import NonmonotoneSearch
 from warp_lcp.reduced.nonsmooth_map import MapForm, MapName, NonsmoothMap
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
 

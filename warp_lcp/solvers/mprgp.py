@@ -28,8 +28,8 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Precision, PrecisionName, Step, Workspace, WorkspaceBase
 from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.reduced.active_set_kernels import projected_move
-from warp_lcp.reduced.descent import Descent
 from warp_lcp.reduced.diagonal_system import DiagonalSystem
+from warp_lcp.reduced.energy_monitor import Descent
 from warp_lcp.reduced.grid_system import projected_cycle
 from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.reduced.sparse_system import SparseSystem

@@ -17,8 +17,8 @@ from warp_lcp.problem.data_types import Matrix, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
 from warp_lcp.problem.residual import EPS
+from warp_lcp.problem.residual_scaling import scale_of_matrix
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.problem.solve import FLOOR_MARGIN, Solver, Step, Workspace, WorkspaceBase
 from warp_lcp.reduced.dense_problem import proved_infeasible
 from warp_lcp.settings import Settings

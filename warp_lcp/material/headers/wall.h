@@ -180,9 +180,10 @@ each(constrain);
 #include "near_walls"
 each([&](int i) { field[i] = result[i]; });
 
-// kernel warp_lcp.material.wall.keep_spray: Mark open faces as known that are unknown but carry
-// weight, and extrapolated ones. Without fractions a face is open between cells that are not SOLID.
-// A face with weight is not on the array's edge, since its particles lie in the domain.
+// kernel warp_lcp.material.velocity_extrapolation.keep_spray: Mark open faces as known that are
+// unknown but carry weight, and extrapolated ones. Without fractions a face is open between cells
+// that are not SOLID. A face with weight is not on the array's edge, since its particles lie in the
+// domain.
 //   compute    float32
 //   box        float32 weight, open?; int8 known, kind
 //   numbers    int axis

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 
-from warp_lcp.operators.restated import Form, as_dense, as_grid, as_sparse
+from warp_lcp.operators.matrix_conversion import Form, as_dense, as_grid, as_sparse
 from warp_lcp.problem.solve import Solver
+from warp_lcp.problem_properties import Traits
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
-from warp_lcp.traits import Traits
 
 # Below these numbers of sweeps, sweeps are faster than linear systems, or than the set-up of a
 # multigrid hierarchy and some cycles.

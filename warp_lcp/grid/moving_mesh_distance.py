@@ -36,7 +36,7 @@ from warp_lcp.grid.solids_kernels import (
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels.host_array import HostArray
 
-MODULE = "warp_lcp.grid.placed_mesh"
+MODULE = "warp_lcp.grid.moving_mesh_distance"
 _FAR, _ROUNDING, _HOLLOW = wp.constant(FAR), wp.constant(ROUNDING), wp.constant(wp.int8(HOLLOW))
 Blocks, Frames, Distances = (
     wp.array(dtype=Block),

@@ -23,7 +23,7 @@ from warp_lcp.granular.stress_kernels import (
     STILL_SHARE,
     TIGHTER,
 )
-from warp_lcp.granular.yield_set import CONSTANTS
+from warp_lcp.granular.stress_layout import CONSTANTS
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.solve import OptionalMembers

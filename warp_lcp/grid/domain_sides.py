@@ -74,7 +74,7 @@ def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
     return outside & ~closed
 
 
-@cell_kernel("warp_lcp.grid.sides")
+@cell_kernel("warp_lcp.grid.domain_sides")
 @typing.no_type_check
 def continue_kernel(k, j, i, bits: int, nx: int, ny: int, nz: int, field: F32):
     """Copy a field from the cells beside open sides to those beyond."""
@@ -101,7 +101,7 @@ def continue_beyond(grid: StaggeredGrid, bits: int, field: wp.array) -> None:
         grid.everywhere.launch(continue_kernel, [bits, *grid.counts, field])
 
 
-@list_kernel("warp_lcp.grid.sides")
+@list_kernel("warp_lcp.grid.domain_sides")
 @typing.no_type_check
 def gone_kernel(
     i,

@@ -31,7 +31,7 @@ def ordered_bits(x: float):
     return wp.where(bits < SIGN, bits ^ SIGN, ~bits)
 
 
-@list_kernel("granular.percentiles")
+@list_kernel("granular.runout")
 @no_type_check
 def count_kernel(
     i, position: POINTS, found: WORDS, counts: INTS, mask: wp.uint32, shift: wp.uint32
@@ -44,7 +44,7 @@ def count_kernel(
             wp.atomic_add(counts, axis * DIGITS + digit, 1)
 
 
-@forward_kernel(module="granular.percentiles")
+@forward_kernel(module="granular.runout")
 def select_kernel(
     counts: INTS,
     found: WORDS,

@@ -50,11 +50,11 @@ _CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID
     "RELEASED": RELEASED,
 }
 KERNELS = KernelFile(Path(__file__).parent / "headers/wall.h", _CONSTANTS)
-KEEP_SPRAY = KERNELS["warp_lcp.material.wall.keep_spray"]
+KEEP_SPRAY = KERNELS["warp_lcp.material.velocity_extrapolation.keep_spray"]
 _FLUID = wp.constant(wp.int8(FLUID))
 
 
-@cell_kernel("warp_lcp.material.wall")
+@cell_kernel("warp_lcp.material.velocity_extrapolation")
 @typing.no_type_check
 def keep_released_kernel(
     k, j, i, axis: int, kind: I8, contact: U8, weight: F32, field: F32, known: I8
@@ -91,7 +91,7 @@ def keep_released_kernel(
             known[k, j, i] = wp.int8(2)
 
 
-@cell_kernel("warp_lcp.material.wall")
+@cell_kernel("warp_lcp.material.velocity_extrapolation")
 @typing.no_type_check
 def closed_face_kernel(
     k,
