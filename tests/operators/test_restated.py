@@ -35,7 +35,7 @@ FORMS = {
 
 @pytest.mark.parametrize(("name", "seed"), covering(list(FORMS), [5101, 5102]))
 def test_solutions_and_starts_are_those_of_the_given_problem(name, seed, monkeypatch):
-    monkeypatch.setattr(renumbering, "SMALLEST", 100)
+    monkeypatch.setattr(reordering, "SMALLEST", 100)
     form, make = FORMS[name]
     A, rng = make(seed), np.random.default_rng(seed)
     n, dense = A.shape[0], A.toarray() if scipy.sparse.issparse(A) else A

@@ -40,8 +40,8 @@ class NaturalResidual:
         norm: the residual's norm there, units of y.
         diagonal: d / unit, stored field: on grids the stencil's own diagonal, with its sign, and 0
             at empty rows and where there is no unknown.
-        current: whether `y` and `norm` belong to the current iterate; a method that moves x sets it
-            to False.
+        current: whether `y` and `norm` belong to the current iterate; it is False when a step
+            begins, and whoever moves x after an evaluation calls `invalidate`.
     """
 
     def __init__(self, problem: LCP) -> None:
@@ -85,8 +85,16 @@ class NaturalResidual:
             unknown=p.unknown,
             unit=self.unit,
         )[0]
-        self.norm, self.current = float(np.sqrt(square)), True
-        return self.norm
+        return self.mark_evaluated(float(np.sqrt(square)))
+
+    def mark_evaluated(self, norm: float) -> float:
+        """Store and return the norm at the current iterate."""
+        self.norm, self.current = norm, True
+        return norm
+
+    def invalidate(self) -> None:
+        """Note that x has moved since the last evaluation."""
+        self.current = False
 
     def affine(self, x: DeviceArray) -> None:
         """Compute y = A x + b."""
@@ -117,7 +125,7 @@ class NaturalResidual:
                 unknown=p.unknown,
                 keep=keep,
             ).launch(launch)
-        self.current = False
+        self.invalidate()
 
     def rescale(self) -> None:
         """Update d after the operator has changed; grids share theirs."""
@@ -150,7 +158,7 @@ class NaturalResidual:
         SETTLE_ISOLATED.bind(
             rows, bounds=bounds, d=zero_if_empty, b=p.b, unknown=p.unknown, x=x
         ).launch()
-        self.current = False
+        self.invalidate()
 
     def unattainable(self) -> float:
         """Return the norm of b on empty rows whose solution would be infinite.

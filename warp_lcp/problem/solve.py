@@ -141,7 +141,7 @@ class Residual(Protocol):
 
     Attributes:
         norm: at the x of the last evaluation, in units of y or of d x.
-        current: whether that is the current iterate; the loop sets it to False before each step.
+        current: whether that is the current iterate; `method_step` sets it to False.
     """
 
     norm: float
@@ -309,9 +309,24 @@ class Solver(Protocol):
     def step(self, problem: Any, work: Any, x: DeviceArray) -> Step:
         """Move x once.
 
-        `work.residual` is current at x; leave `work.residual.current` False unless it is at the new
-        x.
+        `work.residual` holds the norm at x, with `current` False, which becomes True only where the
+        norm is that at the new x.
         """
+
+
+def method_step(solver: Solver, problem: Any, work: Workspace) -> Step:
+    """Take a step of a method.
+
+    The residual is then current only if the method has evaluated it at the new x.
+    """
+    work.residual.current = False
+    return solver.step(problem, work, work.x)
+
+
+def evaluate_unless_current(work: Workspace) -> None:
+    """Evaluate the residual at the iterate, unless it is current."""
+    if not work.residual.current:
+        work.residual.evaluate(work.x)
 
 
 @cache
@@ -606,8 +621,7 @@ class _Loop:
         """Take steps until a status ends the solve."""
         iteration = 0
         while status is None:
-            self.residual.current = False
-            step = self.solver.step(self.problem, self.work, self.work.x)
+            step = method_step(self.solver, self.problem, self.work)
             iteration += step.iterations
             self.linear += step.linear_iterations
             if (
@@ -616,8 +630,7 @@ class _Loop:
                 and self.deadline.left() > 0
             ):
                 continue
-            if not self.residual.current:
-                self.residual.evaluate(self.work.x)
+            evaluate_unless_current(self.work)
             self._record(iteration, step)
             if step.final or self.residual.norm < self.best_norm:
                 self._keep(iteration)

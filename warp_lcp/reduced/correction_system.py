@@ -123,9 +123,11 @@ class CorrectionSystem:
             wp.copy(self.start_of_step, x)
         most = self.cycles.run(x, residual, self.free, restrict=self._stale)
         self.iterate.round_iterate()
+        residual.invalidate()
         if not symmetric and not residual.evaluate(x) <= most:  # no energy falls there
             wp.copy(x, self.start_of_step)
-            self._cycles_left, residual.current = 0, False
+            self._cycles_left = 0
+            residual.invalidate()
         # A grid's system keeps all unknowns from cycle to cycle; Newton's step removes some of them
         # again.
         self._stale = not (self.cycles.repairs and self._cycles_left > 0)
@@ -250,10 +252,9 @@ class CorrectionSystem:
         self._set(self.start_of_step, self.principal.e, length * self.size)
         if self.cycles is not None and self.cycles.repairs:
             residual.evaluate(x)
-            self._stale, residual.current = True, False
+            self._stale = True
             return self._step("monotone cycle", iterations + self._cycle().linear_iterations)
         if best <= max(norms):
-            residual.current = False
             return self.accept(iterations)
         if self.damped is None:
             return self._take_back(iterations, "regularized")
@@ -293,6 +294,7 @@ class CorrectionSystem:
             guarded=False,
         )
         self.iterate.round_iterate()
+        self.iterate.residual.invalidate()
 
 
 def _coarse_problem(

@@ -381,8 +381,7 @@ class DeviceIteration:
         if isinstance(criteria, MeanCriteria) and criteria.count() == 0:
             self.rows.clear()
             work.distrust_hierarchy()  # the free set is unknown
-            r.norm = 0.0
-            return 0.0
+            return r.mark_evaluated(0.0)
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = (

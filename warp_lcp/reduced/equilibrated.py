@@ -123,7 +123,6 @@ class EquilibratedWorkspace(WorkspaceBase):
         """
         inner = self.inner
         inner.residual.evaluate(inner.x)
-        inner.residual.current = False
         with np.errstate(over="ignore", invalid="ignore"):  # detected below
             step = advance(self._inner, inner, inner.x)
         alone = self.x.numpy()[self._alone] if self._alone.size else None

@@ -109,16 +109,16 @@ class FusedGridSystem:
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         self._settings = settings
-        self.iterate = passes = MultigridWorkspace(
+        self._exact = Precision(settings.precision) is not Precision.SINGLE
+        self.iterate = MultigridWorkspace(
             problem,
             problem.A,  # type: ignore[arg-type]
             settings,
             residual=MinimumMapResidual,
             ahead=False,
+            # With x rounded to float32 the energy is too noisy: Newton's own safeguard decides.
+            cycles_against_creeping=self._exact,
         )
-        self._exact = passes.precision is not Precision.SINGLE
-        # If x is rounded to float32, the energy is too noisy, and Newton's own safeguard decides.
-        passes.cycles_against_creeping = self._exact
         self._target, self._active, self._length, self._step = 0.0, 0, 1.0, 0.0
         self._sinks = False  # whether the energy has fallen to a new least
 

@@ -161,7 +161,7 @@ class HostResidual(NaturalResidual):
         self._take()
         values = self.values(x)
         np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
-        self.current = False
+        self.invalidate()
 
     def evaluate(self, x: DeviceArray) -> float:
         """Compute y and return the norm of the natural residual at x."""
@@ -171,8 +171,8 @@ class HostResidual(NaturalResidual):
         np.add(self.matrix.product(values), self.b, out=y)
         with np.errstate(invalid="ignore", over="ignore"):
             r = np.maximum(np.minimum(y, d * (values - self.lower)), d * (values - self.upper))
-            self.norm, self.current = math.sqrt(r @ r), True
-        return self.norm
+            norm = math.sqrt(r @ r)
+        return self.mark_evaluated(norm)
 
     def values(self, x: DeviceArray) -> np.ndarray:
         """Return x's memory; creating a view takes a tenth of a small solve."""
@@ -224,6 +224,7 @@ class HostIterate(WorkspaceBase):
             self.read()[...] = values
         else:
             self.x.assign(values)
+        self.residual.invalidate()
 
     def y(self) -> np.ndarray:
         """Return y = A x + b as last evaluated, shape (n,)."""
@@ -345,10 +346,9 @@ class HostSystem:
         # x may violate its bounds by what the criteria allow.
         if residual.evaluate(iterate.x) <= self._target:
             iterate.write(np.clip(values, self._lower, self._upper))
-            residual.current = False
         if self._rounds:
             iterate.round_iterate()
-            residual.current = False
+            residual.invalidate()
 
     def accept(self, iterations: int) -> Step:
         """Return the accepted step; whole steps may first raise the residual."""
@@ -358,10 +358,9 @@ class HostSystem:
         self, iterations: int, norms: deque[float], best: float, length: float
     ) -> CorrectionSystem:
         """Return the system of steps with a search, at the best iterate."""
-        iterate, residual = self.iterate, self.iterate.residual
+        iterate = self.iterate
         iterate.restore()
-        residual.evaluate(iterate.x)
-        residual.current = False
+        iterate.residual.evaluate(iterate.x)
         searched = CorrectionSystem(self._problem, self._settings, iterate)
         searched.start(warm=self._warm, tolerance=self._target, floating=self._floating)
         return searched

@@ -80,11 +80,11 @@ class MultigridWorkspace(WorkspaceBase):
         residual: creates the residual of the problem, the operator and the hierarchy.
         shifted: whether the finest diagonal takes shifts.
         ahead: whether the device may take steps without the host.
+        cycles_against_creeping: whether a projected cycle follows a step in which the free set
+            creeps.
 
     Attributes:
         cycles_left: number of projected cycles that come next.
-        cycles_against_creeping: whether a projected cycle follows a step in which the free set
-            creeps.
     """
 
     residual: ResidualAndActiveSet
@@ -92,7 +92,6 @@ class MultigridWorkspace(WorkspaceBase):
     correction: WoodburyCorrection | None = None  # of the cycle, for bodies
     # Limit of runs of projected cycles: after those, the free set is considered to cycle.
     most_runs: float = math.inf
-    cycles_against_creeping = True
     device_begins = True
     # Whether `WoodburyCorrection.note` has been launched for the current free set.
     free_set_noted = False
@@ -106,6 +105,7 @@ class MultigridWorkspace(WorkspaceBase):
         residual: Callable[..., ResidualAndActiveSet] = ResidualAndActiveSet,
         shifted: bool = False,
         ahead: bool = True,
+        cycles_against_creeping: bool = True,
     ) -> None:
         precision = Precision(settings.precision)
         real, self.A, self.settings, self.bounded = (
@@ -114,6 +114,7 @@ class MultigridWorkspace(WorkspaceBase):
             settings,
             problem.bounded,
         )
+        self._cycles_against_creeping = cycles_against_creeping
         self._p = problem.layout.zeros(real)
         # A projected cycle resets the search direction, so its lower bounds may use that memory:
         # finite numbers, and 0 off the unknowns.
@@ -408,7 +409,7 @@ class MultigridWorkspace(WorkspaceBase):
             self.residual.read(classified=True)
         if self.floating is not None:
             self._project()
-        if self._creeps() and self.cycles_against_creeping:
+        if self._creeps() and self._cycles_against_creeping:
             self.begin_cycles(1)
         return Step("truncated cycle", 1, active, interim=self.descent.sinks)
 

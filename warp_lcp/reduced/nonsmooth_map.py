@@ -316,11 +316,8 @@ class NonsmoothMap:
         STEP.launch(moving, condensing)
         self._by_rows.add_up(0, columns=3)
         square, merit, weighted = self._by_rows.scalars.numpy()
-        self.residual.norm, self.residual.current, self.norm = (
-            float(np.sqrt(square)),
-            True,
-            float(np.sqrt(weighted)),
-        )
+        self.residual.mark_evaluated(float(np.sqrt(square)))
+        self.norm = float(np.sqrt(weighted))
         return 0.5 * float(merit) / scale**2
 
     def descend(self, x: DeviceArray) -> tuple[float, float]:

@@ -209,15 +209,12 @@ class ResidualAndActiveSet(NaturalResidual):
         """
         self.classified = classified
         square, moved, active, twice, step, size = map(float, row)
-        self.energy, self.size = 0.5 * twice, size
-        self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
-        if not math.isfinite(step):
-            self.norm = math.nan
+        self.energy, self.size, self.active = 0.5 * twice, size, int(active)
         if moved > 0:
             self.free_set += 1
         if norm_of_b is not None:
             self._norm_of_b = norm_of_b
-        return self.norm
+        return self.mark_evaluated(float(np.sqrt(square)) if math.isfinite(step) else math.nan)
 
     def set(self, slot: int, value: float) -> None:
         """Write a scalar to its slot on the device."""

@@ -14,7 +14,14 @@ from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, check_taken, has
-from warp_lcp.problem.solve import Solver, Step, WorkspaceBase, method_name
+from warp_lcp.problem.solve import (
+    Solver,
+    Step,
+    WorkspaceBase,
+    evaluate_unless_current,
+    method_name,
+    method_step,
+)
 from warp_lcp.settings import Settings
 
 
@@ -86,10 +93,8 @@ class AssembledWorkspace(WorkspaceBase):
     def step(self, x: DeviceArray) -> Step:
         """Take a step, and write the iterate to x."""
         work = self._work
-        work.residual.current = False
-        done = self._method.step(self._inner, work, work.x)
-        if not work.residual.current:
-            work.residual.evaluate(work.x)
+        done = method_step(self._method, self._inner, work)
+        evaluate_unless_current(work)
         if work.residual.norm < self._least or not math.isfinite(self._least):
             self._least = work.residual.norm
             work.keep()

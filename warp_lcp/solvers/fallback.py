@@ -26,8 +26,10 @@ from warp_lcp.problem.solve import (
     Step,
     VariationalInequality,
     Workspace,
+    evaluate_unless_current,
     is_method,
     method_name,
+    method_step,
     refusal,
     spare_of,
     takes_floating,
@@ -421,8 +423,7 @@ class FallbackWorkspace(OptionalMembers):
             name = done.method or method_name(self._entries[self._place].method)
             done = replace(done, interim=done.interim or patient, method=name)
         if done.failure is not None and done.failure not in PROVED:
-            if not self.residual.current:
-                self.residual.evaluate(self.x)
+            evaluate_unless_current(self)
             if self._due() is not None:  # at the next step
                 return replace(done, failure=None, interim=True)
         return done
@@ -585,10 +586,8 @@ class FallbackWorkspace(OptionalMembers):
         self.residual.current = False
 
     def _one_step(self, method: Solver, work: Workspace) -> Step:
-        work.residual.current = False
-        done = method.step(self.problem, work, work.x)
-        if not work.residual.current:
-            work.residual.evaluate(work.x)
+        done = method_step(method, self.problem, work)
+        evaluate_unless_current(work)
         return done
 
     def _batch(self, entry: FallbackEntry, work: Workspace) -> Step:

@@ -381,7 +381,7 @@ class FischerWorkspace(WorkspaceBase):
             return self._gradient.descend(x)
         self._gradient.residual.evaluate(x)
         step = self._gradient.descend(x)
-        self.residual.norm, self.residual.current = self._gradient.residual.norm, True
+        self.residual.mark_evaluated(self._gradient.residual.norm)
         return step
 
     def _trial(self, x: DeviceArray, scale: float) -> float:

@@ -465,7 +465,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         )
         ADVANCE.launch(moving, condensing)
         sums.add_up(0, columns=3)
-        self.residual.norm, self.residual.current = self._norm(0), True
+        self.residual.mark_evaluated(self._norm(0))
         if length:
             self.mu = float(sums.scalars.numpy()[2]) / self.count
 

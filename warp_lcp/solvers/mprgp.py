@@ -156,7 +156,7 @@ class SplitResidual(NaturalResidual):
     Attributes:
         free: stored uint8 field, 1 where an unknown is off its bounds.
         size: see `r`.
-        moved: whether the free set has changed since this was last set to False.
+        free_set: version of the free set: it grows when the set changes.
         chopped: squared norm of the residual on the held unknowns.
         reduced: product of the residual and y on the free ones.
         release: product of -y / size and the chopped step.
@@ -177,13 +177,13 @@ class SplitResidual(NaturalResidual):
         self.rows = Rows.flat(problem.layout.size, problem.device)
         (
             self.size,
-            self.moved,
+            self.free_set,
             self.chopped,
             self.reduced,
             self.release,
             self.active,
             self.energy,
-        ) = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
+        ) = 1.0, 1, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if has(problem.A, HasStencil) else None
         self.sums = Sums(self.rows, 2, slots=engine.SLOTS)
@@ -232,13 +232,10 @@ class SplitResidual(NaturalResidual):
         square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
             float(v) for v in sums
         )
-        self.norm, self.current, self.active, self.moved = (
-            float(np.sqrt(square)),
-            True,
-            int(active),
-            self.moved or moved > 0,
-        )
-        return self.norm
+        self.active = int(active)
+        if moved > 0:
+            self.free_set += 1
+        return self.mark_evaluated(float(np.sqrt(square)))
 
     def measure(self, finest: StencilLevel, p: DeviceArray) -> list[float]:
         """Return z'Az, z'Ap, r'z and r'p on a grid's finest level.
@@ -296,6 +293,7 @@ class MPRGPWorkspace(WorkspaceBase):
             0.0,
         )
         self._descent = Descent(self.precision.epsilon)
+        self._restricted = 0  # the version of the free set that the preconditioner is restricted to
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
@@ -312,8 +310,13 @@ class MPRGPWorkspace(WorkspaceBase):
             self.residual.energy,
         )
         self._descent.start(self.residual.energy, self.residual.norm)
-        self.residual.moved = True
+        self._restricted = 0
         self.system.refresh()
+
+    @property
+    def stale(self) -> bool:
+        """Whether the free set has changed since the preconditioner was restricted to it."""
+        return self._restricted != self.residual.free_set
 
     def sinks(self) -> bool:
         """Return whether the energy has fallen beyond rounding.
@@ -334,7 +337,7 @@ class MPRGPWorkspace(WorkspaceBase):
         if self._cycled:
             self._descent.weigh(fell)
         elif self._cycles_left == 0 and self._descent.creeps(
-            fell, moved=self.residual.moved or self._released
+            fell, moved=self.stale or self._released
         ):
             self._cycles_left = 1
         self._cycles_left = self._cycles_left or self._descent.due(self.settings.patience)
@@ -345,7 +348,7 @@ class MPRGPWorkspace(WorkspaceBase):
         """Take a projected cycle on all unknowns."""
         residual = self.residual
         self._cycles_left -= 1
-        residual.moved, self._carry = True, False
+        self._restricted, self._carry = 0, False
         residual.affine(x)
         projected_cycle(
             self.problem, self.system, x, residual.y, residual.size, residual.free, residual.sums
@@ -387,7 +390,7 @@ class MPRGPWorkspace(WorkspaceBase):
             length=factor * residual.size,
         ).launch()
         self._settle(target)
-        residual.moved = True
+        self._restricted = 0
         return True
 
     def conjugate(self) -> bool:
@@ -400,9 +403,9 @@ class MPRGPWorkspace(WorkspaceBase):
             False: the energy is unbounded below along the direction.
         """
         residual, M = self.residual, self.preconditioner
-        if residual.moved:
+        if self.stale:
             M.restrict(residual.free)
-            residual.moved, self._carry = False, False
+            self._restricted, self._carry = residual.free_set, False
         if self.floating is not None:
             self.floating.project(M.r, residual.free)
         M.apply()
@@ -471,7 +474,7 @@ class MPRGPWorkspace(WorkspaceBase):
         for _ in range(0 if self.is_grid else 30):
             check_time()
             residual.evaluate(self.x)
-            if not residual.moved or residual.energy <= energy + ENERGY_ROUNDING * abs(energy):
+            if not self.stale or residual.energy <= energy + ENERGY_ROUNDING * abs(energy):
                 break
             length *= 0.5
             self._advance(origin, direction, length, self.x)
@@ -505,7 +508,7 @@ class MPRGPWorkspace(WorkspaceBase):
         """Make the result of a step the current x."""
         self.x = target
         self._finish_move(self.x)
-        self.residual.current = False
+        self.residual.invalidate()
 
     def keep(self) -> None:
         """Store x as the best iterate: the next step is written to other memory."""

@@ -65,8 +65,7 @@ class NNCG(Settings):
             ValueError: A cannot be swept; see ProjectedSOR.
         """
         check_taken(self, problem.A)
-        work = NNCGWorkspace(problem, self.precision)
-        work.sweep = sweep_for(problem, work.diagonal, self.omega)
+        work = NNCGWorkspace(problem, self.precision, self.omega)
         work.diagonal.check()
         return work
 
@@ -87,8 +86,9 @@ class NNCGWorkspace(SweepWorkspace):
         p: stored field, the direction.
     """
 
-    def __init__(self, problem: LCP, precision: str) -> None:
+    def __init__(self, problem: LCP, precision: str, omega: float) -> None:
         super().__init__(problem, precision)
+        self.sweep = sweep_for(problem, self.diagonal, omega)
         self.g, self.p = problem.layout.zeros(wp.float64), problem.layout.zeros(wp.float64)
         affine = problem.bounds.affine
         self._constant = problem.bounds.operands  # where bounds do not depend on x

@@ -100,7 +100,7 @@ class ProjectedMultigrid(Settings):
         ones otherwise.
         """
         if work.goes_in_circles:
-            work.residual.current = True
+            work.residual.mark_evaluated(work.residual.norm)  # x has not moved
             return Step("truncated cycle", 0, work.residual.active, SolveStatus.STAGNATED)
         if work.wants_monotone_cycle():
             return work.monotone_step()

@@ -19,7 +19,15 @@ from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.residual_scaling import scale_of_matrix
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import FLOOR_MARGIN, Solver, Step, Workspace, WorkspaceBase
+from warp_lcp.problem.solve import (
+    FLOOR_MARGIN,
+    Solver,
+    Step,
+    Workspace,
+    WorkspaceBase,
+    evaluate_unless_current,
+    method_step,
+)
 from warp_lcp.reduced.dense_problem import proved_infeasible
 from warp_lcp.settings import Settings
 from warp_lcp.solvers.fallback import Fallback, fails
@@ -131,10 +139,8 @@ class ProximalWorkspace(WorkspaceBase):
         if self._steps == 0:
             self._take_center(x)
         self._steps += 1
-        work.residual.current = False
-        done = self._method.step(self._inner, work, work.x)
-        if not work.residual.current:
-            work.residual.evaluate(work.x)
+        done = method_step(self._method, self._inner, work)
+        evaluate_unless_current(work)
         wp.copy(x, work.x)
         near = work.residual.norm <= self._near
         if (
@@ -143,7 +149,7 @@ class ProximalWorkspace(WorkspaceBase):
             or self._steps >= (TRIED if self._least == LEAST else FEWER)
         ):
             failure = self._assess(x, solved=near)
-        self.residual.current = False
+        self.residual.invalidate()
         return Step(
             "proximal point", done.linear_iterations, done.active, failure, interim=failure is None
         )

@@ -178,10 +178,9 @@ class SubspaceWorkspace(SweepWorkspace):
                 or residual.evaluate(x) < norm
                 or self._energy(x) < energy - ROUNDING * abs(energy)
             ):
-                residual.current = s.backtracks >= 0
                 return iterations
         wp.copy(x, self._before)
-        residual.current = False
+        residual.invalidate()
         return iterations
 
     def _correct(self, x: DeviceArray, scale: float) -> None:
@@ -207,6 +206,7 @@ class SubspaceWorkspace(SweepWorkspace):
                 old_upper=old_upper,
             ).launch()
         self._finish_move(x)
+        self.residual.invalidate()
 
     def _energy(self, x: DeviceArray) -> float:
         """Return the energy x'A x / 2 + b'x = x'(y + b) / 2, y being that of x.
