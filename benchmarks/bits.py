@@ -240,7 +240,7 @@ def _variants(name: str, method: Callable[..., Solver]) -> list[Solver]:
     """Return a method in each precision, and with its OTHER_SETTINGS."""
     chosen = any(
         field.name == "precision"
-        for field in dataclasses.fields(cast(type[DataclassInstance], method))
+        for field in dataclasses.fields(cast("type[DataclassInstance]", method))
     )
     made = [method(precision=p) for p in PRECISIONS] if chosen else [method()]
     return made + [method(**settings) for settings in OTHER_SETTINGS.get(name, ())]
