@@ -165,7 +165,7 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
     def listening(
         declared: StencilKernel,
         rows: Rows,
-        structs: tuple[DataclassInstance, ...],
+        structs: tuple["DataclassInstance", ...],
         kernel_args: Tables,
         stencil: PaddedStencil | None = None,
         bounds: BoundOperands | None = None,

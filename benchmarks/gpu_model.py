@@ -283,7 +283,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
     def binding(
         declared: StencilKernel,
         rows: Rows,
-        structs: tuple[DataclassInstance, ...],
+        structs: tuple["DataclassInstance", ...],
         arguments: Tables,
         stencil: PaddedStencil | None = None,
         bounds: BoundOperands | None = None,
