@@ -317,8 +317,8 @@ FORMULAS = [
         ),
         ("(self.residual.y, self.problem.b)", "(self.residual.y, self.residual.y)"),
         (
-            "        wp.copy(x, self._before)\n        residual.current = False",
-            "        residual.current = False",
+            "        wp.copy(x, self._before)\n        residual.invalidate()",
+            "        residual.invalidate()",
         ),
         (
             "            work.sweep.run(x, forward=True)",
