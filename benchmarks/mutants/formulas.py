@@ -365,8 +365,8 @@ FORMULAS = [
             "self._projected_step(direction, residual.release, curvature)",
         ),
         (
-            "residual.moved, self._carry = False, False",
-            "residual.moved, self._carry = False, self._carry",
+            "self._restricted, self._carry = residual.free_set, False",
+            "self._restricted, self._carry = residual.free_set, self._carry",
         ),
         (
             "factor, target, p = residual.release / curvature",
