@@ -24,6 +24,8 @@ NO_MATERIAL = "there is no material, only bodies move"
 class ContactDomain(Domain):
     """[domain]: the box; there is no grid."""
 
+    has_grid: ClassVar = False
+
     resolution: int = Field(default=64, ge=2, le=MOST_CELLS, description="resolution of pictures")
 
 
@@ -418,19 +420,3 @@ class ContactScene(Scene):
             f"{motors} with motors": motors,
         }
         return ", ".join(line for line, count in named.items() if count)
-
-    def _grid_complaints(self) -> list[Complaint]:
-        """Return errors of the domain.
-
-        Its sides need not be whole numbers of cells.
-        """
-        complaints = self.domain.spacing_complaints()
-        if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            complaints.append(
-                Complaint(
-                    ("domain", "periodic"),
-                    self.domain.periodic,
-                    f"must have {self.dimension} entries",
-                )
-            )
-        return complaints

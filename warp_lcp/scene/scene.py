@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from unicodedata import normalize
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.frames.meshio_format import FrameFormat
@@ -81,6 +88,17 @@ NAME_RULE = (
 WHOLE_CELLS = 1e-6  # largest relative distance of a side from a whole number of cells
 
 
+def side_of_whole_cells(side: float, spacing: float) -> float:
+    """Return a side [m] rounded up to whole cells.
+
+    A side of whole cells, up to rounding errors, is returned as it is.
+    """
+    cells = side / spacing
+    if round(cells) >= 1 and abs(cells - round(cells)) <= WHOLE_CELLS * cells:
+        return side
+    return math.ceil(cells) * spacing
+
+
 def _name(text: str) -> str:
     """Return a valid name of a folder, also with a prefix; "" for no name."""
     if len(text) > LONGEST_NAME or text != text.strip(". ") or set(text) - set(file_name(text)):
@@ -136,10 +154,12 @@ class Domain(Table):
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
+    has_grid: ClassVar[bool] = True
     size: list[Positive] = Field(
         min_length=2,
         max_length=3,
-        description="sides [m]: [x, y] or [x, y, z]; omitted with spacing",
+        description="sides [m]: [x, y] or [x, y, z], rounded up to whole cells; omitted with "
+        "spacing",
     )
     resolution: int = Field(
         ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing"
@@ -165,6 +185,7 @@ class Domain(Table):
     periodic: list[Literal[False]] | None = Field(
         default=None, description="false along every axis"
     )
+    _size_in_scene: list[float] = PrivateAttr(default_factory=list)
 
     @model_validator(mode="before")
     @classmethod
@@ -186,6 +207,27 @@ class Domain(Table):
             "resolution": MOST_CELLS,
             "dimension": axes,
         } | {**data, "open": sides}
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _with_whole_cells(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Round sides up to whole cells, and keep those that the scene has."""
+        domain = handler(data)
+        if domain.spacing is not None or not cls.has_grid:
+            return domain
+        spacing = max(domain.size) / domain.resolution
+        sides = [side_of_whole_cells(side, spacing) for side in domain.size]
+        if sides == domain.size:
+            return domain
+        rounded = domain.model_copy(update={"size": sides})
+        rounded._size_in_scene = domain.size
+        return rounded
+
+    @property
+    def rounded_sides(self) -> list[tuple[int, float, float]]:
+        """Return axis, side in the scene and length [m] of each side that was rounded up."""
+        sides = zip(self._size_in_scene, self.size, strict=False)
+        return [(axis, given, side) for axis, (given, side) in enumerate(sides) if given != side]
 
     @property
     def boundless(self) -> bool:
@@ -616,21 +658,8 @@ class Scene(Table):
         )
 
     def _grid_complaints(self) -> list[Complaint]:
-        """Return errors of the grid: whole cells along each side, periodic axes."""
+        """Return errors of the grid: spacing, periodic axes."""
         complaints = self.domain.spacing_complaints()
-        for axis, side in enumerate(self.domain.size if not complaints else ()):
-            cells = side / self.spacing
-            if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
-                sides = [
-                    f"{n * self.spacing:.8g}"
-                    for n in (math.floor(cells), math.ceil(cells))
-                    if n > 0
-                ]
-                message = (
-                    f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: "
-                    f"{' and '.join(sides)}"
-                )
-                complaints.append(Complaint(("domain", "size", axis), side, message))
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
             complaints.append(
                 Complaint(

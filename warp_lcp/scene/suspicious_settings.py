@@ -92,6 +92,11 @@ def scene_notes(scene: Scene) -> Iterator[str]:
             f"physics.gravity = {gravity} is in m/s^2 (Earth: 9.81); if cm/s^2 were meant, it is "
             f"{0.01 * strength:g}"
         )
+    for axis, given, side in scene.domain.rounded_sides:
+        yield (
+            f"domain.size[{axis}] = {given:.8g} is rounded up to {side:.8g}, "
+            f"{scene.cell_counts[axis]} cells of {scene.spacing:.6g} m"
+        )
     if time.duration * time.frames_per_second < 1.0 - 1e-9:
         yield (
             f"time.duration = {time.duration:g} s is shorter than a frame, "
