@@ -11,8 +11,8 @@ import warp as wp
 from warp_lcp.granular import stress_kernels as kernels
 from warp_lcp.granular.stress import MOST_MOMENTUM, Stress
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, launch, loops_on_device
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 if TYPE_CHECKING:
     from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient

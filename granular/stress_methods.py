@@ -26,7 +26,7 @@ from warp_lcp.granular.stress_kernels import (
 from warp_lcp.granular.stress_layout import CONSTANTS
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.solve import OptionalMembers
+from warp_lcp.problem.solve_loop import WorkspaceDefaults
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import (
     Count,
@@ -49,7 +49,7 @@ APART = 3
 KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
 
-class StressWorkspace(OptionalMembers):
+class StressWorkspace(WorkspaceDefaults):
     """Workspace of a stress solve; it iterates on the problem's own field.
 
     The last stresses are the result, even if the solve fails; see

@@ -15,7 +15,7 @@ import warp_lcp as wl
 from default_run import by_turns
 from oracle import natural_residual
 from warp_lcp import deadline
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 S = wl.SolveStatus
 CRITERIA = wl.StoppingCriteria(rtol=1e-8, max_iterations=25, patience=25)
@@ -198,7 +198,7 @@ def test_a_solve_within_a_solve_ends_with_it(monkeypatch):
             assert deadline.time_is_up()
         assert not deadline.time_is_up()
         seconds[0] = 5
-        with pytest.raises(deadline.TimeIsUp):
+        with pytest.raises(deadline.DeadlineReached):
             deadline.check_time()
     assert deadline.seconds_left() == math.inf
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from warp_lcp.contacts.inverse_kinematics import InverseKinematics
-from warp_lcp.gallery.planted import Plant
+from warp_lcp.gallery.planted import PlantedSolution
 from warp_lcp.granular.stress_methods import METHODS as SAND
 from warp_lcp.grid import staggered
 from warp_lcp.material import density_correction
@@ -41,7 +41,7 @@ KINDS = [
     wl.CycleSettings,
     AlgebraicSettings,
     InverseKinematics,
-    Plant,
+    PlantedSolution,
 ]
 KINDS = [kind for kind in [*KINDS, *SAND.values()] if dataclasses.fields(kind)]
 # Values that are no numbers.

@@ -6,8 +6,8 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.problem.protocol import families
-from warp_lcp.problem.protocol import members as names_of
+from warp_lcp.problem.operator_protocol import families
+from warp_lcp.problem.operator_protocol import members as names_of
 
 A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
 X = [0.5, 1.5]  # 2 * 0.5 - 1.5 + 0.5 = 0 and -0.5 + 2 * 1.5 - 2.5 = 0

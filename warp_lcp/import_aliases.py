@@ -1,12 +1,13 @@
-"""Older names of modules: `import warp_lcp.qp` imports `warp_lcp.extras.qp`.
+"""Older names of modules and classes: `import warp_lcp.qp` imports `warp_lcp.extras.qp`.
 
 Scripts, notebooks and the README files of recorded problems use them, so they keep working. An
-alias is the same module, not a copy. Type checkers know the new names only.
+alias is the same module or class, not a copy. Type checkers know the new names only.
 """
 
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
@@ -14,6 +15,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MODULES = {
+    "warp_lcp.default": "warp_lcp.method_selection",
     "warp_lcp.distributed.petsc_matrix": "warp_lcp.extras.petsc_matrix",
     "warp_lcp.gallery.articulated_figure": "warp_lcp.contacts.articulated_figure",
     "warp_lcp.gallery.contact_models": "warp_lcp.rigid.contact_models",
@@ -23,16 +25,39 @@ MODULES = {
     "warp_lcp.gradients.jax": "warp_lcp.extras.gradients.jax",
     "warp_lcp.gradients.pytorch": "warp_lcp.extras.gradients.pytorch",
     "warp_lcp.gradients.tape": "warp_lcp.extras.gradients.tape",
+    "warp_lcp.grid.solids": "warp_lcp.grid.signed_distance",
     "warp_lcp.newton": "warp_lcp.extras.newton",
     "warp_lcp.newton.bodies": "warp_lcp.extras.newton.bodies",
     "warp_lcp.newton.shapes": "warp_lcp.extras.newton.shapes",
     "warp_lcp.newton.solver": "warp_lcp.extras.newton.solver",
+    "warp_lcp.problem.protocol": "warp_lcp.problem.operator_protocol",
+    "warp_lcp.problem.solve": "warp_lcp.problem.solve_loop",
+    "warp_lcp.problem.spare_workspace": "warp_lcp.problem.workspace_cache",
     "warp_lcp.qp": "warp_lcp.extras.qp",
     "warp_lcp.render.live": "warp_lcp.extras.live",
     "warp_lcp.render.usd": "warp_lcp.extras.usd",
     "warp_lcp.render.viewer": "warp_lcp.extras.viewer",
 }
 """The module that each older name stands for."""
+
+CLASSES = {
+    "warp_lcp.gallery": {
+        "Plant": "PlantedSolution",
+        "Prices": "OptionPrices",
+        "Published": "PublishedFigure",
+    },
+    "warp_lcp.problem.operator_protocol": {
+        "AppliesPlus": "HasApplyPlus",
+        "HasBlocks": "HasRestriction",
+        "HasColumns": "HasLowRankTerm",
+        "NamesComponents": "HasFloatingComponents",
+        "Relaxes": "HasSweep",
+        "StoresRounded": "HasStorageRounding",
+        "Versioned": "HasVersion",
+    },
+    "warp_lcp.problem_properties": {"Traits": "ProblemProperties"},
+}
+"""By module: the class that each older name stands for."""
 
 
 class AliasFinder(MetaPathFinder, Loader):
@@ -56,3 +81,20 @@ def install_aliases() -> None:
     """
     if not any(isinstance(finder, AliasFinder) for finder in sys.meta_path):
         sys.meta_path.insert(0, AliasFinder())
+
+
+def renamed_class(module: str, name: str) -> object:
+    """Return the class of an older name, with a DeprecationWarning.
+
+    Args:
+        module: where the name was looked up; its `__getattr__` calls this function.
+        name: the older name.
+
+    Raises:
+        AttributeError: the module never had the name.
+    """
+    new = CLASSES[module].get(name)
+    if new is None:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    warnings.warn(f"{module}.{name} is now {module}.{new}", DeprecationWarning, stacklevel=3)
+    return getattr(sys.modules[module], new)

@@ -20,7 +20,7 @@ import numpy as np
 from warp_lcp.cli import commands as cli
 from warp_lcp.distributed import collective
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.frames import frames
+from warp_lcp.frames import frame_folder
 from warp_lcp.scene import simulator as plug_ins
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Points, SimulationFailed, StepFailed
@@ -158,7 +158,7 @@ def trouble(dots: Dots) -> None:
         def full(*arguments: object) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        frames.FrameFolder.write_part = full
+        frame_folder.FrameFolder.write_part = full
 
 
 def main(words: list[str]) -> None:

@@ -16,7 +16,7 @@ from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.kernels.launch_graph import Task, run_table
+from warp_lcp.kernels.launch_graph import HostTask, run_table
 from warp_lcp.kernels.thread_pool import OperationTable
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
@@ -327,7 +327,7 @@ def memory_in_place(ranks):
 def as_on_devices(ranks):
     """Compare with ghost cells through host memory and unfused cycles."""
     fill, filling, fuses = Halo.fill, Halo.filling, StencilLevel.fuses
-    Halo.filling = lambda self, field: Task(partial(self.fill, field))
+    Halo.filling = lambda self, field: HostTask(partial(self.fill, field))
     Halo.fill = lambda self, field: (
         self._fill_through_host(field.reshape(self.shape))
         if isinstance(field, wp.array)

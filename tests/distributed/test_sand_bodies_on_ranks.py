@@ -10,8 +10,8 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress_layout import NUMBERS
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

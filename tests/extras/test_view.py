@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from small_runs import ball, write_run
 from warp_lcp.cli import commands as cli
 from warp_lcp.extras.viewer import Viewer
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import INSTALL
 

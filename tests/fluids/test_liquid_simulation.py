@@ -8,7 +8,7 @@ from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from warp_lcp.grid.particles import Particles
 from warp_lcp.scene.simulator import Simulator, simulators
-from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, StepFailed
+from warp_lcp.simulation import Cells, HasStages, Points, SimulationFailed, StepFailed
 
 DIMENSIONS = [2, 3]
 
@@ -346,7 +346,7 @@ def test_a_step_marks_its_stages() -> None:
             return nullcontext()
 
     plain, watched = dam(), dam()
-    assert isinstance(watched, Profiled)
+    assert isinstance(watched, HasStages)
     watched.watch = Names()
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [

@@ -12,9 +12,9 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

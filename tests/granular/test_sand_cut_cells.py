@@ -17,14 +17,14 @@ from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.granular.solids import SandSolids, SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
+from warp_lcp.granular.wall_friction import SandSolids, SandWalls
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.solids import Plane
+from warp_lcp.grid.signed_distance import Plane
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
-from warp_lcp.material.particle_assembly import Parts
+from warp_lcp.material.particle_assembly import GridComponents
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, DX, G = 0.01, 0.1, 9.81
@@ -314,7 +314,10 @@ def whole(simulation: SandSimulation) -> SandSimulation:
         simulation.grid, simulation.boundary.cut.solids, simulation.boundary, scene.wall_frictions()
     )
     return SandSimulation(
-        scene, simulation.grid, Parts(simulation.boundary, solids=solids), simulation.particles
+        scene,
+        simulation.grid,
+        GridComponents(simulation.boundary, solids=solids),
+        simulation.particles,
     )
 
 

@@ -10,8 +10,8 @@ import pytest
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls, wall_faces
-from warp_lcp.grid.part import GridPart
+from warp_lcp.granular.wall_friction import SandWalls, wall_faces
+from warp_lcp.grid.grid_part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -13,8 +13,8 @@ import scipy.optimize
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

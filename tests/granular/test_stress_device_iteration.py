@@ -13,10 +13,10 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_device_iteration import StressDeviceIteration
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient, MomentumWorkspace
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.motion import Rotation, Translation
-from warp_lcp.grid.solids import Box, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 

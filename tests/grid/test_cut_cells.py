@@ -22,7 +22,7 @@ from cut_cell_tools import (
 import warp_lcp as wl
 from warp_lcp.grid import node_distance, staggered
 from warp_lcp.grid.node_distance_kernels import FAR
-from warp_lcp.grid.solids import Box, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.voxelize import voxelize
 
 

@@ -10,9 +10,9 @@ from cut_cell_tools import grid_of
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.moving_mesh_distance import FlatCells, PlacedMesh, tables_of
+from warp_lcp.grid.moving_mesh_distance import FlatCells, MovingMesh, tables_of
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler
-from warp_lcp.grid.solids import Box, Placement, Sphere, TriangleMesh, Union
+from warp_lcp.grid.signed_distance import Box, Placement, Sphere, TriangleMesh, Union
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
 
@@ -29,7 +29,7 @@ def compare_meshes(seed: int, dimension: int) -> None:
         surface=builtin_mesh("torus"), placement=placement, invert=bool(rng.random() < 0.2)
     )
     ball = Sphere(center=rng.uniform(0.2, 0.7, dimension), radius=0.15)
-    table, sampler = PlacedMesh(grid, 2, mesh), NodeSampler(grid)
+    table, sampler = MovingMesh(grid, 2, mesh), NodeSampler(grid)
     fields = [NodeDistances(grid, second=True) for _ in range(2)]
     for field in fields:
         sampler.enter(field, 1, ball)

@@ -6,10 +6,10 @@ import warp as wp
 
 from default_run import covering
 from warp_lcp.grid.distributed_distance import enter_layers, layer_of, measure_together
+from warp_lcp.grid.grid_part import GridPart
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.node_distance_kernels import FAR
-from warp_lcp.grid.part import GridPart
-from warp_lcp.grid.solids import Placement, TriangleMesh
+from warp_lcp.grid.signed_distance import Placement, TriangleMesh
 from warp_lcp.grid.staggered import StaggeredGrid
 
 COUNTS, DX = (18, 14, 11), 0.05

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from grid_fields import distances
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import (
+from warp_lcp.grid.signed_distance import (
     Box,
     Capsule,
     Geometry,

@@ -19,8 +19,8 @@ from warp_lcp.kernels import joined_graphs as module
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.joined_graphs import joined
 from warp_lcp.kernels.launch_graph import LaunchGraph, launch
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 emulated = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"

@@ -25,7 +25,7 @@ from warp_lcp.krylov.conjugate_gradient import (
     end_kernel,
 )
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.reduced.active_set_kernels import DIVIDE
+from warp_lcp.subproblems.active_set_kernels import DIVIDE
 
 SHAPE = (5, 6, 7)
 

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import LinearOperator as Linear
 import warp_lcp as wl
 from default_run import covering
 from oracle import boxed, lemke
-from warp_lcp.problem.protocol import families, takes
+from warp_lcp.problem.operator_protocol import families, takes
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=20_000, patience=5000)
 N = 8

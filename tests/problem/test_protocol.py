@@ -10,12 +10,12 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import lemke
-from warp_lcp.problem.protocol import (
+from warp_lcp.problem.operator_protocol import (
     CAPABILITIES,
     FAMILIES,
     HasCells,
-    HasColumns,
     HasLayout,
+    HasLowRankTerm,
     HasRows,
     HasScale,
     families,
@@ -53,7 +53,7 @@ class Least:
 def shown(capability, n):
     """Return an operator of the library with one capability, SPD with n unknowns."""
     grid = wl.GridPoisson(np.ones((n, 1), dtype=int), shift=0.5, device="cpu", dtype=wp.float64)
-    if capability is HasColumns:
+    if capability is HasLowRankTerm:
         return wl.SumOperator(
             grid, wl.LowRankOperator(np.linspace(0.1, 1.0, n).reshape(n, 1, 1), [2.0], device="cpu")
         )
@@ -85,7 +85,7 @@ def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
     with_it = {
         None: (),
         HasCells: (HasCells, HasLayout),
-        HasColumns: (HasColumns, HasCells, HasLayout),
+        HasLowRankTerm: (HasLowRankTerm, HasCells, HasLayout),
     }.get(capability, (capability,))
     matrix, operator = dense(A), Least(A, *with_it)
     b = np.random.default_rng(7).standard_normal(A.shape)
@@ -120,7 +120,7 @@ def test_tables_say_what_operators_have():
     for method in wl.METHODS.values():
         assert families(method) == {family for family, A in ours.items() if takes(method, A)}
     for A in ours.values():
-        assert not set(members(HasColumns)) & set(dir(A))
+        assert not set(members(HasLowRankTerm)) & set(dir(A))
     assert set(CAPABILITIES) >= ASKED
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 import warp_lcp as wl
 from matrices import operator_of
 from oracle import lemke, natural_scale
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.residual_scaling import scale_by_products, scale_of_matrix
 

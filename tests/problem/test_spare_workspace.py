@@ -13,9 +13,9 @@ import warp as wp
 
 import warp_lcp as wl
 from default_run import few
-from warp_lcp.problem import spare_workspace
+from warp_lcp.problem import workspace_cache
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.spare_workspace import KEPT, MOST_CELLS
+from warp_lcp.problem.workspace_cache import KEPT, MOST_CELLS
 
 pytestmark = pytest.mark.cpu_form("workspaces are kept on the CPU")
 
@@ -203,7 +203,7 @@ def test_problems_without_copies(monkeypatch):
         for _ in range(3):
             wl.solve(problem, method)
             assert problem.form is None and KEPT.workspace is None
-    monkeypatch.setattr(spare_workspace, "MOST_CELLS", 8 * 9 * 11 - 1)
+    monkeypatch.setattr(workspace_cache, "MOST_CELLS", 8 * 9 * 11 - 1)
     for _ in range(3):
         wl.solve(wl.LCP(A, b), method)
         assert KEPT.workspace is None

@@ -8,9 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.grid.signed_distance import Box, Sphere
 from warp_lcp.rigid.body import BodyStates, RigidBody
-from warp_lcp.rigid.contact_detection import ContactDetection, Place, between, close_pairs, on_plane
+from warp_lcp.rigid.contact_detection import (
+    ContactDetection,
+    UncheckedPose,
+    between,
+    close_pairs,
+    on_plane,
+)
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contacts import SAME_PLACE, ContactMemory
 from warp_lcp.rigid.mass_properties import MassProperties
@@ -57,7 +63,7 @@ def test_balls_touch_where_each_two_of_them_do():
     bodies = placed(at, rng)
     ways = rng.uniform(0.0, 0.02, n)
     found = ContactDetection(bodies, shapes, (), 3).find(0.0, ways, np.zeros(0), 0.01)
-    places = [Place(body.rotation, body.position) for body in bodies]
+    places = [UncheckedPose(body.rotation, body.position) for body in bodies]
     expected = {}
     for i in range(n):
         for j in range(i):
@@ -148,7 +154,11 @@ def test_balls_touch_planes_where_each_of_them_does():
     for i, body in enumerate(bodies):
         for point, normal in zip(planes.points + 0.1 * np.eye(3)[1], normals, strict=True):
             touch = on_plane(
-                shapes[i], Place(body.rotation, body.position), point, normal, 0.01 + ways[i]
+                shapes[i],
+                UncheckedPose(body.rotation, body.position),
+                point,
+                normal,
+                0.01 + ways[i],
             )
             expected += [
                 (i, *touch.point[k], *touch.normal[k], touch.gap[k]) for k in range(len(touch))

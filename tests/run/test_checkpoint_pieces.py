@@ -8,7 +8,7 @@ from small_runs import run_into
 from warp_lcp.distributed.collective import Collective
 from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import fingerprint
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 
@@ -120,7 +120,7 @@ def test_old_pieces_go_with_their_checkpoint(tmp_path):
 
 
 def test_a_simulator_that_cannot_join_pieces_says_so(dots, scene_file, tmp_path):
-    out, watcher = tmp_path / "out", Lines(Console(quiet=True))
+    out, watcher = tmp_path / "out", ProgressLines(Console(quiet=True))
     scene = load_scene(scene_file)
     run_into(scene, out, observer=watcher, last_frame=1)
     for file in (out / "checkpoints").iterdir():

@@ -15,12 +15,12 @@ from rich.console import Console
 
 from small_runs import read_record, run_contents, run_into
 from warp_lcp.frames import vtu as vtu_module
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.run import loop as run_module
 from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.folder import OutputError, RunRecord
-from warp_lcp.run.profile import Profile
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.profile import Profiler
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.scene import SceneError, Time
 from warp_lcp.scene.scene_file import load_scene
@@ -29,7 +29,7 @@ from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
 VOLATILE = "seconds"  # the only column of the log that differs in a repetition
 
 
-class Watcher(Lines):
+class Watcher(ProgressLines):
     """Observer that stores the remarks."""
 
     def __init__(self) -> None:
@@ -425,7 +425,7 @@ def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(
 
 
 def test_a_profile_counts_every_stage(scene_file, tmp_path):
-    out, profile = tmp_path / "out", Profile("cpu")
+    out, profile = tmp_path / "out", Profiler("cpu")
     result = go(scene_file, out, profile=profile)
     written = json.loads((out / "profile.json").read_text())
     assert (written["device"], written["steps"], written["seconds"]) == (
@@ -457,7 +457,7 @@ def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
         return simulation
 
     monkeypatch.setattr(type(dots), "create", watched)
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     go(scene_file, tmp_path / "out", last_frame=1)
     assert {type(watch) for watch in seen} == {NoStopwatch}
     assert not (tmp_path / "out" / "profile.json").exists()

@@ -9,7 +9,7 @@ import pytest
 
 from command_line import invoke
 from warp_lcp.run import tune as tuning
-from warp_lcp.run.trial import Differences, Look, Trial, look_times, spread, trial
+from warp_lcp.run.trial import MaterialSnapshot, RunDifferences, Trial, look_times, spread, trial
 from warp_lcp.scene.presets import price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
@@ -21,7 +21,7 @@ SMALL = ["domain.resolution=32", "time.duration=0.2"]
 def made(distance: float, seconds: float, drift: float = 0.0) -> Trial:
     """Return a run whose distance from made(0.0, ...) is `distance`."""
     mass = np.array([1.0 - distance, distance])
-    looks = tuple(Look(time, mass, 1.0, 0.5) for time in (0.0, 0.1, 0.2))
+    looks = tuple(MaterialSnapshot(time, mass, 1.0, 0.5) for time in (0.0, 0.1, 0.2))
     return Trial(seconds, 10, 10, 10, looks, 0.0, volume=(1.0, 1.0 + drift))
 
 
@@ -49,7 +49,7 @@ def test_the_distance_of_a_point_that_moves(moved: float, distance: float) -> No
             1,
             1,
             tuple(
-                Look(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x)
+                MaterialSnapshot(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x)
                 for t in (0.0, 1.0)
             ),
             0.0,
@@ -110,7 +110,7 @@ class Model:
         )
 
 
-def tuned(monkeypatch: pytest.MonkeyPatch, model: Model) -> tuning.Tuning:
+def tuned(monkeypatch: pytest.MonkeyPatch, model: Model) -> tuning.TuningResult:
     monkeypatch.setattr(tuning, "trial", model)
     return tuning.tune(load_scene("dam-break-2d"), accuracy="standard", device="cpu")
 
@@ -262,7 +262,7 @@ def test_the_reference_is_not_doubted_where_its_bounds_are_kept(
     found = tuned(monkeypatch, model)
     assert model.references == 1
     assert found.noise is None
-    assert found.bounds == Differences(0.03, 0.05)
+    assert found.bounds == RunDifferences(0.03, 0.05)
     assert found.verdict("standard")[0].startswith("standard: time.cfl=8 ")
 
 

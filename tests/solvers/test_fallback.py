@@ -15,8 +15,8 @@ import warp as wp
 import warp_lcp as wl
 from default_run import few
 from oracle import natural_residual
-from warp_lcp.default_chain import PathCreeps
-from warp_lcp.problem.solve import Step, WorkspaceBase, method_name
+from warp_lcp.default_chain import CentralPathStalls
+from warp_lcp.problem.solve_loop import Step, WorkspaceBase, method_name
 from warp_lcp.solvers.fallback import FIRST, Progress
 
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -291,8 +291,8 @@ def test_a_slow_interior_point_path_triggers_the_fallback():
         progress = Progress(None, 0.0)
         for k in range(12):
             progress.record(factor**k)
-        assert PathCreeps()(progress) is creeps
-        assert not PathCreeps(steps=30)(progress)
+        assert CentralPathStalls()(progress) is creeps
+        assert not CentralPathStalls(steps=30)(progress)
 
 
 def test_a_workspace_is_used_again():

@@ -10,8 +10,8 @@ import warp as wp
 import warp_lcp as wl
 from method_steps import begun
 from oracle import assemble
-from warp_lcp.reduced.grid_step_kernels import conjugate
 from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.subproblems.grid_step_kernels import conjugate
 
 
 class PlainMPRGP:

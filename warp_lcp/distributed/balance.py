@@ -28,7 +28,7 @@ Parts = list[list[int]]  # cells of each box along x, y, z
 
 
 @dataclass(frozen=True)
-class Load:
+class WorkLoad:
     """Work of a step, by blocks of cells.
 
     Cuts lie between blocks, so that the levels of multigrid that ranks share end at them.
@@ -200,7 +200,7 @@ class Balance:
             return None
         # Each rank searches its share of the box counts; the best result of all ranks counts.
         edge = edge_of_blocks(now.counts, part.ranks.size)
-        load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
+        load = WorkLoad(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
         # The present boxes stay if no boxes end between blocks.
         least, cut = min(

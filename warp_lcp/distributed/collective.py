@@ -35,7 +35,7 @@ class RankFailed(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Failure:
+class RankException:
     """Error of a rank.
 
     Args:
@@ -166,16 +166,18 @@ class Collective:
         self._raised = _joined(fresh or failed, named)
         raise self._raised from error
 
-    def _failure(self, error: BaseException | None) -> Failure | None:
+    def _failure(self, error: BaseException | None) -> RankException | None:
         if error is None:
             return None
         planned = isinstance(error, self._planned)
         kind = type(error) if planned else RankFailed
         text = str(error) if planned else f"{type(error).__name__}: {error}"
         errno = error.errno if isinstance(error, OSError) else None
-        return Failure(kind, text, errno, planned, error is self._raised)
+        return RankException(kind, text, errno, planned, error is self._raised)
 
-    def _meet(self, error: BaseException | None, failure: Failure | None) -> list[Failure | None]:
+    def _meet(
+        self, error: BaseException | None, failure: RankException | None
+    ) -> list[RankException | None]:
         """Gather the outcome of a block on every rank."""
         if self.ranks.size == 1:
             return [failure]
@@ -184,7 +186,9 @@ class Collective:
                 met = finish(self._own.comm.Ibarrier(), math.inf if error is None else PATIENCE)
             if error is not None and not met:
                 self._end_all(error)
-            found: list[tuple[int, Failure | None]] = self._own.collect((self._depth, failure))
+            found: list[tuple[int, RankException | None]] = self._own.collect(
+                (self._depth, failure)
+            )
             if max(depth for depth, _ in found) <= self._depth or failure is None:
                 return [other for _, other in found]
             # A rank that failed between two blocks meets ranks that were still inside one: they
@@ -209,7 +213,7 @@ class Collective:
         self.ranks.comm.Abort(1)
 
 
-def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
+def _joined(failed: list[tuple[int, RankException]], named: bool) -> BaseException:
     """Return one exception for the failures of some ranks."""
     first = failed[0][1]
     texts = list(_lines(failed)) if named else [first.text]
@@ -221,7 +225,7 @@ def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
     return error
 
 
-def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
+def _lines(failed: list[tuple[int, RankException]]) -> Iterator[str]:
     """Yield a line for each different message."""
     ranks: dict[str, list[int]] = {}
     for rank, failure in failed:

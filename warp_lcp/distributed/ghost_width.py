@@ -46,7 +46,7 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
     return worst
 
 
-class Refill:
+class GhostLayerExchange:
     """Halo exchange of ghost layers during velocity extrapolation.
 
     The extrapolation calls it after every layer. Ghost layers are filled before wrong values in

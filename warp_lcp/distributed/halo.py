@@ -18,7 +18,7 @@ from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
+from warp_lcp.kernels.launch_graph import HostTask, Launch, launch_now
 from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
@@ -144,9 +144,9 @@ class Halo:
         )
 
     @cached_property
-    def gathering(self) -> Gathering:
+    def gathering(self) -> GridGather:
         """Gathering of the fields of all ranks on every rank."""
-        return Gathering(self.decomposition)
+        return GridGather(self.decomposition)
 
     def fill(self, field: DeviceArray | np.ndarray) -> None:
         """Halo exchange: fill the ghost cells of a contiguous field; collective.
@@ -160,15 +160,15 @@ class Halo:
             return
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
-    def filling(self, field: DeviceArray) -> Task:
+    def filling(self, field: DeviceArray) -> HostTask:
         """Return the halo exchange of a field, to run now or within a recorded program.
 
         For more than one rank.
         """
         if field.device.is_cuda:
-            return Task(partial(self.fill, field))
+            return HostTask(partial(self.fill, field))
         assert self._forest is not None
-        return Task(
+        return HostTask(
             partial(self.fill, field),
             partial(exchanging, self._forest, field.numpy(), field.numpy()),
         )
@@ -207,7 +207,7 @@ class Halo:
         return slabs
 
 
-class Gathering:
+class GridGather:
     """Gathers a field of all boxes into one field of the whole grid on every rank.
 
     Both fields have one layer of ghost cells.
@@ -237,11 +237,11 @@ class Gathering:
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def collecting(self, own_part: DeviceArray, whole: DeviceArray) -> Task:
+    def collecting(self, own_part: DeviceArray, whole: DeviceArray) -> HostTask:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
-            return Task(partial(self.collect, own_part, whole))
-        return Task(
+            return HostTask(partial(self.collect, own_part, whole))
+        return HostTask(
             partial(self.collect, own_part, whole),
             partial(exchanging, self._forest, own_part.numpy(), whole.numpy()),
         )

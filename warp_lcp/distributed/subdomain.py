@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.balance import Balance
-from warp_lcp.distributed.ballistic_fragments import TreesAtCuts
+from warp_lcp.distributed.ballistic_fragments import FragmentMerger
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.ghost_width import Refill, too_far
+from warp_lcp.distributed.ghost_width import GhostLayerExchange, too_far
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchanging_all
@@ -21,14 +21,14 @@ from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.repartition import cuts_of, migrate
-from warp_lcp.distributed.solids import boundary_of_part
+from warp_lcp.distributed.subdomain_boundary import boundary_of_part
 from warp_lcp.grid.cell_box import CellBox
-from warp_lcp.grid.part import BodyNumbers, Corner, FieldT, GridPart
+from warp_lcp.grid.grid_part import BodyNumbers, Corner, FieldT, GridPart
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import Task, is_recording, launch, run_table
+from warp_lcp.kernels.launch_graph import HostTask, is_recording, launch, run_table
 from warp_lcp.kernels.thread_pool import Operation, OperationTable, team
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, convert
@@ -153,7 +153,7 @@ class Subdomain(GridPart):
         self._fillings: dict[Hashable, OperationTable] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: StarForest | None = None
-        self._trees: TreesAtCuts | None = None
+        self._trees: FragmentMerger | None = None
         self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # key: layers around the box
         for axis in decomposition.cut_axes:
             least, most = (
@@ -303,12 +303,12 @@ class Subdomain(GridPart):
             for name, values in fields.items()
         }
 
-    def refill(self) -> Refill:
+    def refill(self) -> GhostLayerExchange:
         """Return a function that fills ghost cells during velocity extrapolation.
 
         It exchanges halos before wrong values in the ghost cells can reach the box.
         """
-        return Refill(self)
+        return GhostLayerExchange(self)
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
         """Return the largest displacement in a step that may leave the ghost layers.
@@ -459,10 +459,10 @@ class Subdomain(GridPart):
                 return
         self.filling(*fields, forest=forest).launch()
 
-    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
+    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> HostTask:
         """Return `fill` over a star forest, to run now or in a recorded program."""
         operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
-        return Task(partial(_fill, forest, fields), operation)
+        return HostTask(partial(_fill, forest, fields), operation)
 
     def _fill_again(self, forest: StarForest, fields: Sequence[wp.array]) -> None:
         """Fill fields that were filled before, by the exchange set up then."""
@@ -638,7 +638,7 @@ class Subdomain(GridPart):
     ) -> BodyNumbers:
         """Join the trees of cells that extend over several boxes; collective."""
         if self._trees is None:
-            self._trees = TreesAtCuts(self)
+            self._trees = FragmentMerger(self)
         return self._trees.join(trees, seen, parent, number, held)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:

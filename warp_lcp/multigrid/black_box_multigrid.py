@@ -30,7 +30,7 @@ from warp_lcp.multigrid.dense_inverse import DenseInverse
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
-from warp_lcp.problem.protocol import HasStencil, Operator, has
+from warp_lcp.problem.operator_protocol import HasStencil, Operator, has
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/lines.h")
 FILL = KERNELS["lines.fill"]

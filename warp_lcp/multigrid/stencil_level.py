@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_lcp.kernels import BoundKernel, Rows, StencilKernel
 from warp_lcp.kernels.fields import nothing, zeros
-from warp_lcp.kernels.launch_graph import Task
-from warp_lcp.kernels.memory import KernelArgument
+from warp_lcp.kernels.launch_graph import HostTask
+from warp_lcp.kernels.recorded_arguments import KernelArgument
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
@@ -186,7 +186,7 @@ class StencilLevel:
         # The kernel keeps the rows alive, so that their id stays unique.
         return self._once((coarse, projected, id(rows)), make)
 
-    def filling(self, name: str) -> list[BoundKernel | Task]:
+    def filling(self, name: str) -> list[BoundKernel | HostTask]:
         """Return the exchange that fills the ghost cells of x or t."""
         return self._once(name, lambda: self.stencil.fillings({"x": self.x, "t": self.t}[name]))
 
@@ -213,7 +213,7 @@ class StencilLevel:
 
     def pair(
         self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False
-    ) -> Iterator[BoundKernel | Task]:
+    ) -> Iterator[BoundKernel | HostTask]:
         """Yield two sweeps, x to t and back; x is taken as 0 if from_zero."""
         if from_zero and self.joins_sweeps:
             yield self._two_sweeps(weights, projected=projected)
@@ -374,7 +374,7 @@ class StencilLevel:
         )
         return self._once(("correct and sweep", coarse, omega, projected), make)
 
-    def coarsened(self, coarse: StencilLevel) -> Iterator[BoundKernel | Task]:
+    def coarsened(self, coarse: StencilLevel) -> Iterator[BoundKernel | HostTask]:
         """Yield the stages that compute the next level."""
         yield self.coarsening(
             coarse, self.settings.over_correction, self.settings.dirichlet_scaling

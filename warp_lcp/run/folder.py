@@ -30,7 +30,7 @@ from warp_lcp.files.atomic import (
 )
 from warp_lcp.files.size_limits import one_line
 from warp_lcp.files.tables import Tables
-from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.frames.frame_folder import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import (
     CHECKPOINT_FILE,

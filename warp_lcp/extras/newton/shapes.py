@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import (
+from warp_lcp.grid.signed_distance import (
     Box,
     Capsule,
     Geometry,
