@@ -280,15 +280,15 @@ def test_old_names_of_modules_and_methods_warn_and_give_the_new_ones():
     with pytest.raises(AttributeError, match="no attribute 'Trace'"):
         staggered.Trace  # noqa: B018
 
-    class Doubled:
+    class WithOldMethodName:
         def twice(self, number: int) -> int:
             return 2 * number
 
         double = renamed_method("double", twice)
 
-    class Own(Doubled):
+    class SubclassOfRenamed(WithOldMethodName):
         def twice(self, number: int) -> int:
             return 2 * number + 1
 
     with pytest.warns(DeprecationWarning, match=r"Own\.double is now Own\.twice"):
-        assert Own().double(2) == 5
+        assert SubclassOfRenamed().double(2) == 5

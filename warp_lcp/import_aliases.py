@@ -1,13 +1,12 @@
-"""Older names of modules and classes: `import warp_lcp.qp` imports `warp_lcp.extras.qp`.
+"""Older names of modules: `import warp_lcp.qp` imports `warp_lcp.extras.qp`.
 
 Scripts, notebooks and the README files of recorded problems use them, so they keep working. An
-alias is the same module or class, not a copy. Type checkers know the new names only.
+alias is the same module, not a copy. Type checkers know the new names only.
 """
 
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
@@ -40,25 +39,6 @@ MODULES = {
 }
 """The module that each older name stands for."""
 
-CLASSES = {
-    "warp_lcp.gallery": {
-        "Plant": "PlantedSolution",
-        "Prices": "OptionPrices",
-        "Published": "PublishedFigure",
-    },
-    "warp_lcp.problem.operator_protocol": {
-        "AppliesPlus": "HasApplyPlus",
-        "HasBlocks": "HasRestriction",
-        "HasColumns": "HasLowRankTerm",
-        "NamesComponents": "HasFloatingComponents",
-        "Relaxes": "HasSweep",
-        "StoresRounded": "HasStorageRounding",
-        "Versioned": "HasVersion",
-    },
-    "warp_lcp.problem_properties": {"Traits": "ProblemProperties"},
-}
-"""By module: the class that each older name stands for."""
-
 
 class AliasFinder(MetaPathFinder, Loader):
     """Finder and loader of modules by their older names."""
@@ -81,20 +61,3 @@ def install_aliases() -> None:
     """
     if not any(isinstance(finder, AliasFinder) for finder in sys.meta_path):
         sys.meta_path.insert(0, AliasFinder())
-
-
-def renamed_class(module: str, name: str) -> object:
-    """Return the class of an older name, with a DeprecationWarning.
-
-    Args:
-        module: where the name was looked up; its `__getattr__` calls this function.
-        name: the older name.
-
-    Raises:
-        AttributeError: the module never had the name.
-    """
-    new = CLASSES[module].get(name)
-    if new is None:
-        raise AttributeError(f"module {module!r} has no attribute {name!r}")
-    warnings.warn(f"{module}.{name} is now {module}.{new}", DeprecationWarning, stacklevel=3)
-    return getattr(sys.modules[module], new)

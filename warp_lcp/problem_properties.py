@@ -11,7 +11,6 @@ import scipy.linalg
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.import_aliases import renamed_class
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
@@ -22,6 +21,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.operator_protocol import HasRows, HasStencil, declared, has, layout_of, takes
 from warp_lcp.problem.solve_loop import solve
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.settings import renamed_names
 from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.subproblems.host_system import suits
@@ -328,6 +328,4 @@ def _definiteness(A: Matrix, symmetric: bool, d: np.ndarray) -> str:
     return "indefinite"
 
 
-def __getattr__(name: str) -> object:
-    """Return a class by its older name."""
-    return renamed_class(__name__, name)
+__getattr__ = renamed_names(__name__, Traits="ProblemProperties")

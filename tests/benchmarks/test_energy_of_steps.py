@@ -113,7 +113,7 @@ SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], shorter than the normal step
 MOST = 1e-3  # share of the total that a step may add
 
 
-class Rise(NamedTuple):
+class EnergyGain(NamedTuple):
     """Energy gained by a step of a length [s], and its part from density correction.
 
     Both are divided by the total energy.
@@ -124,12 +124,12 @@ class Rise(NamedTuple):
     displaced: float
 
 
-def along(ledger: EnergyBalance, moments: list[float], dt_max: float) -> list[Rise]:
+def along(ledger: EnergyBalance, moments: list[float], dt_max: float) -> list[EnergyGain]:
     """Step from moment to moment and try steps of all lengths at each.
 
     Also rows of short and normal steps in turns.
     """
-    simulation, rises = ledger.simulation, list[Rise]()
+    simulation, rises = ledger.simulation, list[EnergyGain]()
     for moment in moments:
         while simulation.time < moment or simulation.step_count == 0:
             ledger.step(min(simulation.stable_dt(), dt_max))
@@ -141,7 +141,7 @@ def along(ledger: EnergyBalance, moments: list[float], dt_max: float) -> list[Ri
         for row in [*rows, (0.0, 1e-6) * 2, (0.0, 1e-4) * 2]:
             for length in row:
                 done = ledger.step(length or min(simulation.stable_dt(), dt_max))
-                rises.append(Rise(length, done.gained / total, done.displaced / total))
+                rises.append(EnergyGain(length, done.gained / total, done.displaced / total))
             ledger.set_back(state, energy)
     return rises
 

@@ -24,7 +24,7 @@ from liquids_on_ranks import (
     sponge,
 )
 from scipy.spatial import cKDTree
-from turns import Seat
+from turns import RankInTurn
 
 from small_liquids import box
 from warp_lcp.distributed.decomposition import Decomposition
@@ -118,7 +118,7 @@ def single(model_) -> ParticleSimulation:
 def alone(model_, **options):
     """Return a simulation on one rank, which needs no MPI."""
     return simulators()[model_.scene.simulator].create(
-        model_, device="cpu", folder=Path(), ranks=Ranks(Seat(0, 1)), **options
+        model_, device="cpu", folder=Path(), ranks=Ranks(RankInTurn(0, 1)), **options
     )
 
 
@@ -301,7 +301,7 @@ def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
     for ranks, what in ((2, "keep,go-on"), (4, "go-on")):
         assert mpi(ranks, PROGRAM, what, tmp_path, environment=environment).returncode == 0
-    liquids_on_ranks.go_on(Ranks(Seat(0, 1)), tmp_path)
+    liquids_on_ranks.go_on(Ranks(RankInTurn(0, 1)), tmp_path)
     for name in RESUMED:
         whole = json.loads((tmp_path / f"{name}_whole.json").read_text())[5:]
         for ranks in (1, 2, 4):
@@ -348,7 +348,7 @@ def test_a_source_keeps_its_cells_in_other_boxes_wherever_bodies_are():
 
 def test_too_large_velocities_are_detected_near_and_along_cuts():
     part = Subdomain(
-        Decomposition((40, 8, 1), Ranks(Seat(0, 2))),
+        Decomposition((40, 8, 1), Ranks(RankInTurn(0, 2))),
         spacing=0.1,
         dimension=2,
         device="cpu",

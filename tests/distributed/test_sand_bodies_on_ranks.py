@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from turns import Seat, on_ranks
+from turns import RankInTurn, on_ranks
 
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.ranks import Ranks
@@ -89,7 +89,7 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
         base = wp.array(np.where(index >= 0, SOLID, 0), dtype=wp.int8)
         return Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32))
 
-    def work(seat: Seat) -> list[np.ndarray]:
+    def work(seat: RankInTurn) -> list[np.ndarray]:
         boxes = Decomposition(grid.counts, Ranks(seat))
         part = Subdomain(boxes, spacing=DX, dimension=dimension, device="cpu", layers=LAYERS)
         here = tuple(

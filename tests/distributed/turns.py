@@ -9,7 +9,7 @@ import numpy as np
 WAIT = 60.0  # [s] limit of a wait
 
 
-class Table:
+class ExchangeTable:
     """Exchange of values between threads that take turns."""
 
     def __init__(self, size: int) -> None:
@@ -33,11 +33,11 @@ class Table:
             self.turn.acquire()
 
 
-class Seat:
+class RankInTurn:
     """Communicator and mailbox of a rank, as far as `Ranks` needs them."""
 
-    def __init__(self, rank: int, size: int, table: Table | None = None) -> None:
-        self.rank, self.size, self._table = rank, size, table or Table(size)
+    def __init__(self, rank: int, size: int, table: ExchangeTable | None = None) -> None:
+        self.rank, self.size, self._table = rank, size, table or ExchangeTable(size)
 
     def Allgather(self, mine: np.ndarray, everyone: np.ndarray) -> None:  # noqa: N802  mpi4py's name
         """Gather arrays."""
@@ -56,17 +56,17 @@ class Seat:
         return [laid[rank][self.rank] for rank in sorted(outgoing)]
 
 
-def on_ranks(size: int, work: Callable[[Seat], Any]) -> list[Any]:
+def on_ranks(size: int, work: Callable[[RankInTurn], Any]) -> list[Any]:
     """Return the results of some work on each rank.
 
     Only one rank computes at a time.
     """
-    table, results, errors = Table(size), [None] * size, []
+    table, results, errors = ExchangeTable(size), [None] * size, []
 
     def run(rank: int) -> None:
         with table.turn:
             try:
-                results[rank] = work(Seat(rank, size, table))
+                results[rank] = work(RankInTurn(rank, size, table))
             except BaseException as error:
                 errors.append(error)
                 table.barrier.abort()

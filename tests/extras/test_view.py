@@ -14,7 +14,7 @@ from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import INSTALL
 
 
-class Clock:
+class ManualClock:
     now = 0.0
 
     def __call__(self) -> float:
@@ -33,7 +33,7 @@ def folder(dots, tmp_path):
 @pytest.fixture
 def viewer(pyvista, folder):
     plotter = pyvista.Plotter(off_screen=True, window_size=[400, 300], lighting="none")
-    viewer = Viewer(Recording(folder), plotter, Clock())
+    viewer = Viewer(Recording(folder), plotter, ManualClock())
     yield viewer
     plotter.close()
 

@@ -336,7 +336,7 @@ def test_the_grid_methods_give_the_same_liquid(method: str) -> None:
 
 
 def test_a_step_marks_its_stages() -> None:
-    class Names:
+    class StageNames:
         def __init__(self) -> None:
             self.found: list[str] = []
 
@@ -347,7 +347,7 @@ def test_a_step_marks_its_stages() -> None:
 
     plain, watched = dam(), dam()
     assert isinstance(watched, HasStages)
-    watched.watch = Names()
+    watched.watch = StageNames()
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
         "diagnostics",

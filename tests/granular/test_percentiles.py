@@ -12,7 +12,7 @@ from warp_lcp.granular.simulator import percentile_place
 DEVICE = wp.get_device("cpu")
 
 
-class Points:
+class PointParticles:
     """Particles at given points, shape (n, 3)."""
 
     def __init__(self, points: np.ndarray) -> None:
@@ -24,7 +24,7 @@ class Points:
 
 def particles(points: np.ndarray) -> Any:
     """Return particles at given points."""
-    return Points(points)
+    return PointParticles(points)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -27,7 +27,7 @@ DIRECTIONS = {
 
 
 @dataclass(frozen=True)
-class Function:
+class FunctionSolid:
     """Solid whose distance is any function of points, shape (m, 3)."""
 
     value: Any
@@ -40,7 +40,7 @@ class Function:
 
     def moved(self, pose):
         inverse = pose.inverse()
-        return Function(lambda points: self.value(inverse.apply(points)))
+        return FunctionSolid(lambda points: self.value(inverse.apply(points)))
 
 
 def placed(geometry, *, separating=True, name="solid[0]", motion=None):

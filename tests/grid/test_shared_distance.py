@@ -15,7 +15,7 @@ from warp_lcp.grid.staggered import StaggeredGrid
 COUNTS, DX = (18, 14, 11), 0.05
 
 
-class Ranks:
+class RanksInTurn:
     """Several ranks in turn.
 
     `everyone` maps each rank to its values; `gather` returns them.
@@ -36,7 +36,7 @@ def part_of(rank, size, everyone):
         (end - first, *COUNTS[1:]), DX, 3, "cpu", origin=(first, 0, 0), whole=COUNTS
     )
     object.__setattr__(grid, "part", GridPart(grid))
-    grid.part.ranks = Ranks(rank, size, everyone)
+    grid.part.ranks = RanksInTurn(rank, size, everyone)
     return grid
 
 

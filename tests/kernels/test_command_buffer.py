@@ -13,7 +13,7 @@ from warp_lcp.kernels.vectors import ADD, Reduction, rows_of
 DEVICE = wp.get_device("cpu")
 
 
-class Others:
+class ThreefoldRanks:
     """Communicator whose other ranks have three times this rank's values."""
 
     def sum(self, values):
@@ -39,7 +39,7 @@ def test_a_task_runs_between_the_launches_around_it_each_time():
 def test_sums_are_of_all_parts():
     a = wp.array([1.0, 2.0, 3.0], dtype=wp.float64, device=DEVICE)
     scalars = wp.full(3, 7.0, dtype=wp.float64, device=DEVICE)
-    Reduction(3, DEVICE, scalars, comm=Others()).dot(a, a, 1)
+    Reduction(3, DEVICE, scalars, comm=ThreefoldRanks()).dot(a, a, 1)
     assert scalars.numpy().tolist() == [7.0, 56.0, 7.0]
 
 

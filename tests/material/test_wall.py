@@ -11,7 +11,7 @@ GRID = StaggeredGrid((5, 6, 1), 0.1, 2, "cpu")
 CEILING = GRID.counts[1] + 1  # row of the ceiling's faces
 
 
-class Air:
+class AirAndFluidBox:
     """Box in 2-D of AIR and FLUID cells.
 
     Every open face that touches FLUID has been projected to one velocity.
@@ -78,7 +78,7 @@ TOP = [(x, y) for x in range(5) for y in (4, 5)]
 def test_closed_faces_of_liquid_cells(
     separating: int, state: int, speed: float, expected: float
 ) -> None:
-    air = Air(cells(*TOP), (0.0, speed))
+    air = AirAndFluidBox(cells(*TOP), (0.0, speed))
     air.separating.fill_(separating)
     air.contact.fill_(state)
     _, v = air.extend()
@@ -91,7 +91,7 @@ def test_closed_faces_of_liquid_cells(
 def test_closed_faces_of_air_lose_only_what_goes_into_the_wall(
     separating: int, speed: float, expected: float
 ) -> None:
-    air = Air(cells((2, 2), (2, 3)), (0.0, speed))
+    air = AirAndFluidBox(cells((2, 2), (2, 3)), (0.0, speed))
     air.separating.fill_(separating)
     _, v = air.extend()
     assert v[1, 3] == pytest.approx(expected)
@@ -99,14 +99,14 @@ def test_closed_faces_of_air_lose_only_what_goes_into_the_wall(
 
 def test_a_held_cell_follows_a_moving_wall_both_ways() -> None:
     for wall in (0.25, -0.25):
-        air = Air(cells(*TOP), (0.0, 0.1))
+        air = AirAndFluidBox(cells(*TOP), (0.0, 0.1))
         air.contact.fill_(HELD)
         _, v = air.extend(wall_velocity=wall)
         assert v[CEILING, 1:-1] == pytest.approx(wall)
 
 
 def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
-    air = Air(cells(*TOP), (0.0, -0.1))
+    air = AirAndFluidBox(cells(*TOP), (0.0, -0.1))
     air.contact.fill_(RELEASED)
     _, v = air.extend(wall_velocity=-0.25)
     assert v[CEILING, 1:-1] == pytest.approx(-0.25)
@@ -125,7 +125,7 @@ def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
 def test_liquid_at_rest_at_a_wall_does_not_follow_liquid_that_leaves(
     separating: int, state: int, weight: float, own_speed: float, expected: float
 ) -> None:
-    air = Air(cells((0, 0)), (3.0, 0.0))
+    air = AirAndFluidBox(cells((0, 0)), (3.0, 0.0))
     air.separating.fill_(separating)
     air.contact.fill_(state)
     air.velocity[0][1, 1, 1:2].fill_(own_speed)
@@ -142,7 +142,7 @@ def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
 
     A drop above a pool at rest: extrapolating the pool over it would make it hang.
     """
-    air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
+    air = AirAndFluidBox(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
     for row in (3, 5):
         air.velocity[1][1, row, 3:4].fill_(-2.0)
         air.weights[1][1, row, 3:4].fill_(1.0)
@@ -193,7 +193,7 @@ def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
 
 
 def test_a_closed_face_is_no_source_of_spray() -> None:
-    air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
+    air = AirAndFluidBox(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
     air.velocity[0][1, 6, 1:2].fill_(3.0)
     air.weights[0][1, 6, 1:2].fill_(1.0)
     u, _ = air.extend()
@@ -202,7 +202,7 @@ def test_a_closed_face_is_no_source_of_spray() -> None:
 
 
 def test_tangential_flow_continues_into_the_wall() -> None:
-    air = Air(cells(*((x, y) for x in range(5) for y in range(2))), (0.75, 0.0))
+    air = AirAndFluidBox(cells(*((x, y) for x in range(5) for y in range(2))), (0.75, 0.0))
     u, v = air.extend()
     assert u[0, 2:-1] == pytest.approx(0.75)  # inside the floor
     assert u[1, 1] == pytest.approx(0.0)  # held by the left wall
@@ -211,7 +211,7 @@ def test_tangential_flow_continues_into_the_wall() -> None:
 
 
 def test_layers_end() -> None:
-    air = Air(cells(*((x, 0) for x in range(5))), (0.5, 0.0))
+    air = AirAndFluidBox(cells(*((x, 0) for x in range(5))), (0.5, 0.0))
     u, _ = air.extend(layers=2)
     assert u[4, 3] == pytest.approx(0.5)
     assert u[5, 3] == 0.0

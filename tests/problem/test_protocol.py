@@ -30,7 +30,7 @@ ASKED = {
 }
 
 
-class Least:
+class MinimalOperator:
     """Operator with the common members of another one, and some capabilities.
 
     It counts its calls. Without a layout it is user-defined, with plain fields.
@@ -87,7 +87,7 @@ def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
         HasCells: (HasCells, HasLayout),
         HasLowRankTerm: (HasLowRankTerm, HasCells, HasLayout),
     }.get(capability, (capability,))
-    matrix, operator = dense(A), Least(A, *with_it)
+    matrix, operator = dense(A), MinimalOperator(A, *with_it)
     b = np.random.default_rng(7).standard_normal(A.shape)
     problem = wl.LCP(operator, b)
     asked = getattr(cls, "supports", ())
@@ -130,7 +130,7 @@ def test_methods_that_messages_name_ask_for_nothing():
     MinimumMapNewton, and ProjectedJacobi for bounds affine in x: also what is used and recommended
     by default.
     """
-    operator = Least(shown(None, 3))
+    operator = MinimalOperator(shown(None, 3))
     assert takes(wl.MinimumMapNewton, operator)
     constant, friction = (
         wl.LCP(operator, -np.ones(3)),
@@ -150,7 +150,7 @@ def test_rows_are_the_operator_s_own():
     A row sweep uses entries that change in place.
     """
     A = shown(HasRows, 12)
-    own, b = Least(A, HasRows, HasScale), np.linspace(-1.0, 1.0, 12)
+    own, b = MinimalOperator(A, HasRows, HasScale), np.linspace(-1.0, 1.0, 12)
     problem, method = wl.LCP(own, b), wl.ProjectedSOR()
     work = method.init(problem)
     for scale in (1.0, 3.0):

@@ -18,7 +18,7 @@ TINY = (np.array([[1e-8, -1.0], [1.0, 1e-8]]), np.array([1.0, -1.0]))
 SOLVE_IT = ["interior-point", "lemke", "minimum-map-newton", "primal-dual-active-set"]
 
 
-class Shown:
+class OperatorWithoutEntries:
     """User-defined operator: products and the diagonal, no entries."""
 
     def __init__(self, A):
@@ -43,7 +43,7 @@ class Shown:
 
     def masked(self, free, shift=None):
         p, d = np.diag(free.numpy() != 0), 0.0 if shift is None else np.diag(shift.numpy())
-        return Shown(p @ (self._A + d) @ p)
+        return OperatorWithoutEntries(p @ (self._A + d) @ p)
 
 
 def program(seed, m=20, n=20):
@@ -196,10 +196,10 @@ def test_an_operator_that_shows_its_diagonal_only():
     sizes.
     """
     M, b = TINY
-    residual = NaturalResidual(wl.LCP(Shown(M), b))
+    residual = NaturalResidual(wl.LCP(OperatorWithoutEntries(M), b))
     wrong = wp.array([1.0, 1e-8], dtype=wp.float64, device="cpu")
     assert residual.evaluate(wrong) > 0.5
-    result = wl.solve(wl.LCP(Shown(M), b), wl.MinimumMapNewton())
+    result = wl.solve(wl.LCP(OperatorWithoutEntries(M), b), wl.MinimumMapNewton())
     assert not result or np.abs(result.x.numpy() - 1.0).max() < 1e-5
     rng = np.random.default_rng(619)
     K = np.triu(rng.standard_normal((30, 30)), 1)
@@ -208,7 +208,7 @@ def test_an_operator_that_shows_its_diagonal_only():
     assert (d >= scale_of_matrix(skew) / 2).all()
     assert (d <= 12 * scale_of_matrix(skew)).all()
     np.testing.assert_array_equal(
-        NaturalResidual(wl.LCP(Shown(grid), np.ones(30))).diagonal.numpy(), 2.0
+        NaturalResidual(wl.LCP(OperatorWithoutEntries(grid), np.ones(30))).diagonal.numpy(), 2.0
     )
 
 

@@ -185,18 +185,18 @@ def test_problems_without_copies(monkeypatch):
     A, method = wl.GridPoisson(cells, device="cpu"), METHODS[0]
     stored = wp.array(np.pad(b, 1), dtype=wp.float64, device="cpu")
 
-    class Other(wl.GridPoisson):
+    class SubclassedOperator(wl.GridPoisson):
         pass
 
-    class OtherProblem(wl.LCP):
+    class SubclassedProblem(wl.LCP):
         pass
 
     masked = A.masked(np.where(cells == wl.FLUID, 1, 0))
     own = [
         wl.LCP(A, stored),
         wl.LCP(A, b, stored),
-        wl.LCP(Other(cells, device="cpu"), b),
-        OtherProblem(A, b),
+        wl.LCP(SubclassedOperator(cells, device="cpu"), b),
+        SubclassedProblem(A, b),
         wl.LCP(masked, b),
     ]
     for problem in own:

@@ -78,7 +78,7 @@ def test_balls_touch_where_each_two_of_them_do():
         np.testing.assert_allclose(getattr(found.points, name), each, atol=1e-12)
 
 
-class Touching(SimpleNamespace):
+class TouchingPairs(SimpleNamespace):
     def __len__(self):
         return len(self.first)
 
@@ -93,7 +93,7 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
         rng = np.random.default_rng(seed)
         n, k, m = (int(count) for count in rng.integers((1, 1, 1), (5, 30, 30)))
         bodies = placed(rng.standard_normal((n, 3)), rng)
-        contacts = Touching(
+        contacts = TouchingPairs(
             first=rng.integers(0, n, k),
             second=rng.integers(0, n + 1, k),
             point=rng.standard_normal((k, 3)).round(1),

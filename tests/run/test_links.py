@@ -206,7 +206,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     elsewhere.mkdir()
 
-    class Plants(ProgressLines):
+    class LinkPlanter(ProgressLines):
         def step(self, row: Any) -> None:
             super().step(row)
             for number, name in enumerate(names(whole) if row["step"] == 1 else ()):
@@ -215,7 +215,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
                 if not checkpoint and not (out / name).exists() and not (out / name).is_symlink():
                     lay(out / name, elsewhere / f"{number}")
 
-    record = go(scene, out, observer=Plants(Console(quiet=True)))
+    record = go(scene, out, observer=LinkPlanter(Console(quiet=True)))
     assert record.status == "finished", record.reason
     assert len(list(elsewhere.iterdir())) > 20
     assert {path.read_text() for path in elsewhere.iterdir()} == {PRECIOUS}
@@ -225,7 +225,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
 def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
 
-    class Moves(ProgressLines):
+    class FolderMover(ProgressLines):
         def step(self, row: Any) -> None:
             super().step(row)
             if row["step"] == 2:
@@ -237,7 +237,7 @@ def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
                 (out / name).symlink_to(elsewhere)
                 self.before = content(elsewhere)
 
-    observer = Moves(Console(quiet=True))
+    observer = FolderMover(Console(quiet=True))
     record = go(scene, out, observer=observer)
     assert record.status == "failed"
     assert "is a link" in record.reason

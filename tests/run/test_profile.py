@@ -97,7 +97,7 @@ def test_kernels_that_load_are_a_stage_of_their_own():
     def fill(a: wp.array(dtype=wp.float32)):
         a[wp.tid()] = 3.0
 
-    class Said:
+    class RecordingLogger:
         messages: ClassVar[list[str]] = []
 
         def say(self, message, *_, **__):
@@ -106,7 +106,11 @@ def test_kernels_that_load_are_a_stage_of_their_own():
         debug = info = warning = error = say
 
     profile, field = Profiler("cpu"), wp.zeros(4, dtype=wp.float32, device="cpu")
-    with wp.ScopedLogger(Said()), wp.ScopedLogLevel(wp.LOG_WARNING), profile.kernels_apart():
+    with (
+        wp.ScopedLogger(RecordingLogger()),
+        wp.ScopedLogLevel(wp.LOG_WARNING),
+        profile.kernels_apart(),
+    ):
         level = wp.config.log_level
         begun = time.perf_counter()
         with profile.stage("fill"):
@@ -119,7 +123,7 @@ def test_kernels_that_load_are_a_stage_of_their_own():
     assert kernels.calls == 1
     assert kernels.seconds > 0.0
     assert 0.0 <= stage.seconds <= seconds - 0.99 * kernels.seconds
-    assert Said.messages == ["heard"]
+    assert RecordingLogger.messages == ["heard"]
     assert profile.table(1, seconds).splitlines()[1].startswith(KERNELS)
 
 

@@ -29,7 +29,7 @@ from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
 VOLATILE = "seconds"  # the only column of the log that differs in a repetition
 
 
-class Watcher(ProgressLines):
+class RemarkObserver(ProgressLines):
     """Observer that stores the remarks."""
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Watcher(ProgressLines):
 
 
 def go(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
-    observer = options.pop("observer", None) or Watcher()
+    observer = options.pop("observer", None) or RemarkObserver()
     return run_into(load_scene(scene, overrides), out, observer=observer, **options)
 
 
@@ -265,7 +265,7 @@ def test_resume_reports_a_broken_checkpoint_and_takes_the_one_before(scene_file,
     go(scene_file, parts, stop=stop_at(10))
     broken = parts / "checkpoints" / "step_000010.npz"
     broken.write_bytes(broken.read_bytes()[:-40])
-    observer = Watcher()
+    observer = RemarkObserver()
     result = go(scene_file, parts, resume=True, observer=observer)
     assert result.resumed_from_step == 8
     assert result.warnings == observer.notes == read_record(parts)["warnings"]
@@ -536,7 +536,7 @@ def test_an_empty_simulation_has_frames(dots, scene_file, tmp_path):
 
 def test_notes_reach_the_user_and_the_record(dots, scene_file, tmp_path):
     dots.notes = ["solid[0]: lies outside the domain"]
-    observer = Watcher()
+    observer = RemarkObserver()
     assert go(scene_file, tmp_path / "out", observer=observer).warnings == dots.notes
     assert observer.notes == dots.notes
 

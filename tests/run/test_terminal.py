@@ -205,11 +205,11 @@ def test_colors_and_bars_of_our_own_reach_the_terminal(capsys):
 
 @pytest.mark.parametrize("code", [errno.EPIPE, errno.EIO])
 def test_a_terminal_that_is_gone_ends_no_run(dots, scene_file, tmp_path, code):
-    class Gone(io.StringIO):
+    class ClosedTerminal(io.StringIO):
         def write(self, text: str) -> int:
             raise OSError(code, os.strerror(code))
 
-    watcher = ProgressLines(Terminal(file=Gone()))
+    watcher = ProgressLines(Terminal(file=ClosedTerminal()))
     record = run_into(load_scene(scene_file), tmp_path / "out", observer=watcher, last_frame=2)
     assert record.status == "finished"
 

@@ -13,7 +13,6 @@ from warp_lcp.gallery.published import PUBLISHED, PublishedFigure
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.gallery.shallow_ice import IceDome
 from warp_lcp.host_problem import FACTS, Problem
-from warp_lcp.import_aliases import renamed_class
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactSystem,
@@ -21,6 +20,7 @@ from warp_lcp.rigid.contact_models import (
     StewartTrinkleModel,
     proximal_sweeps,
 )
+from warp_lcp.settings import renamed_names
 
 __all__ = [
     "FACTS",
@@ -62,6 +62,6 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> object:
-    """Return a class by its older name."""
-    return renamed_class(__name__, name)
+__getattr__ = renamed_names(
+    __name__, Plant="PlantedSolution", Prices="OptionPrices", Published="PublishedFigure"
+)

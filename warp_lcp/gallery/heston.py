@@ -19,6 +19,7 @@ from warp_lcp.operators.stencil import Stencil
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.operator_protocol import AIR, FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.settings import renamed_names
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 Coefficients = dict[tuple[int, int], np.ndarray]
@@ -260,3 +261,6 @@ class OptionPrices:
         return scipy.interpolate.CubicSpline(
             self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance)
         )(spot)
+
+
+__getattr__ = renamed_names(__name__, Prices="OptionPrices")

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.host_problem import M_MATRIX, Matrix, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
-from warp_lcp.settings import Part, Positive, Settings
+from warp_lcp.settings import Part, Positive, Settings, renamed_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,3 +179,6 @@ def poisson(
         x,
         flat.facts,
     )
+
+
+__getattr__ = renamed_names(__name__, Plant="PlantedSolution")

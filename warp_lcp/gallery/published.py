@@ -17,6 +17,7 @@ from warp_lcp.host_problem import Problem
 from warp_lcp.method_selection import solve
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.settings import renamed_names
 
 PETSC, CUTEST, P4PDES = "PETSc", "CUTEst", "p4pdes"
 SPG = "CSPG.jl"  # its table of CUTEst's problems, with the spectral projected gradient method
@@ -387,3 +388,6 @@ def _domes() -> list[PublishedFigure]:
 
 
 PUBLISHED = (*_bearings(), *_torsions(), *_sines(), *_balls(), *_dams(), *_puts(), *_domes())
+
+
+__getattr__ = renamed_names(__name__, Published="PublishedFigure")

@@ -24,10 +24,10 @@ from typing import (
 import numpy as np
 import warp as wp
 
-from warp_lcp.import_aliases import renamed_class
 from warp_lcp.kernels.fields import Layout
 from warp_lcp.kernels.types import DataType, DeviceArray, Values
 from warp_lcp.problem.residual_scaling import NoTranspose, estimated_scale
+from warp_lcp.settings import renamed_names
 
 if TYPE_CHECKING:
     from warp_lcp.kernels.fields import PaddedLayout
@@ -498,6 +498,13 @@ def check_taken(method: Solver, A: Operator) -> None:
         )
 
 
-def __getattr__(name: str) -> object:
-    """Return a class by its older name."""
-    return renamed_class(__name__, name)
+__getattr__ = renamed_names(
+    __name__,
+    AppliesPlus="HasApplyPlus",
+    HasBlocks="HasRestriction",
+    HasColumns="HasLowRankTerm",
+    NamesComponents="HasFloatingComponents",
+    Relaxes="HasSweep",
+    StoresRounded="HasStorageRounding",
+    Versioned="HasVersion",
+)
