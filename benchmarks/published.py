@@ -95,7 +95,7 @@ class TruncatedWorkspace(MultigridWorkspace):
         self.forget_direction()
         return False
 
-    def _creeps(self) -> bool:
+    def _needs_cycle(self) -> bool:
         self.judge()
         return False
 

@@ -274,7 +274,7 @@ class Packing:
         have stresses of 0 on all ranks.
         """
         if self._forest is not None:
-            self.grid.part.filling(stress, forest=self._forest).launch(launch)
+            self.grid.part.fill_task(stress, forest=self._forest).launch(launch)
         if self.sides is not None:
             self.sides.wrap(stress, launch=launch)
 

@@ -64,7 +64,11 @@ class StressDeviceIteration:
         stress.set_steps(*method.steps(stress))
         limit, least, still = math.inf, method.least, 0.0
         if stress.cold:
-            limit, least, still = method.swing(stress), method.cold, kernels.STILL_SHARE * tolerance
+            limit, least, still = (
+                method.momentum_limit(stress),
+                method.cold,
+                kernels.STILL_SHARE * tolerance,
+            )
         for number, value in zip(
             self._scalars, (limit, tolerance, least, still, most), strict=True
         ):

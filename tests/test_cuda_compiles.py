@@ -80,7 +80,7 @@ def use_every_kernel(reals):
                         assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-4))
         assert Hierarchy(
             problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1]
-        )._small.coarsening.kernel
+        )._small.coarsen_kernel.kernel
     for real in (wp.float32, wp.float64):
         transfer_passes(real)
     wl.solve(

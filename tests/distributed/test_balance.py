@@ -10,7 +10,13 @@ import pytest
 
 from warp_lcp.distributed import balance
 from warp_lcp.distributed.balance import WorkLoad, edge_of_blocks
-from warp_lcp.distributed.decomposition import OPEN, balanced_processes, parts, pool, seen_by
+from warp_lcp.distributed.decomposition import (
+    OPEN,
+    balanced_processes,
+    cells_with_ghosts,
+    parts,
+    pool,
+)
 
 ALL = np.zeros(3), np.array([64.0, 32.0, 32.0])
 
@@ -72,7 +78,7 @@ def busiest(load, cut):
     ends = [[0, *-(-np.cumsum(part) // load.edge)] for part in cut]
     boxes = itertools.product(*(list(itertools.pairwise(end)) for end in ends))
     full = [load.material[tuple(slice(a, b) for a, b in box)].sum() for box in boxes]
-    return (np.array(full) + OPEN * seen_by(load.counts, cut, load.layers).ravel()).max()
+    return (np.array(full) + OPEN * cells_with_ghosts(load.counts, cut, load.layers).ravel()).max()
 
 
 @pytest.mark.parametrize(("least", "pays"), [(560.0, True), (780.0, False)])
@@ -87,7 +93,9 @@ def test_boxes_are_repartitioned_only_if_the_step_gets_a_quarter_shorter(least, 
     ranks = SimpleNamespace(size=2, rank=0, collect=lambda mine: [mine, None])
     part = SimpleNamespace(decomposition=now, layers=3, ranks=ranks)
     particles = SimpleNamespace(exchange=SimpleNamespace(counts=[1000, 100]))
-    monkeypatch.setattr(balance, "seen_by", lambda counts, parts, layers: np.zeros((2, 1, 1)))
+    monkeypatch.setattr(
+        balance, "cells_with_ghosts", lambda counts, parts, layers: np.zeros((2, 1, 1))
+    )
     monkeypatch.setattr(balance, "blocks", lambda part, particles, edge: np.zeros(1))
     monkeypatch.setattr(
         balance, "WorkLoad", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts))

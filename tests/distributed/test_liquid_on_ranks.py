@@ -23,12 +23,12 @@ from liquids_on_ranks import (
     scene,
     sponge,
 )
+from ranks_in_turn import RankInTurn
 from scipy.spatial import cKDTree
-from turns import RankInTurn
 
 from small_liquids import box
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.ghost_width import too_far
+from warp_lcp.distributed.ghost_width import displacement_beyond_ghosts
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids import SIMULATOR
@@ -366,7 +366,7 @@ def test_too_large_velocities_are_detected_near_and_along_cuts():
         velocity = part.grid.faces()
         host = velocity[axis].numpy()
         host[1, 4, place] = cells * 0.1 / 0.02
-        assert too_far(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
+        assert displacement_beyond_ghosts(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
 
 
 def damaged(name, change):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from turns import RankInTurn, on_ranks
+from ranks_in_turn import RankInTurn, on_ranks
 
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.ranks import Ranks

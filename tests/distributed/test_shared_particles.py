@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from turns import RankInTurn, on_ranks
+from ranks_in_turn import RankInTurn, on_ranks
 
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.particles import REACH

@@ -80,13 +80,13 @@ def write(folder: Path, grid_format: str, frames: int = 1) -> None:
     for index in range(frames):
         found = []
         for rank, box in enumerate(BOXES):
-            collective = Collective.of_one()
+            collective = Collective.for_one_process()
             collective.ranks.comm.rank = rank  # other data of the ranks are not used
             mine = RankFrames(FrameFolder(folder, grid_format), collective)
             mine.write(index, 0.5 * index, piece(box))
             found.append(mine.describe(piece(box)))
         if index == 0:
-            first = RankFrames(FrameFolder(folder, grid_format), Collective.of_one())
+            first = RankFrames(FrameFolder(folder, grid_format), Collective.for_one_process())
         first.publish(index, 0.5 * index, found)
 
 
@@ -244,7 +244,7 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
 
 
 def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path):
-    collective = Collective.of_one()
+    collective = Collective.for_one_process()
     collective.ranks.comm.rank = 1  # the first rank writes elsewhere
     folder = RunFolder(tmp_path / "out", load_scene(scene_file), collective)
     with pytest.raises(

@@ -17,7 +17,7 @@ from warp_lcp.cli.exit_codes import FAILED, WRONG_INPUT, end, wrong_input
 from warp_lcp.cli.solve_file import FileOutcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks, suite_names
-from warp_lcp.cli.view_commands import export, looked_on, render, serve, view
+from warp_lcp.cli.view_commands import export, render, serve, show_while_running, view
 from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.extras.viewer import check_window
@@ -267,7 +267,7 @@ def run(
             ProgressBar(console) if console.is_terminal else ProgressLines(console) as observer,
         ):
             watch = Profiler(chosen_device) if profile and launcher.is_root else None
-            with looked_on(
+            with show_while_running(
                 observer, folder, page=page and launcher.is_root, window=window and launcher.is_root
             ) as observers:
                 record = launcher.run(request, observer=observers, stop=stop, profile=watch)

@@ -352,7 +352,9 @@ class _StartObserver:
 
 
 @contextmanager
-def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> Iterator[Observer]:
+def show_while_running(
+    observer: Observer, folder: Path, *, page: bool, window: bool
+) -> Iterator[Observer]:
     """Show a web page or a window of a run once its folder exists.
 
     The window runs in another process, and stays open.

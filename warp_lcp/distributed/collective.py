@@ -94,7 +94,7 @@ class Collective:
         self._raised: BaseException | None = None  # exception that a block has raised on all ranks
 
     @classmethod
-    def of_one(cls) -> Collective:
+    def for_one_process(cls) -> Collective:
         """Return the collective of a single process; needs no MPI."""
         return cls(Ranks(SimpleNamespace(rank=0, size=1)))
 
@@ -102,7 +102,7 @@ class Collective:
         """Return the context of a block that all ranks execute."""
         return self._block(named=True)
 
-    def led(self) -> AbstractContextManager[None]:
+    def root_only(self) -> AbstractContextManager[None]:
         """Return the context of a block that the root rank executes for all."""
         return self._block(named=False)
 
@@ -265,7 +265,7 @@ def on_root(
     def collective(
         self: HasCollectiveT, *arguments: ArgumentsT.args, **options: ArgumentsT.kwargs
     ) -> ResultT | None:
-        with self.collective.led():
+        with self.collective.root_only():
             return method(self, *arguments, **options) if self.collective.ranks.is_root else None
 
     return collective

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_lcp.distributed.components import GROUND, joined, nodes_of
 from warp_lcp.distributed.launch import petsc
-from warp_lcp.distributed.messages import exchange, exchanging
+from warp_lcp.distributed.messages import exchange, exchange_operation
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.kernels.compiler import forward_kernel
@@ -144,7 +144,7 @@ class Halo:
         )
 
     @cached_property
-    def gathering(self) -> GridGather:
+    def field_gather(self) -> GridGather:
         """Gathering of the fields of all ranks on every rank."""
         return GridGather(self.decomposition)
 
@@ -160,7 +160,7 @@ class Halo:
             return
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
-    def filling(self, field: DeviceArray) -> HostTask:
+    def fill_task(self, field: DeviceArray) -> HostTask:
         """Return the halo exchange of a field, to run now or within a recorded program.
 
         For more than one rank.
@@ -170,7 +170,7 @@ class Halo:
         assert self._forest is not None
         return HostTask(
             partial(self.fill, field),
-            partial(exchanging, self._forest, field.numpy(), field.numpy()),
+            partial(exchange_operation, self._forest, field.numpy(), field.numpy()),
         )
 
     def _fill_through_host(self, field: DeviceArray) -> None:
@@ -237,13 +237,13 @@ class GridGather:
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def collecting(self, own_part: DeviceArray, whole: DeviceArray) -> HostTask:
+    def collect_task(self, own_part: DeviceArray, whole: DeviceArray) -> HostTask:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
             return HostTask(partial(self.collect, own_part, whole))
         return HostTask(
             partial(self.collect, own_part, whole),
-            partial(exchanging, self._forest, own_part.numpy(), whole.numpy()),
+            partial(exchange_operation, self._forest, own_part.numpy(), whole.numpy()),
         )
 
     def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:

@@ -207,7 +207,7 @@ class ParticleMigration(ParticleExchange):
         self._counts, self._added = self.part.ranks.gather(self.particles.count).ravel().tolist(), 0
         self._expected = sum(self._counts)
 
-    def appended(self, count: int) -> None:
+    def register_append(self, count: int) -> None:
         """Assign the next places to new particles, which are stored behind the others."""
         self.add_places(max(NEW, 1 + int(self.place.max(initial=0))) + np.arange(count))
 
@@ -216,7 +216,7 @@ class ParticleMigration(ParticleExchange):
         self.place, self._lying = np.append(self.place, places), None
         self._added += len(places)
 
-    def removing(self, marks: wp.array) -> None:
+    def register_removal(self, marks: wp.array) -> None:
         """Drop the places of particles that are about to be removed."""
         before = len(self.place)
         self.place, self._lying = self.place[marks.numpy()[: self.particles.count] == 0], None

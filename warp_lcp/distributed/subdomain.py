@@ -13,10 +13,10 @@ import warp as wp
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.ballistic_fragments import FragmentMerger
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.ghost_width import GhostLayerExchange, too_far
+from warp_lcp.distributed.ghost_width import GhostLayerExchange, displacement_beyond_ghosts
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.interruptible_wait import waiting
-from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchanging_all
+from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchange_all_operation
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
 from warp_lcp.distributed.ranks import Ranks
@@ -94,10 +94,10 @@ def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
             field.assign(host)
 
 
-def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
+def _fill_operation(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
     """Return `_fill` as an operation of the thread pool."""
     hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
-    return exchanging_all(forest, [(host, host) for host in hosts])
+    return exchange_all_operation(forest, [(host, host) for host in hosts])
 
 
 class Subdomain(GridPart):
@@ -262,7 +262,7 @@ class Subdomain(GridPart):
 
         Returns this part if the boxes are the same, and None if the ranks cannot have them.
         """
-        with self.decomposition.collective.led():
+        with self.decomposition.collective.root_only():
             cuts = cuts_of(pieces, self)
         if cuts is None or cuts == self.decomposition.parts:
             return None if cuts is None else self
@@ -315,7 +315,7 @@ class Subdomain(GridPart):
 
         It is the largest of all ranks, in cells; 0: no particle leaves them.
         """
-        return float(self.ranks.max(too_far(self, velocity, dt)))
+        return float(self.ranks.max(displacement_beyond_ghosts(self, velocity, dt)))
 
     def notes(self) -> list[str]:
         """Return the number of ranks and the size of their boxes, as text."""
@@ -457,11 +457,11 @@ class Subdomain(GridPart):
             if not is_recording() and team() is not None and all(map(_stays, fields)):
                 self._fill_again(forest, fields)
                 return
-        self.filling(*fields, forest=forest).launch()
+        self.fill_task(*fields, forest=forest).launch()
 
-    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> HostTask:
+    def fill_task(self, *fields: wp.array | np.ndarray, forest: StarForest) -> HostTask:
         """Return `fill` over a star forest, to run now or in a recorded program."""
-        operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
+        operation = None if self.grid.device.is_cuda else partial(_fill_operation, forest, fields)
         return HostTask(partial(_fill, forest, fields), operation)
 
     def _fill_again(self, forest: StarForest, fields: Sequence[wp.array]) -> None:
@@ -472,7 +472,7 @@ class Subdomain(GridPart):
                 self._fillings.clear()
             hosts = [field.numpy() for field in fields]
             self._fillings[key] = OperationTable(
-                [exchanging_all(forest, [(host, host) for host in hosts])]
+                [exchange_all_operation(forest, [(host, host) for host in hosts])]
             )
         run_table(self._fillings[key])
 

@@ -130,13 +130,13 @@ class ParticleExchange:
     def count(self) -> None:
         """Count the particles of all processes; collective."""
 
-    def appended(self, count: int) -> None:
+    def register_append(self, count: int) -> None:
         """Register particles that have been appended."""
 
     def add_places(self, places: np.ndarray) -> None:
         """Set the places of the last appended particles in the order of sums, int64."""
 
-    def removing(self, marks: wp.array) -> None:
+    def register_removal(self, marks: wp.array) -> None:
         """Register the particles that are about to be removed: those whose mark is not 0."""
 
     def begin_sort(self) -> None:
@@ -421,7 +421,7 @@ class GridPart:
         box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         return cast(FieldT, field[(slice(None),) * (field.ndim - 3) + box])
 
-    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> HostTask:
+    def fill_task(self, *fields: wp.array | np.ndarray, forest: StarForest) -> HostTask:
         """Return the exchange of a `forest`'s cells as a task.
 
         It runs at once or within a launch graph.

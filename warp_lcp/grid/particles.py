@@ -298,7 +298,7 @@ class Particles:
                 column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
             else:  # sorting may have left anything behind the particles in use
                 column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
-        self.exchange.appended(len(position))
+        self.exchange.register_append(len(position))
 
     def make_room(self, count: int) -> int:
         """Add particles at the end and return the index of the first.
@@ -385,7 +385,7 @@ class Particles:
                         kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device
                     )
                     self._columns[name], self._spare = self._spare, column
-            self.exchange.removing(marks)
+            self.exchange.register_removal(marks)
             self.resize(self.count - first - others)
         return first, others
 

@@ -122,7 +122,7 @@ class Communicator(Protocol):
     def sum(self, values: Entries) -> Entries:
         """Return sums over all parts, entry by entry."""
 
-    def adding(self, sums: np.ndarray) -> Operation:
+    def sum_operation(self, sums: np.ndarray) -> Operation:
         """Return an operation that replaces float64 sums by those over all ranks.
 
         It works in place and runs in the thread pool.
@@ -492,7 +492,7 @@ def sum_over_ranks(
     """
 
     def operation() -> Operation:
-        adding = comm.adding(scalars.numpy()[slots])
+        adding = comm.sum_operation(scalars.numpy()[slots])
         return adding if condition is None else adding.only_if(condition)
 
     HostTask(

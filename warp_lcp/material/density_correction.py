@@ -327,7 +327,7 @@ class DensityCorrection:
         self._over.changed()
         if self._inside is not None:
             self._lacking.changed()
-        result = self._solve_counting() if self._begins_ahead() else None
+        result = self._solve_counting() if self._begins_on_gpu() else None
         over_full, most = self._found()
         if over_full == 0:
             self.x.zero_()
@@ -421,12 +421,12 @@ class DensityCorrection:
         )
         return self._solved_to(criteria)
 
-    def _begins_ahead(self) -> bool:
+    def _begins_on_gpu(self) -> bool:
         """Return whether a GPU starts the solve before the host knows of overfull cells."""
         return (
             self._problem is not None
             and not self.grid.part.shared
-            and bool(getattr(self._work, "begins_ahead", False))
+            and bool(getattr(self._work, "begins_on_gpu", False))
         )
 
     def _solve_counting(self) -> wl.SolveResult:

@@ -42,7 +42,7 @@ class FusedCoarseLevels:
             level.in_one_launch = True
 
     @functools.cached_property
-    def coarsening(self) -> PersistentKernel:
+    def coarsen_kernel(self) -> PersistentKernel:
         """Stages that compute all levels from the first one."""
         stages = _kernels(
             s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)

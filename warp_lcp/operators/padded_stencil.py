@@ -80,7 +80,7 @@ def coarsen_spans_kernel(
 class FieldGather(Protocol):
     """Collects a field of all processes' boxes, with ghost cells, on every process."""
 
-    def collecting(self, mine: DeviceArray, whole: DeviceArray) -> HostTask:
+    def collect_task(self, mine: DeviceArray, whole: DeviceArray) -> HostTask:
         """Return the task that writes all processes' cells to the whole grid's field."""
 
     def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = ...) -> None:
@@ -102,12 +102,12 @@ class GhostExchange(Protocol):
     @property
     def cuts(self) -> list[tuple[int, int]]: ...  # noqa: D102
     @property
-    def gathering(self) -> FieldGather: ...  # noqa: D102
+    def field_gather(self) -> FieldGather: ...  # noqa: D102
 
     def fill(self, field: DeviceArray) -> None:
         """Fill the ghost cells of a stored field."""
 
-    def filling(self, field: DeviceArray) -> HostTask:
+    def fill_task(self, field: DeviceArray) -> HostTask:
         """Return the task that fills ghost cells, now or in a program."""
 
     def coarser(self, factors: tuple[int, int, int]) -> GhostExchange | None:
@@ -261,7 +261,7 @@ class PaddedStencil:
         made: list[BoundKernel | HostTask] = [
             WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes
         ]
-        return made if self.ghosts is None else [*made, self.ghosts.filling(x)]
+        return made if self.ghosts is None else [*made, self.ghosts.fill_task(x)]
 
     @cached_property
     def _edges(self) -> list[Rows]:

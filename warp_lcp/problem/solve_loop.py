@@ -194,14 +194,14 @@ class WorkspaceDefaults:
     Attributes:
         scratch: stored fields, of 4-byte elements and of bytes, that the search of floating
             components may overwrite before `start`; None: there are none.
-        device_begins: whether `begin_ahead` may begin a solve.
+        device_begins: whether `begin_on_device` may begin a solve.
     """
 
     scratch: Scratch | None = None
-    device_begins = False
+    begins_on_device = False
 
     @property
-    def is_ahead(self) -> bool:
+    def has_device_steps(self) -> bool:
         """Whether the device has already taken the next step."""
         return False
 
@@ -209,7 +209,7 @@ class WorkspaceDefaults:
         """Return x in its precision and stored shape; None: x itself."""
         return None
 
-    def begin_ahead(
+    def begin_on_device(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve on the device, and take steps, without the host.
@@ -593,22 +593,22 @@ class _SolveLoop:
 
         Returns the residual there, None if the device has not begun.
         """
-        return self._begin_ahead(None)
+        return self._begin_on_device(None)
 
-    def _begin_ahead(self, x0: Array | None) -> float | None:
+    def _begin_on_device(self, x0: Array | None) -> float | None:
         """Begin a solve on the device if the workspace supports that.
 
-        Returns the value of `WorkspaceDefaults.begin_ahead`. With a callback, merits or a deadline
-        the host takes each step.
+        Returns the value of `WorkspaceDefaults.begin_on_device`. With a callback, merits or a
+        deadline the host takes each step.
         """
         work = self.work
-        if not (isinstance(work, WorkspaceDefaults) and work.device_begins):
+        if not (isinstance(work, WorkspaceDefaults) and work.begins_on_device):
             return None
         watched = (
             self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
         )
         guess = None if x0 is None or watched else self.problem.layout.load(x0, wp.float64, "x0")
-        return work.begin_ahead(
+        return work.begin_on_device(
             guess, self.criteria, 0 if watched else self.stopping.max_iterations
         )
 
@@ -752,7 +752,7 @@ class _BoxSolveLoop(_SolveLoop):
 
         A relative tolerance refers to the residual at clip(0, l, u).
         """
-        reference = self._begin_ahead(x0)
+        reference = self._begin_on_device(x0)
         if reference is not None:
             self.warm = True
             self._refer(reference)

@@ -158,7 +158,10 @@ class RunFolder:
     def __init__(self, path: Path, scene: Scene, collective: Collective | None = None) -> None:
         """Inspect a folder, which need not exist; nothing is written yet."""
         self.path, self.scene, self.log = path, scene, path / "log.csv"
-        self.collective, self._shared = collective or Collective.of_one(), collective is not None
+        self.collective, self._shared = (
+            collective or Collective.for_one_process(),
+            collective is not None,
+        )
         with self.collective.together():
             self.mesh_files = mesh_digests(scene)
         output = scene.output

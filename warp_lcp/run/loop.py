@@ -134,7 +134,7 @@ def running_scene(
         OutputError: the folder cannot be used for the run; on all ranks, like all errors here.
         SceneError: the scene cannot be simulated, or not on ranks.
     """
-    scene, group = request.scene, collective or Collective.of_one()
+    scene, group = request.scene, collective or Collective.for_one_process()
     if collective is not None and request.record_problems is not None:
         raise OutputError(
             "--record-problems cannot be combined with --engine petsc: each rank has only a part "

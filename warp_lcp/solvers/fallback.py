@@ -320,7 +320,10 @@ class FallbackWorkspace(WorkspaceDefaults):
             else Precision(first.precision)
         )
         self._optional = first if isinstance(first, WorkspaceDefaults) else WorkspaceDefaults()
-        self.scratch, self.device_begins = self._optional.scratch, self._optional.device_begins
+        self.scratch, self.begins_on_device = (
+            self._optional.scratch,
+            self._optional.begins_on_device,
+        )
         # Workspaces by position in the chain; None: the method does not take the problem.
         self._works: dict[int, Workspace | None] = {0: first}
         # By position: whether a method takes such a problem, before it has a workspace.
@@ -342,19 +345,19 @@ class FallbackWorkspace(WorkspaceDefaults):
         return getattr(self._first, name)
 
     @property
-    def is_ahead(self) -> bool:
+    def has_device_steps(self) -> bool:
         """Whether the first method's device has already taken the next step."""
-        return self._optional.is_ahead
+        return self._optional.has_device_steps
 
     def solution(self) -> DeviceArray | None:
         """Return x as the first method's workspace does."""
         return self._optional.solution()
 
-    def begin_ahead(
+    def begin_on_device(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve on the device by the first method."""
-        return self._optional.begin_ahead(guess, criteria, steps)
+        return self._optional.begin_on_device(guess, criteria, steps)
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
@@ -406,7 +409,7 @@ class FallbackWorkspace(WorkspaceDefaults):
         progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
         # No hand-over while the device has already taken the step.
-        ahead = at_first and self._optional.is_ahead
+        ahead = at_first and self._optional.has_device_steps
         if not ahead and (place := self._due()) is not None:
             self._hand_over(place)
             at_first = False

@@ -244,7 +244,7 @@ class SplitResidual(NaturalResidual):
 
         The level's x is z, its b is r.
         """
-        engine.measuring(finest, p, self._split.partials).launch(wp.launch)
+        engine.measure_kernel(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)
         return [float(v) for v in self._split.scalars.numpy()[:4]]
 
@@ -294,7 +294,7 @@ class MPRGPWorkspace(WorkspaceBase):
             False,
             0.0,
         )
-        self._descent = EnergyMonitor(self.precision.epsilon)
+        self._energy_monitor = EnergyMonitor(self.precision.epsilon)
         self._restricted = 0  # the version of the free set that the preconditioner is restricted to
 
     def start(
@@ -311,7 +311,7 @@ class MPRGPWorkspace(WorkspaceBase):
             False,
             self.residual.energy,
         )
-        self._descent.start(self.residual.energy, self.residual.norm)
+        self._energy_monitor.start(self.residual.energy, self.residual.norm)
         self._restricted = 0
         self.system.refresh()
 
@@ -326,7 +326,7 @@ class MPRGPWorkspace(WorkspaceBase):
         Since the last time that it had; on grids, whether the step before has lowered it.
         """
         if self.is_grid:
-            return self._descent.sinks
+            return self._energy_monitor.sinks
         sinks = self.residual.energy < self._lowest - NOISE * abs(self._lowest)
         self._lowest = self.residual.energy if sinks else self._lowest
         return sinks
@@ -335,14 +335,14 @@ class MPRGPWorkspace(WorkspaceBase):
         """Judge the last step; return whether the next one is a projected cycle."""
         if not (self.is_grid and self.bounded):
             return False
-        fell = self._descent.record(self.residual.energy, self.residual.norm)
+        fell = self._energy_monitor.record(self.residual.energy, self.residual.norm)
         if self._cycled:
-            self._descent.weigh(fell)
-        elif self._cycles_left == 0 and self._descent.creeps(
+            self._energy_monitor.weigh(fell)
+        elif self._cycles_left == 0 and self._energy_monitor.needs_cycle(
             fell, moved=self.stale or self._released
         ):
             self._cycles_left = 1
-        self._cycles_left = self._cycles_left or self._descent.due(self.settings.patience)
+        self._cycles_left = self._cycles_left or self._energy_monitor.due(self.settings.patience)
         self._cycled, self._released = self._cycles_left > 0, False
         return self._cycled
 

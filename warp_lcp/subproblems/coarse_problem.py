@@ -152,7 +152,7 @@ class CoarseStencilProblem(FullApproximationCorrection):
         hierarchy.take_all(self._free)
         fine, coarse, size = hierarchy.finest, hierarchy.levels[1], float(np.abs(y).max()) or 1.0
         fine.t.assign((y / size).astype(wp.dtype_to_numpy(kind)))
-        fine.handing_down(coarse).launch()
+        fine.restrict_to_coarse_kernel(coarse).launch()
         held = (
             self._points((bound.numpy() - x) / size) for bound in (problem.lower, problem.upper)
         )
@@ -161,7 +161,7 @@ class CoarseStencilProblem(FullApproximationCorrection):
             .numpy()
             .astype(wp.dtype_to_numpy(kind))
         )
-        fine.correcting(coarse, add=False).launch()
+        fine.correct_kernel(coarse, add=False).launch()
         return size * fine.x.numpy().astype(np.float64)
 
     def _points(self, field: np.ndarray) -> np.ndarray:  # type: ignore[override]

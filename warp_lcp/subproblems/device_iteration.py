@@ -320,8 +320,8 @@ class DeviceIteration:
             int(work.stale),
             min(left, ROWS),
             tolerance,
-            *work.descent.standing,
-            work.descent.noise,
+            *work.energy_monitor.device_state,
+            work.energy_monitor.noise,
         ]
         for number, value in zip(self._standing, arguments, strict=True):
             number.value = value
@@ -373,7 +373,7 @@ class DeviceIteration:
             min(left + 2, ROWS),
             criteria.rtol,
             criteria.atol,
-            work.descent.noise,
+            work.energy_monitor.noise,
         )
         if self._beginning is None or not self._beginning.fits(guess, counted):
             self._beginning = SolveStart(work, guess, counted, self._results, self._judge_first)
@@ -454,7 +454,7 @@ class DeviceIteration:
         decision whether another step follows.
         """
         work = self._work
-        step, rebuild = work.step_program(), work.hierarchy.rebuilding
+        step, rebuild = work.step_program(), work.hierarchy.rebuild_program
         if not (step.has_run and rebuild.has_run):
             return None
         key = id(step), rebuilds
@@ -566,7 +566,7 @@ class SolveStart:
         self._judge(self._counted, launch)
         if loop is not None:
             loop.run_while(going)
-        elif (correction := self._work.correction) is not None and correction.is_made_ahead:
+        elif (correction := self._work.correction) is not None and correction.is_made_on_gpu:
             self._work.hierarchy.rebuild_changed()
             correction.make_potentials()
 

@@ -60,7 +60,7 @@ class EnergyMonitor:
         self._fell, self._owed, self._pause, self._wait = math.inf, 0.0, 0, 1
 
     @property
-    def standing(self) -> tuple[float, float, float, float, float]:
+    def device_state(self) -> tuple[float, float, float, float, float]:
         """State for the device's judgment.
 
         Residual norm, the least one, energy, the least one, and the last decrease of the energy.
@@ -102,7 +102,7 @@ class EnergyMonitor:
         self._unsuccessful, self._fell, self.runs = 0, math.inf, self.runs + 1
         return int(2 ** (self.runs - 1))
 
-    def creeps(self, fell: float, *, moved: bool) -> bool:
+    def needs_cycle(self, fell: float, *, moved: bool) -> bool:
         """Return whether a projected cycle should follow a truncated step.
 
         The step has lowered the energy by `fell`; `moved`: it has moved the free set. Truncated

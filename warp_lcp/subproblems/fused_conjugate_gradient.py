@@ -92,7 +92,7 @@ class FusedConjugateGradient(ConjugateGradient):
         )
         self._passes = direct, step
         self._program = hierarchy.cycle_with(
-            engine.CLIMB, engine.measuring(finest, self._p, sums.partials)
+            engine.CLIMB, engine.measure_kernel(finest, self._p, sums.partials)
         )
         self._advance(self._program.launch)
 

@@ -178,7 +178,7 @@ class FusedGridSystem:
             least, idle = (residual.norm, 0) if residual.norm < least else (least, idle + 1)
             if idle >= IDLE and not self._exact:  # the rounding of x to float32 limits the residual
                 break
-        self._sinks = passes.descent.sinks and self._exact
+        self._sinks = passes.energy_monitor.sinks and self._exact
         self.whole = self._sinks or not math.isfinite(residual.norm) or not passes.bounded
         return iterations
 
@@ -209,14 +209,14 @@ class FusedGridSystem:
         """
         if self._length < 1.0:
             self.iterate.judge()
-            self._sinks = self.iterate.descent.sinks
+            self._sinks = self.iterate.energy_monitor.sinks
         return Step("newton", iterations, self._active, interim=self._sinks)
 
     def fall_back(self, iterations: int, norms: deque[float], best: float, length: float) -> Step:
         """Take projected cycles from the end of the search."""
         passes = self.iterate
         self._prepare_shortening()
-        passes.begin_cycles(passes.descent.due(0))
+        passes.begin_cycles(passes.energy_monitor.due(0))
         return Step(
             "monotone cycle", iterations + passes.monotone_step().linear_iterations, self._active
         )

@@ -55,7 +55,7 @@ MASK = KERNELS["projected_multigrid.mask"]
 UNDO = KERNELS["projected_multigrid.undo"]
 
 
-def measuring(finest: StencilLevel, direction: DeviceArray, out: DeviceArray) -> BoundKernel:
+def measure_kernel(finest: StencilLevel, direction: DeviceArray, out: DeviceArray) -> BoundKernel:
     """Return the kernel that sums the products of a cycle's correction."""
     return MEASURE.bind(
         finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out

@@ -227,7 +227,7 @@ class WoodburyCorrection:
         return self.calm is not None and self.slots == 0
 
     @property
-    def is_made_ahead(self) -> bool:
+    def is_made_on_gpu(self) -> bool:
         """Whether a GPU computes the potentials before the host's decision.
 
         They are those of the last solve's columns, at the start of the next solve.

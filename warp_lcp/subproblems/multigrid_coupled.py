@@ -125,14 +125,14 @@ class CoupledWorkspace(MultigridWorkspace):
         super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._fresh = True
 
-    def begin_ahead(
+    def begin_on_device(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
         if guess is not None:
             self.correction.prepare()
-        reference = super().begin_ahead(guess, criteria, steps)
-        self._prepared = reference is not None and self.correction.is_made_ahead
+        reference = super().begin_on_device(guess, criteria, steps)
+        self._prepared = reference is not None and self.correction.is_made_on_gpu
         return reference
 
     def begin_cycles(self, count: int) -> None:
@@ -221,7 +221,7 @@ class CoupledWorkspace(MultigridWorkspace):
             self._low.columns,
         )
         finest.stencil.wrap(finest.x, launch=launch)
-        kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
+        kernels.measure_kernel(finest, self._p, residual.sums.partials).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         CONVERT.bind(
             rows_of(self._along), a=columns.gather(self._p, launch=launch), b=self._along

@@ -92,7 +92,7 @@ class MultigridWorkspace(WorkspaceBase):
     correction: WoodburyCorrection | None = None  # of the cycle, for bodies
     # Limit of runs of projected cycles: after those, the free set is considered to cycle.
     most_runs: float = math.inf
-    device_begins = True
+    begins_on_device = True
     # Whether `WoodburyCorrection.note` has been launched for the current free set.
     free_set_noted = False
 
@@ -140,7 +140,7 @@ class MultigridWorkspace(WorkspaceBase):
         self.scratch = self._scratch() if real is wp.float32 else None
         # Steps since the best iterate; whether it has memory of its own.
         self._past, self._stored = 0, False
-        self.cycles_left, self.descent = 0, EnergyMonitor(self.precision.epsilon)
+        self.cycles_left, self.energy_monitor = 0, EnergyMonitor(self.precision.epsilon)
         self._tolerance, self._steps_taken = 0.0, 0  # steps of this solve
         self._ahead = DeviceIteration(self) if ahead and DeviceIteration.suits(self) else None
         self._one_table = self._ahead is not None  # whether nothing is read back within a step
@@ -167,7 +167,7 @@ class MultigridWorkspace(WorkspaceBase):
         if self._ahead is not None:
             self._ahead.forget_guess()
 
-    def begin_ahead(
+    def begin_on_device(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve, and take steps, without the host.
@@ -188,7 +188,7 @@ class MultigridWorkspace(WorkspaceBase):
         return reference
 
     @property
-    def begins_ahead(self) -> bool:
+    def begins_on_gpu(self) -> bool:
         """Whether a GPU can begin a solve without the host."""
         return self._ahead is not None and self.A.device.is_cuda
 
@@ -284,7 +284,7 @@ class MultigridWorkspace(WorkspaceBase):
         """Reset the search direction; the operator may have changed."""
         self.floating = floating
         self.cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
-        self.descent.start(self.residual.energy, self.residual.norm)
+        self.energy_monitor.start(self.residual.energy, self.residual.norm)
         self._tolerance, self._steps_taken = tolerance, 0
         if self._started:
             self._started = False
@@ -307,17 +307,17 @@ class MultigridWorkspace(WorkspaceBase):
     @property
     def goes_in_circles(self) -> bool:
         """Whether the free set keeps recurring, in a problem in which that may not end."""
-        return self.descent.runs >= self.most_runs
+        return self.energy_monitor.runs >= self.most_runs
 
     @property
-    def is_ahead(self) -> bool:
+    def has_device_steps(self) -> bool:
         """Whether the device has taken steps that the host has not read yet."""
         return self._ahead is not None and bool(self._ahead.rows)
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
         if self.cycles_left == 0 and self.bounded:
-            due = self.descent.due(
+            due = self.energy_monitor.due(
                 cast(EnergyDescentMethod, self.settings).patience
             )  # an active set can cycle
             if due:
@@ -338,7 +338,7 @@ class MultigridWorkspace(WorkspaceBase):
 
         A projected sweep replaces it once cycles have raised the energy.
         """
-        descent = self.descent
+        descent = self.energy_monitor
         self._leave()
         self._budget -= 1
         self._steps_taken += 1
@@ -396,7 +396,7 @@ class MultigridWorkspace(WorkspaceBase):
         self._leave()
         self._budget -= 1
         self._steps_taken += 1
-        if not self._has_run_ahead():
+        if not self._take_device_step():
             self.rebuild(classify=True)
             if self.floating is None:
                 self.step_program().run()
@@ -409,11 +409,11 @@ class MultigridWorkspace(WorkspaceBase):
             self.residual.read(classified=True)
         if self.floating is not None:
             self._project()
-        if self._creeps() and self._cycles_against_creeping:
+        if self._needs_cycle() and self._cycles_against_creeping:
             self.begin_cycles(1)
-        return Step("truncated cycle", 1, active, interim=self.descent.sinks)
+        return Step("truncated cycle", 1, active, interim=self.energy_monitor.sinks)
 
-    def _has_run_ahead(self) -> bool:
+    def _take_device_step(self) -> bool:
         """Let the device take a step, and those that follow it.
 
         Returns whether it has; the results of one step are then read.
@@ -429,13 +429,13 @@ class MultigridWorkspace(WorkspaceBase):
         self.residual.take(ahead.rows.popleft(), classified=True)
         return True
 
-    def _creeps(self) -> bool:
+    def _needs_cycle(self) -> bool:
         """Judge a truncated step; return whether a projected cycle should follow."""
-        return self.descent.creeps(self.judge(), moved=self.bounded and self.stale)
+        return self.energy_monitor.needs_cycle(self.judge(), moved=self.bounded and self.stale)
 
     def judge(self) -> float:
         """Judge the evaluated step by the energy; return the energy's decrease."""
-        return self.descent.record(self.residual.energy, self.residual.norm)
+        return self.energy_monitor.record(self.residual.energy, self.residual.norm)
 
     def _cycle(self) -> None:
         """Run a cycle on the right-hand side."""
@@ -473,7 +473,7 @@ class MultigridWorkspace(WorkspaceBase):
             program.extend(hierarchy.cycle)
             self._measure(launch=program.launch)
             return
-        measuring = kernels.measuring(hierarchy.finest, self._p, self.residual.sums.partials)
+        measuring = kernels.measure_kernel(hierarchy.finest, self._p, self.residual.sums.partials)
         program.extend(hierarchy.cycle_with(kernels.CLIMB, measuring))
         self._measure_beside_cuts(program.launch)
         self._plan(program.launch)
@@ -507,7 +507,7 @@ class MultigridWorkspace(WorkspaceBase):
         """Sum the products of the cycle's correction, and choose the step."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
-        kernels.measuring(finest, self._p, self.residual.sums.partials).launch(launch)
+        kernels.measure_kernel(finest, self._p, self.residual.sums.partials).launch(launch)
         self._plan(launch)
 
     def _plan(self, launch: Launch) -> None:

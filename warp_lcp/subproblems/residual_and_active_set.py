@@ -88,7 +88,7 @@ class ResidualAndActiveSet(NaturalResidual):
         ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
         for bound in (lower, upper, code):
             if ghosts is not None and bound.size:
-                ghosts.filling(bound).launch(launch)
+                ghosts.fill_task(bound).launch(launch)
 
     def renew(self) -> None:
         """Read the operator again if it has changed."""
@@ -128,14 +128,14 @@ class ResidualAndActiveSet(NaturalResidual):
     def assess(self, x: DeviceArray, *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the evaluation at x; `read` returns its results."""
         self._A.stencil.wrap(x, launch=launch)
-        kernels.ADVANCE.launch(None, self._assessing(x, classify), launch=launch)
+        kernels.ADVANCE.launch(None, self._evaluate_kernel(x, classify), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def update(
         self, x: DeviceArray, direction: DeviceArray, *, launch: Launch = launch_now
     ) -> None:
         """Launch the step from x along the new conjugate direction."""
-        self._updating(self._A.stencil.rows, x, direction).launch(launch)
+        self._update_kernel(self._A.stencil.rows, x, direction).launch(launch)
 
     def advance(
         self, x: DeviceArray, direction: DeviceArray, *, classify: bool, launch: Launch = launch_now
@@ -152,19 +152,23 @@ class ResidualAndActiveSet(NaturalResidual):
             self.assess(x, classify=classify, launch=launch)
             return
         for axis, end in s.ghosts.cuts if s.ghosts is not None else ():
-            self._updating(Rows.beyond(s.padding, p.device, axis, end), x, direction).launch(launch)
+            self._update_kernel(Rows.beyond(s.padding, p.device, axis, end), x, direction).launch(
+                launch
+            )
         kernels.ADVANCE.launch(
-            self._updating(s.rows, x, direction), self._assessing(x, classify), launch=launch
+            self._update_kernel(s.rows, x, direction),
+            self._evaluate_kernel(x, classify),
+            launch=launch,
         )
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
-    def _updating(self, rows: Rows, x: DeviceArray, direction: DeviceArray) -> BoundKernel:
+    def _update_kernel(self, rows: Rows, x: DeviceArray, direction: DeviceArray) -> BoundKernel:
         bounds = self.problem.bounds.operands
         return kernels.UPDATE.bind(
             rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars
         )
 
-    def _assessing(self, x: DeviceArray, classify: bool) -> BoundKernel:
+    def _evaluate_kernel(self, x: DeviceArray, classify: bool) -> BoundKernel:
         """Return the kernel that evaluates the residual at x, with its arguments."""
         p, finest = self.problem, self._finest
         return kernels.ASSESS.bind(

@@ -240,15 +240,15 @@ class IncompleteFactors:
         """
         try:
             if block.shape[0] <= DIRECT:
-                return scipy.sparse.linalg.splu(nudged(block, NUDGE)).solve
+                return scipy.sparse.linalg.splu(perturb_diagonal(block, NUDGE)).solve
             return scipy.sparse.linalg.spilu(
-                nudged(block, NUDGE, small=100 * DROP), drop_tol=DROP, fill_factor=FILL
+                perturb_diagonal(block, NUDGE, small=100 * DROP), drop_tol=DROP, fill_factor=FILL
             ).solve
         except RuntimeError:  # a factor is exactly singular after all
             return np.asarray
 
 
-def nudged(
+def perturb_diagonal(
     block: scipy.sparse.csr_array, share: float, *, small: float = 0.0
 ) -> scipy.sparse.csr_array:
     """Return a block without exactly singular factors.

@@ -69,7 +69,7 @@ def geometries(model: newton.Model, origin: np.ndarray) -> dict[int, list[Geomet
     return geometries_of
 
 
-def united(shapes: list[Geometry]) -> Geometry:
+def union_of(shapes: list[Geometry]) -> Geometry:
     """Return all shapes of a body as one shape."""
     return shapes[0] if len(shapes) == 1 else Union(parts=tuple(shapes))
 

@@ -128,7 +128,7 @@ def photograph_run(
                 settings.shutter / recording.scene.time.frames_per_second,
             )
             radiance = render_radiance(scenes.frame(number), quality, number, variant)
-            _save(developed(radiance), wanted[number], files[number], folder)
+            _save(tone_mapped(radiance), wanted[number], files[number], folder)
         on_progress(done, len(numbers))
         yield files[number]
 
@@ -234,7 +234,7 @@ def core_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def developed(radiance: np.ndarray) -> np.ndarray:
+def tone_mapped(radiance: np.ndarray) -> np.ndarray:
     """Return 8-bit pixels of scene-linear radiance."""
     return (
         255.0 * agx(EXPOSURE * radiance, contrast=CONTRAST, saturation=SATURATION) + 0.5

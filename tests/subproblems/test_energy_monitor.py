@@ -190,7 +190,7 @@ def test_projected_sweeps_lower_the_energy_from_anywhere():
     work.begin_cycles(300)
     energies, norms = [work.residual.energy], [work.residual.norm]
     for _ in range(300):
-        work.descent.safe = True
+        work.energy_monitor.safe = True
         work.monotone_step()
         energies.append(work.residual.energy)
         norms.append(work.residual.norm)
@@ -216,13 +216,13 @@ def test_unsuccessful_descent_calls_become_rarer():
     descent.start(0.0, 1.0)
     for k in range(16):
         fell = descent.record(-0.1 * (k + 1), 1.0)
-        called.append(descent.creeps(fell, moved=True))
+        called.append(descent.needs_cycle(fell, moved=True))
         if called[-1]:
             descent.weigh(0.1)  # no more than the step before: in vain
     steps = np.flatnonzero(called)
     assert (np.diff(np.diff(steps)) > 0).all()
     assert len(steps) >= 3
-    assert not descent.creeps(0.1, moved=False)
+    assert not descent.needs_cycle(0.1, moved=False)
 
 
 def test_a_cycle_that_raises_the_energy_makes_the_next_ones_safe():

@@ -153,7 +153,7 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
             level.changed.fill_(1)
             for w in (level.stencil.d, *level.stencil.weights) if level is not first else ():
                 w.zero_()
-        for sequence in (small.coarsening, cycles):
+        for sequence in (small.coarsen_kernel, cycles):
             for i in range(len(sequence.tables.order)):
                 wp.launch(
                     sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu"
@@ -282,7 +282,7 @@ def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_p
         hierarchy._small.solve(1, projected=projected, from_zero=True)[0].kernel.module.name: 1
         for projected in (False, True)
     }
-    modules[hierarchy._small.coarsening.kernel.module.name] = 1
+    modules[hierarchy._small.coarsen_kernel.kernel.module.name] = 1
     # Assembled, eliminated forward and backward.
     modules[coarsest_kernels(True, real, real).invert.module.name] = 3
     for module, barriers in modules.items():
