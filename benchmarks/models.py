@@ -361,7 +361,7 @@ def table_of(simulator: str, dimension: int, records: list[BenchmarkRecord]) -> 
 def price_list(records: list[BenchmarkRecord]) -> TableView:
     """Return the contents of `warp_lcp/scene/models.toml`.
 
-    It holds the fields of `warp_lcp.scene.models.Price` by simulator, dimension and model.
+    It holds the fields of `warp_lcp.scene.models.ModelCost` by simulator, dimension and model.
     """
     listed: Tables = {}
     for record in records:

@@ -162,7 +162,7 @@ class _GridBenchmark:
         wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
         hierarchy: Hierarchy = workspace.hierarchy
         fine, coarse = hierarchy.levels[:2]
-        sweep = fine.sweeping(fine.t, fine.x, 0.5, projected=False)
+        sweep = fine.sweep_kernel(fine.t, fine.x, 0.5, projected=False)
         return {
             "x += z (what memory allows)": _program(
                 ADD.bind(rows_of(self.x), z=self.x, x=self.y).launch
@@ -171,7 +171,7 @@ class _GridBenchmark:
                 lambda launch: self.box.stencil.product(self.x, self.y, launch=launch)
             ),
             "sweep": _program(sweep.launch),
-            "restriction": _program(fine.restricting(coarse).launch),
+            "restriction": _program(fine.restrict_kernel(coarse).launch),
             "cycle": hierarchy.cycle.run,
             "steps of a solve": lambda: wl.solve(
                 self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace

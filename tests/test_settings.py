@@ -290,5 +290,7 @@ def test_old_names_of_modules_and_methods_warn_and_give_the_new_ones():
         def twice(self, number: int) -> int:
             return 2 * number + 1
 
-    with pytest.warns(DeprecationWarning, match=r"Own\.double is now Own\.twice"):
+    with pytest.warns(
+        DeprecationWarning, match=r"SubclassOfRenamed\.double is now SubclassOfRenamed\.twice"
+    ):
         assert SubclassOfRenamed().double(2) == 5

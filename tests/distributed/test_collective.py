@@ -46,7 +46,7 @@ lambda text: sys.stderr.write(text + "\\n"))
                 raise ValueError("wrong")
 
     def led():
-        with collective.led():
+        with collective.root_only():
             if ranks.is_root:
                 raise ValueError("from the first")
 

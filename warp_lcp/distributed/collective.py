@@ -70,7 +70,7 @@ class Collective:
         failed: the ranks on which the last block failed.
         watchdog: deadlock watchdog, or None.
 
-    >>> alone = Collective.of_one()
+    >>> alone = Collective.for_one_process()
     >>> with alone.together():
     ...     raise OSError("the disk is full")
     Traceback (most recent call last):

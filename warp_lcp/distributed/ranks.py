@@ -227,7 +227,7 @@ def device_by_number(name: str | None, number: int, gpus: list[str]) -> str:
         ValueError: there is no such device.
 
     Example:
-        >>> [dealt("cuda", number, ["cuda:0", "cuda:1"]) for number in range(3)]
+        >>> [device_by_number("cuda", number, ["cuda:0", "cuda:1"]) for number in range(3)]
         ['cuda:0', 'cuda:1', 'cuda:0']
     """
     if name == "cpu" or (name is None and not gpus):

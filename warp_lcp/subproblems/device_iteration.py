@@ -65,7 +65,7 @@ ROWS = 32  # largest number of rows
 ROW_STEP = wp.constant(4)
 ROW_SIZE = wp.constant(5)
 ROW = wp.constant(6)
-# Slots of the numbers by which the device judges its steps, as `descent.Descent` and the outer loop
+# Slots of the numbers by which the device judges its steps, as `EnergyMonitor` and the outer loop
 # do.
 TAKEN = wp.constant(0)  # number of rows written
 MOST = wp.constant(1)  # largest number of rows
