@@ -35,8 +35,8 @@ test-distributed:
 # transfers, steps of scenes that have all that there is in scenes, with threads in an unusual order;
 # PYTEST_ARGS="-m ''" for all scenes and all precisions, EMULATED=tests for all there is, COMPARE=1
 # to launch every kernel in three orders.
-EMULATED ?= tests/solvers/test_table.py tests/multigrid/test_small_levels.py tests/grid/test_transfer.py \
-	tests/solvers/test_device_iteration.py tests/grid/test_window_reduction.py tests/kernels/test_joined_graphs.py tests/granular/test_stress_device_iteration.py tests/granular/test_percentiles.py \
+EMULATED ?= tests/solvers/test_table.py tests/multigrid/test_fused_levels.py tests/grid/test_transfer.py \
+	tests/solvers/test_device_iteration.py tests/grid/test_window_reduction.py tests/kernels/test_joined_graphs.py tests/granular/test_stress_device_iteration.py tests/granular/test_runout.py \
 	tests/test_as_on_cuda.py
 emulated-cuda: $(VENV)/.dev
 	PYTHONPATH=tests:. $(BIN)/python -m pytest -p emulated_cuda -n $(WORKERS) --dist worksteal $(EMULATED) $(PYTEST_ARGS)

@@ -25,10 +25,10 @@ from rich.console import Console
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
 from warp_lcp.files.tables import Tables
-from warp_lcp.problem.protocol import families
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.operator_protocol import families
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.run.loop import RunRequest, run_scene
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import METHODS
@@ -267,7 +267,7 @@ def frames(name: str, resolution: int, duration: float) -> str:
         scene = load_scene(name, [f"domain.resolution={resolution}", f"time.duration={duration}"])
         run_scene(
             RunRequest(scene=scene, out=Path(out) / "run", device="cpu"),
-            observer=Lines(Console(quiet=True)),
+            observer=ProgressLines(Console(quiet=True)),
         )
         found = sorted(p for p in Path(out, "run", "frames").rglob("*") if p.is_file())
         return f"{name}: {len(found)} files {_digest(*(p.read_bytes() for p in found))}"

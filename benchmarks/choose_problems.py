@@ -14,7 +14,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp import gallery
-from warp_lcp.gallery import Plant, Problem, planted
+from warp_lcp.gallery import PlantedSolution, Problem, planted
 from warp_lcp.gallery.contact_scenes import SCENES, contact_scene
 from warp_lcp.rigid.contact_models import StewartTrinkleModel
 
@@ -37,7 +37,7 @@ def between(rng: np.random.Generator, low: float, high: float) -> int:
     return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
 
-def plant(rng: np.random.Generator) -> Plant:
+def plant(rng: np.random.Generator) -> PlantedSolution:
     """Return options for a planted solution.
 
     They choose a share of active unknowns and, sometimes, boxes, weakly active unknowns and
@@ -45,7 +45,7 @@ def plant(rng: np.random.Generator) -> Plant:
     """
     boxed = bool(rng.random() < 0.3)
     weak, mixed = (float(rng.random() < 0.2) * float(rng.uniform(0, 0.5)) for _ in range(2))
-    return Plant(active=float(rng.uniform(0.1, 0.7)), boxed=boxed, weak=weak, mixed=mixed)
+    return PlantedSolution(active=float(rng.uniform(0.1, 0.7)), boxed=boxed, weak=weak, mixed=mixed)
 
 
 def grid(rng: np.random.Generator, seed: int, shape: tuple[int, ...]) -> Problem:
@@ -176,7 +176,7 @@ def bodies_in_liquid(rng: np.random.Generator) -> wl.LCP:
 
 def equations(rng: np.random.Generator, seed: int) -> Problem:
     """Return a problem without bounds on a grid, or on a sparse or dense matrix."""
-    kind, all_free = rng.integers(3), Plant(mixed=1.0)
+    kind, all_free = rng.integers(3), PlantedSolution(mixed=1.0)
     if kind == 0:
         return gallery.poisson(
             (between(rng, 8, 100),) * 2, plant=all_free, seed=seed, device=DEVICE, dtype=wp.float64
@@ -398,7 +398,7 @@ def negative_diagonal(rng: np.random.Generator, seed: int, *, boxed: bool) -> Pr
     return planted(
         A,
         np.random.default_rng(seed),
-        Plant(active=0.4, boxed=boxed),
+        PlantedSolution(active=0.4, boxed=boxed),
         name="negative diagonal",
         facts=frozenset(),
     )

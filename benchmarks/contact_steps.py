@@ -61,7 +61,7 @@ def spheres(method: str) -> Tables:
     }
 
 
-class _Timed:
+class _TimedMethod:
     """Contact method whose solves are timed."""
 
     def __init__(self, solver: Callable[[ContactProblem, np.ndarray], ContactImpulses]) -> None:
@@ -94,7 +94,7 @@ def steps_of_spheres(options: Options) -> tuple[list[BenchmarkRecord], RecordTab
             load_scene(spheres(method)), device=options.device, folder=Path()
         )
         solve = simulations[method].bodies._solve
-        solve._solver = timed[method] = _Timed(solve._solver)
+        solve._solver = timed[method] = _TimedMethod(solve._solver)
     last = simulations[METHODS[-1]]
     for _ in range(SETTLING):
         last.step(DT)

@@ -128,7 +128,7 @@ def memory_of(n: int) -> tuple[int, float, float]:
     )
 
 
-class Shares(NoStopwatch):
+class StageShares(NoStopwatch):
     """Stopwatch that adds up the seconds of each stage."""
 
     def __init__(self) -> None:
@@ -166,7 +166,7 @@ def _flight() -> BenchmarkRecord:
     simulation = SIMULATOR.create(scene, device="cpu", folder=Path())
     for _ in range(STEPS):
         simulation.step(min(simulation.stable_dt(), LONGEST))
-    watch = simulation.watch = Shares()
+    watch = simulation.watch = StageShares()
     grids, begun = [simulation.grid], time.perf_counter()
     while simulation.time < FLIGHT:
         simulation.step(min(simulation.stable_dt(), LONGEST))

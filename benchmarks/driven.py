@@ -18,7 +18,7 @@ from rich.console import Console
 
 import warp_lcp as wl
 from warp_lcp.run.loop import RunRequest, run_scene
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.run.resolve_scene import resolve_scene
 
 SCENES = {"dam-break-2d": 1.0, "dam-break": 0.3}  # [s] simulated
@@ -30,7 +30,7 @@ def by_command(scene: str, folder: Path, duration: float) -> None:
     given = resolve_scene(scene, [f"time.duration={duration}"])
     run_scene(
         RunRequest(scene=given.scene, out=folder, overrides=given.overrides),
-        observer=Lines(Console(quiet=True)),
+        observer=ProgressLines(Console(quiet=True)),
     )
 
 

@@ -43,7 +43,7 @@ from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.problems import natural, splash
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, loops_on_device
-from warp_lcp.reduced.device_iteration import DeviceIteration
+from warp_lcp.subproblems.device_iteration import DeviceIteration
 
 CLOSE, ALIKE = 1e-5, 2e-2  # relative: for solutions to 1e-8, and for particles after many steps
 WRONG = 3  # exit status of `benchmarks.gpu_kernels` where kernels differ
@@ -52,7 +52,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass
-class Claim:
+class GpuCheck:
     """One check: whether it passed, and its details."""
 
     name: str
@@ -71,7 +71,7 @@ class GpuVerdict:
 
     def __init__(self, device: str, *, rehearsal: bool, out: Path) -> None:
         self.device, self.rehearsal, self.out = device, rehearsal, out
-        self.claims: list[Claim] = []
+        self.claims: list[GpuCheck] = []
         self.tables: list[RecordTable] = []
         self.steps = 10 if rehearsal else gpu_cases.STEPS
 
@@ -93,7 +93,7 @@ class GpuVerdict:
                 False,
             )
         if text is not None:
-            self.claims.append(Claim(name, holds, text))
+            self.claims.append(GpuCheck(name, holds, text))
             print(
                 f"{'PASS' if holds else 'FAIL'}  {name}: {text} ({time.perf_counter() - start:.0f} "
                 "s)",

@@ -16,7 +16,7 @@ import scipy.sparse
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.solvers.registry import METHODS

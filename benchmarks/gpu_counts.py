@@ -34,9 +34,9 @@ import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine_code import Kernel, assemble, tools_missing
-from benchmarks.machine_counts import Issued, issued
-from benchmarks.machine_memory import Memory, constants_of
-from warp_lcp.benchmarks.kernels import Heard
+from benchmarks.machine_counts import IssuedInstructions, issued
+from benchmarks.machine_memory import EmulatedMemory, constants_of
+from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.kernels import StencilKernel, layout
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.multigrid.stencil_level import StencilLevel
@@ -94,7 +94,7 @@ class InstructionCount:
     """
 
     name: str
-    issued: Issued
+    issued: IssuedInstructions
     cells: float
     waits: int
     registers: int
@@ -148,7 +148,7 @@ def kinds(given: Tables) -> str:
     return "".join(f" {word}" for word in ("from_zero", "projected") if given.get(word))
 
 
-def passes() -> dict[str, tuple[Heard, Tables]]:
+def passes() -> dict[str, tuple[BoundByName, Tables]]:
     """Return the kernels over the finest grid in solves of a full basin, by name.
 
     They are bound as CUDA launches them on large grids.
@@ -159,7 +159,7 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
     for side in (0, -1):
         wall[side] = wall[:, side] = wall[:, :, side] = True
     b = np.where(cells == wl.FLUID, np.random.default_rng(2015).standard_normal(SHAPE), 0.0)
-    heard: list[tuple[Heard, Tables]] = []
+    heard: list[tuple[BoundByName, Tables]] = []
     bind = StencilKernel.bind_arguments
 
     def listening(
@@ -185,7 +185,7 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        heard.append((Heard(bound, fields), bound.kernel_args))
+        heard.append((BoundByName(bound, fields), bound.kernel_args))
         return bound
 
     blocks = math.prod(SHAPE) // 8  # of the next level, too, but not of those in one launch
@@ -213,7 +213,7 @@ def passes() -> dict[str, tuple[Heard, Tables]]:
         A = wl.GridPoisson(cells, device="cpu")
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device="cpu")
         A.stencil.product(x, wp.zeros_like(x))
-    by_name: dict[str, tuple[Heard, Tables]] = {}
+    by_name: dict[str, tuple[BoundByName, Tables]] = {}
     for one, given in heard:
         rows, declared = one.bound.rows, one.bound.form.declared
         if max(rows.size, rows.other_size) == A.layout.size and not (
@@ -232,7 +232,7 @@ def cells_of(bound: BoundKernel) -> int:
     return max(rows.size, rows.other_size) or L.planes * L.rows * L.nx
 
 
-def count(name: str, one: Heard, kernel_args: Tables, folder: Path) -> InstructionCount:
+def count(name: str, one: BoundByName, kernel_args: Tables, folder: Path) -> InstructionCount:
     """Compile a pass for CUDA, execute a warp in the middle of the grid, and return what it takes.
 
     Args:
@@ -261,7 +261,7 @@ def count(name: str, one: Heard, kernel_args: Tables, folder: Path) -> Instructi
         for a in (*one.fields.values(), *kernel_args.values(), rows.spans)
         if isinstance(a, wp.array) and a.size
     ]
-    memory = Memory((int(a.ptr), a.numpy().copy()) for a in arrays)
+    memory = EmulatedMemory((int(a.ptr), a.numpy().copy()) for a in arrays)
     blocks = -(-math.prod(dim) // BLOCK)
     constants = constants_of(parameters, BLOCK, blocks)
     found = issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in chunk_range])

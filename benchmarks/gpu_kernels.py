@@ -153,7 +153,7 @@ def native(kind):
     )
 
 
-class Copies:
+class LaunchCopies:
     """Copies of the arrays of a launch on the CPU.
 
     They overlap as the arrays on the device do.
@@ -268,7 +268,7 @@ class KernelCheck:
             return run()
         self.tried[sized] += 1
         self.busy = True
-        copies = Copies(self.device, arguments)
+        copies = LaunchCopies(self.device, arguments)
         self._launch_here(kernel, name, bounds, values)
         done = run()
         if self._compare(name, bounds.size, copies):

@@ -43,7 +43,7 @@ from warp._src import context
 
 import warp_lcp as wl
 from benchmarks.gpu_launches import LaunchCounter
-from warp_lcp.benchmarks.kernels import Heard
+from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
@@ -74,7 +74,7 @@ STEP_SIZES = (64, 128, 256)
 
 
 @dataclass
-class Work:
+class RecordedWork:
     """Recorded launches.
 
     Attributes:
@@ -94,7 +94,7 @@ class Work:
     names: list[str] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
     cells: list[float] = field(default_factory=list)
-    bounds: dict[str, Heard] = field(default_factory=dict)
+    bounds: dict[str, BoundByName] = field(default_factory=dict)
     stages: int = 0
     across: int = 0
     readbacks: int = 0
@@ -188,7 +188,7 @@ class Work:
         moved = [size for size, key in zip(self.bytes, self.keys, strict=True) if key not in counts]
         return sum(moved) / max(sum(self.bytes), 1.0)
 
-    def grown(self, before: "Work", levels: int) -> "Work":
+    def grown(self, before: "RecordedWork", levels: int) -> "RecordedWork":
         """Return the work on a grid 2^levels times as fine.
 
         `before` is the work on a grid half as fine. Launches and stages grow by the same number
@@ -243,7 +243,7 @@ class KernelRow:
         return [*(f"{value:.1f}" for value in counted), str(one.waits), str(one.registers)]
 
 
-class Launched(NamedTuple):
+class LaunchWork(NamedTuple):
     """Work of a launch: bytes, barriers, cells, and the names of the pass and its kernel."""
 
     bytes: float
@@ -259,7 +259,9 @@ def name_of(kernel: wp.Kernel) -> str:
     return f"{kernel.module.name.removeprefix('warp_lcp.')}:{kernel.key}"
 
 
-def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | None = None) -> Work:
+def heard(
+    make: Callable[[], Callable[[], object]], counter: LaunchCounter | None = None
+) -> RecordedWork:
     """Return the launches of a call.
 
     Args:
@@ -267,8 +269,8 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
             has set up.
         counter: it counts the first launch of each kernel; None: none is counted.
     """
-    by_bound: dict[int, tuple[BoundKernel, Heard]] = {}
-    tags: dict[int, tuple[object, Launched]] = {}
+    by_bound: dict[int, tuple[BoundKernel, BoundByName]] = {}
+    tags: dict[int, tuple[object, LaunchWork]] = {}
     bind, launch_bound, launch_sequence = (
         StencilKernel.bind_arguments,
         BoundKernel.launch,
@@ -276,9 +278,9 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
     )
     plain, replay = wp.launch, wp.Launch.launch
     invokes = {name: getattr(context, name) for name in ("invoke", "invoke_cpu_blocks")}
-    current: list[Launched] = []
-    active: list[Launched] = []
-    recorded = Work()
+    current: list[LaunchWork] = []
+    active: list[LaunchWork] = []
+    recorded = RecordedWork()
 
     def binding(
         declared: StencilKernel,
@@ -300,17 +302,17 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        by_bound[id(bound)] = bound, Heard(bound, fields)
+        by_bound[id(bound)] = bound, BoundByName(bound, fields)
         return bound
 
     def launching(bound: BoundKernel, *args: Launch) -> None:
         known = by_bound.get(id(bound))
-        launched = Launched(0.0, 0)
+        launched = LaunchWork(0.0, 0)
         if known:
             one = known[1]
             moved = float(sum(one.reads.values()) + sum(one.writes.values()))
             key = gpu_counts.key(one.name + gpu_counts.kinds(bound.kernel_args))
-            launched = Launched(moved, 0, key, gpu_counts.cells_of(bound))
+            launched = LaunchWork(moved, 0, key, gpu_counts.cells_of(bound))
             recorded.bounds[key] = one
         current.append(launched)
         launch_bound(bound, *args)
@@ -319,7 +321,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
     def sequencing(sequence: PersistentKernel, *args: Launch) -> None:
         stages = len(sequence._stages)
         across = stages if sequence.tasks > THREADS else 0
-        current.append(Launched(0.0, stages, across=across))
+        current.append(LaunchWork(0.0, stages, across=across))
         launch_sequence(sequence, *args)
         current.pop()
 
@@ -338,7 +340,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
         launched = (
             current[-1]._replace(name=name)
             if current
-            else Launched(moved, 0, name, float(np.prod(dim)), name)
+            else LaunchWork(moved, 0, name, float(np.prod(dim)), name)
         )
         active.append(launched)
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
@@ -350,13 +352,13 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
         return made
 
     def replaying(command: wp.Launch, *args: object) -> None:
-        _, launched = tags.get(id(command), (None, Launched(0.0, 0)))
+        _, launched = tags.get(id(command), (None, LaunchWork(0.0, 0)))
         active.append(launched)
         replay(command, *args)
         active.pop()
         note(launched, graph=True)
 
-    def note(launched: Launched, *, graph: bool) -> None:
+    def note(launched: LaunchWork, *, graph: bool) -> None:
         recorded.bytes.append(launched.bytes)
         recorded.graph.append(graph)
         recorded.names.append(launched.name)
@@ -401,7 +403,7 @@ def heard(make: Callable[[], Callable[[], object]], counter: LaunchCounter | Non
     return recorded
 
 
-def solve(n: int, *, clusters: bool = False) -> tuple[Work, int]:
+def solve(n: int, *, clusters: bool = False) -> tuple[RecordedWork, int]:
     """Return the work and the iterations of a cold solve of a splash.
 
     Walls separate; the tolerance is 1e-6.
@@ -427,7 +429,7 @@ def solve(n: int, *, clusters: bool = False) -> tuple[Work, int]:
     return work, results[-1].iterations
 
 
-def step(n: int, name: str = "dam-break", counter: LaunchCounter | None = None) -> Work:
+def step(n: int, name: str = "dam-break", counter: LaunchCounter | None = None) -> RecordedWork:
     """Return the work of some steps of a scene, with n cells along x."""
     scene = load_scene(name, [f"domain.resolution={n}"])
 
@@ -442,7 +444,7 @@ def step(n: int, name: str = "dam-break", counter: LaunchCounter | None = None) 
     return heard(make, counter)
 
 
-def table(small: Work, large: Work, n: int, times: int = 1) -> str:
+def table(small: RecordedWork, large: RecordedWork, n: int, times: int = 1) -> str:
     """Return a table of estimated times, by grid size and device.
 
     `times` are extrapolated from the work at n / 2 and at n.
@@ -466,7 +468,9 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
 
 
 def limits_table(
-    works: dict[bool, tuple[Work, Work]], n: int, counts: dict[str, gpu_counts.InstructionCount]
+    works: dict[bool, tuple[RecordedWork, RecordedWork]],
+    n: int,
+    counts: dict[str, gpu_counts.InstructionCount],
 ) -> str:
     """Return a table of what holds solves on GPUs.
 
@@ -565,7 +569,7 @@ def main() -> None:
             print(line, flush=True)
         if options.solves:
             n = options.cells
-            works = dict[bool, tuple[Work, Work]]()
+            works = dict[bool, tuple[RecordedWork, RecordedWork]]()
             for clusters in (True, False):
                 (small, _), (large, iterations) = (solve(m, clusters=clusters) for m in (n // 2, n))
                 works[clusters] = small, large

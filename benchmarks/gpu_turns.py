@@ -34,7 +34,7 @@ from typing import TypedDict, TypeVar
 Answer = dict[str, float | str]  # figures and words of a piece of work
 
 
-class Row(TypedDict):
+class WorkItem(TypedDict):
     """A piece of work and the answers of the workers."""
 
     kind: str
@@ -62,7 +62,7 @@ SOLVES = 3  # timed solves, of which the fastest counts
 
 
 @dataclass(frozen=True)
-class Sizes:
+class WorkSizes:
     """Cells along an axis, for each kind of work."""
 
     solves: tuple[int, ...] = (128, 256, 512)
@@ -72,10 +72,10 @@ class Sizes:
     timed: int = TIMED
 
 
-SMALL = Sizes(solves=(16,), methods=8, steps=(16,), before=1, timed=1)
+SMALL = WorkSizes(solves=(16,), methods=8, steps=(16,), before=1, timed=1)
 
 
-def pieces(sizes: Sizes) -> Iterator[tuple[str, str, int]]:
+def pieces(sizes: WorkSizes) -> Iterator[tuple[str, str, int]]:
     """Yield the pieces of work: kind, method or scene, and cells along an axis."""
     for n in sizes.solves:
         yield "cold solve", "ProjectedMultigrid", n
@@ -116,7 +116,7 @@ def solve(method: str, n: int, device: str) -> dict[str, float | str]:
     return {"ms": 1e3 * min(times), "iterations": last.iterations, "status": last.status.name}
 
 
-def step(scene: str, n: int, device: str, sizes: Sizes) -> dict[str, float | str]:
+def step(scene: str, n: int, device: str, sizes: WorkSizes) -> dict[str, float | str]:
     """Return the mean time of a step of a scene [ms]."""
     from warp_lcp.scene.scene_file import load_scene
     from warp_lcp.scene.simulator import simulators
@@ -134,7 +134,7 @@ def step(scene: str, n: int, device: str, sizes: Sizes) -> dict[str, float | str
     return {"ms": 1e3 * seconds / sizes.timed}
 
 
-def worker(device: str, sizes: Sizes) -> None:
+def worker(device: str, sizes: WorkSizes) -> None:
     """Read requests from the standard input, a line each, and answer by lines."""
     for line in sys.stdin:
         kind, name, n = json.loads(line)
@@ -189,12 +189,12 @@ class TreeWorker:
 
 
 @dataclass
-class Turns:
+class InterleavedTurns:
     """All pieces of work by all workers, with the results so far."""
 
     out: Path
     names: list[str]
-    rows: list[Row] = field(default_factory=list)
+    rows: list[WorkItem] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
     def add(self, piece: tuple[str, str, int], found: dict[str, Answer]) -> None:
@@ -237,7 +237,7 @@ def shown(figures: Answer) -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Time all pieces of work, interleaved; return the exit status."""
-    start_time, sizes = time.monotonic(), SMALL if options.rehearse else Sizes()
+    start_time, sizes = time.monotonic(), SMALL if options.rehearse else WorkSizes()
     options.out.mkdir(parents=True, exist_ok=True)
     device = "cpu" if options.rehearse else options.device
     trees = {"this tree": (ROOT, "1"), "this tree, a cell a thread": (ROOT, "0")}
@@ -247,7 +247,7 @@ def run(options: argparse.Namespace) -> int:
         name: TreeWorker(tree, quads, rehearse=options.rehearse, device=device)
         for name, (tree, quads) in trees.items()
     }
-    turns = Turns(options.out, list(workers))
+    turns = InterleavedTurns(options.out, list(workers))
     try:
         wanted = [piece for piece in pieces(sizes) if options.only in f"{piece[0]}: {piece[1]}"]
         for turn, piece in enumerate(wanted):
@@ -296,7 +296,7 @@ def main() -> int:
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.worker:
-        worker("cpu" if given.rehearse else given.device, SMALL if given.rehearse else Sizes())
+        worker("cpu" if given.rehearse else given.device, SMALL if given.rehearse else WorkSizes())
         return 0
     return run(given)
 

@@ -37,7 +37,7 @@ from warp_lcp.kernels.thread_pool import (
 )
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
-from warp_lcp.simulation import Profiled
+from warp_lcp.simulation import HasStages
 
 TITLE = "Host time of a step by stage"
 SCENES = ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "dam-break")
@@ -275,7 +275,7 @@ def scene_records(
             raise ValueError(f"{what} = {number}: must be >= 1")
     scene = load_scene(name, [f"domain.resolution={resolution}"])
     simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
-    if not isinstance(simulation, Profiled):
+    if not isinstance(simulation, HasStages):
         raise ValueError(f"{name}: its simulation has no stages")
 
     def step() -> None:

@@ -55,7 +55,7 @@ PEER_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class BoundByName:
     """Stencil kernel with its fields by name, recorded when it was bound."""
 
     bound: BoundKernel
@@ -223,12 +223,12 @@ def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
     return waited
 
 
-def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
+def _hear(scene: Splash, device: str) -> tuple[dict[str, BoundByName], BoundByName]:
     """Return the kernels over the finest grid that solves of the scene bind.
 
     Each pass has a unique label. The float32 product among them is returned as well.
     """
-    recorded: list[Heard] = []
+    recorded: list[BoundByName] = []
     bind = StencilKernel.bind
 
     def listening(
@@ -251,7 +251,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
             for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False)
             if name
         }
-        recorded.append(Heard(bound, fields))
+        recorded.append(BoundByName(bound, fields))
         return bound
 
     with mock.patch.object(StencilKernel, "bind", listening):
@@ -271,7 +271,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         A = wl.GridPoisson(scene.cells, device=device, **scene.faces)
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
         A.stencil.product(x, wp.zeros_like(x))
-    kinds: dict[str, Heard] = {}
+    kinds: dict[str, BoundByName] = {}
     for one in recorded:
         declared = one.bound.form.declared
         alone = not declared.name.startswith(
@@ -290,7 +290,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     return kinds, kinds[recorded[-1].name]
 
 
-def _peers(product: Heard, n: int, device: str) -> dict[str, Callable[[], None]]:
+def _peers(product: BoundByName, n: int, device: str) -> dict[str, Callable[[], None]]:
     """Return the peers of the product on the same memory.
 
     The place of a field in the sets of the caches changes the time by 30 % at 128^3.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from benchmarks.machine_code import Instruction
-from benchmarks.machine_memory import Memory
+from benchmarks.machine_memory import EmulatedMemory
 from benchmarks.machine_thread import Lane, decoded
 
 FLOAT64 = frozenset(("DADD", "DMUL", "DFMA", "DSETP", "DMNMX"))
@@ -21,7 +21,7 @@ LOCAL = frozenset(("LDL", "STL"))
 
 
 @dataclass
-class Issued:
+class IssuedInstructions:
     """Counts of a warp.
 
     Attributes:
@@ -52,9 +52,9 @@ class Issued:
 def issued(
     code: dict[int, Instruction],
     constants: bytes,
-    memory: Memory,
+    memory: EmulatedMemory,
     threads: Sequence[tuple[int, int]],
-) -> Issued:
+) -> IssuedInstructions:
     """Count the instructions of a warp.
 
     Its threads have these pairs (index in the block, index of the block).
@@ -74,7 +74,7 @@ def issued(
         for at, turn, address, size, is_load in lane.accesses:
             groups[at, turn, is_load].append((address, size))
     of = lambda names: sum(n for at, n in most.items() if code[at].name in names)  # noqa: E731
-    counts = Issued(sum(most.values()), waits=waits)
+    counts = IssuedInstructions(sum(most.values()), waits=waits)
     counts.float64, counts.atomics, counts.local = of(FLOAT64), of(ATOMIC), of(LOCAL)
     reached: dict[bool, set[int]] = {True: set(), False: set()}
     for (_, _, is_load), accesses in groups.items():
@@ -89,13 +89,13 @@ def issued(
     return counts
 
 
-def mean_of(issues: Sequence[Issued]) -> Issued:
+def mean_of(issues: Sequence[IssuedInstructions]) -> IssuedInstructions:
     """Return the mean of what some warps issue, rounded, with all addresses that they reach."""
 
-    def mean(of: Callable[[Issued], int]) -> int:
+    def mean(of: Callable[[IssuedInstructions], int]) -> int:
         return round(sum(of(one) for one in issues) / len(issues))
 
-    return Issued(
+    return IssuedInstructions(
         mean(lambda one: one.instructions),
         mean(lambda one: one.float64),
         mean(lambda one: one.loads),

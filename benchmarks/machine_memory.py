@@ -16,7 +16,7 @@ PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 NEAR = 65536  # bytes beside memory that are read as 0
 
 
-class Memory:
+class EmulatedMemory:
     """Copies of arrays at their addresses.
 
     Writes are kept apart and override the copies.
@@ -62,7 +62,7 @@ class Memory:
         self.written.update((at + k, byte) for k, byte in enumerate(data))
 
 
-class ProcessMemory(Memory):
+class ProcessMemory(EmulatedMemory):
     """Memory of this process at its addresses; writes are kept apart."""
 
     def __init__(self) -> None:

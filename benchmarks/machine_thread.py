@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.machine_code import Instruction
-from benchmarks.machine_memory import Memory
+from benchmarks.machine_memory import EmulatedMemory
 
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
 MOST = 200_000  # most instructions of a lane
@@ -209,7 +209,7 @@ class Lane:
 
     code: dict[int, Instruction]
     constants: bytes
-    memory: Memory
+    memory: EmulatedMemory
     thread: int
     block: int
     registers: dict[str, int] = field(default_factory=lambda: defaultdict(int))

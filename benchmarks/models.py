@@ -48,7 +48,7 @@ BEGIN, END = (
 
 
 @dataclass(frozen=True)
-class Offer:
+class ModelScenes:
     """Model: tables of the reference scene with it, and of the nearest scene without.
 
     Tables that are not named are those of the reference.
@@ -61,7 +61,7 @@ class Offer:
     frames: bool = False  # whether it works for a frame, not in a step
 
 
-def offers(simulator: str, dimension: int) -> dict[str, Offer]:
+def offers(simulator: str, dimension: int) -> dict[str, ModelScenes]:
     """Return the models of a simulator by name."""
     ball = {"shape": "sphere", "center": [0.72, 0.16, 0.25][:dimension], "radius": 0.1}
     swaying = ball | {
@@ -72,15 +72,17 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
         for x in (0.64, 0.78, 0.92)
     ]
     both = {
-        "cut cells": Offer({"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}),
-        "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
+        "cut cells": ModelScenes(
+            {"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}
+        ),
+        "moving solids": ModelScenes({"solid": [swaying]}, {"solid": [ball]}),
         # Both scenes have moving solids.
-        "rigid bodies": Offer({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),
-        "density correction": Offer({"density_correction": {}}),
-        "automatic density correction": Offer({"density_correction": None}),
-        "reseeding": Offer({"particles": {"reseed": {"every": 1}}}, unit="particle"),
-        "diagnostics": Offer({"output": {}}),
-        "surface mesh": Offer({"output": QUIET | {"surface": True}}, frames=True),
+        "rigid bodies": ModelScenes({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),
+        "density correction": ModelScenes({"density_correction": {}}),
+        "automatic density correction": ModelScenes({"density_correction": None}),
+        "reseeding": ModelScenes({"particles": {"reseed": {"every": 1}}}, unit="particle"),
+        "diagnostics": ModelScenes({"output": {}}),
+        "surface mesh": ModelScenes({"output": QUIET | {"surface": True}}, frames=True),
     }
     if simulator == "granular":
         return both
@@ -91,22 +93,24 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
         for name in ("pressure", "velocity", "level")
     ]
     liquid = {
-        "separating walls": Offer({"domain": {"wall": "separating"}}),
-        "ghost-fluid surface": Offer(level_set),
-        "smoothing": Offer({"pressure": {"smoothing": 2}}, level_set),
-        "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set),
-        "viscosity": Offer({"viscosity": {"value": 10.0}}),
-        "surface tension": Offer(
+        "separating walls": ModelScenes({"domain": {"wall": "separating"}}),
+        "ghost-fluid surface": ModelScenes(level_set),
+        "smoothing": ModelScenes({"pressure": {"smoothing": 2}}, level_set),
+        "unilateral pressure": ModelScenes({"pressure": {"model": "unilateral"}}, level_set),
+        "viscosity": ModelScenes({"viscosity": {"value": 10.0}}),
+        "surface tension": ModelScenes(
             level_set | {"surface_tension": {"coefficient": 0.072}}, level_set
         ),
-        "drag along walls": Offer({"wall_drag": {"coefficient": 5e-3}}),
-        "forces on solids": Offer(
+        "drag along walls": ModelScenes({"wall_drag": {"coefficient": 5e-3}}),
+        "forces on solids": ModelScenes(
             {"solid": [ball], "output": QUIET | {"forces": True}}, {"solid": [ball]}
         ),
-        "probes": Offer({"probe": probes}),
-        "automatic tolerance": Offer({"solver": {"tolerance": "auto"}}),
-        "narrow band": Offer(level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set),
-        "FLIP": Offer(
+        "probes": ModelScenes({"probe": probes}),
+        "automatic tolerance": ModelScenes({"solver": {"tolerance": "auto"}}),
+        "narrow band": ModelScenes(
+            level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set
+        ),
+        "FLIP": ModelScenes(
             {"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"
         ),
     }
@@ -180,7 +184,7 @@ def step_seconds_of(simulation: ParticleSimulation, dt: float) -> tuple[float, T
 
 
 @dataclass
-class Sample:
+class SceneSample:
     """Measured scene: its bytes, and the least seconds of each of its steps.
 
     The steps are the same in each run.
@@ -204,7 +208,7 @@ class Sample:
         self.steps = np.minimum(self.steps[:count], steps[:count])
 
 
-def first_run(scene: Scene, device: str) -> Sample:
+def first_run(scene: Scene, device: str) -> SceneSample:
     """Return a scene's bytes and seconds of one run.
 
     Memory of other simulations is freed first.
@@ -215,10 +219,12 @@ def first_run(scene: Scene, device: str) -> Sample:
     steps = run_seconds(simulation, scene.time)
     simulation.surfaces()
     gc.collect()
-    return Sample(scene, array_bytes() - before, steps)
+    return SceneSample(scene, array_bytes() - before, steps)
 
 
-def measure_all(simulator: str, dimension: int, size: int, options: Options) -> dict[str, Sample]:
+def measure_all(
+    simulator: str, dimension: int, size: int, options: Options
+) -> dict[str, SceneSample]:
     """Return samples of the reference and all models' scenes, by their tables' text.
 
     The runs take turns.
@@ -226,7 +232,7 @@ def measure_all(simulator: str, dimension: int, size: int, options: Options) -> 
     wanted: dict[str, Tables] = {REFERENCE: {}}
     for offer in offers(simulator, dimension).values():
         wanted |= {str(tables): tables for tables in (offer.on, offer.off)}
-    samples: dict[str, Sample] = {}
+    samples: dict[str, SceneSample] = {}
     for text, tables in wanted.items():
         scene = reference(simulator, dimension, tables, size)
         # Loads kernels and data that are no part of a scene's cost.
@@ -248,7 +254,9 @@ def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
     return fixed, max(seconds - fixed, 0.0)
 
 
-def split_base(base: Sample, half: Sample, thin: Sample) -> tuple[float, float, float]:
+def split_base(
+    base: SceneSample, half: SceneSample, thin: SceneSample
+) -> tuple[float, float, float]:
     """Return the seconds of a step: fixed, per cell and per particle.
 
     They are fitted by nonnegative least squares to three scenes of other sizes and amounts of
@@ -353,7 +361,7 @@ def table_of(simulator: str, dimension: int, records: list[BenchmarkRecord]) -> 
 def price_list(records: list[BenchmarkRecord]) -> TableView:
     """Return the contents of `warp_lcp/scene/models.toml`.
 
-    It holds the fields of `warp_lcp.scene.models.Price` by simulator, dimension and model.
+    It holds the fields of `warp_lcp.scene.models.ModelCost` by simulator, dimension and model.
     """
     listed: Tables = {}
     for record in records:

@@ -25,9 +25,9 @@ from warp_lcp.benchmarks.harness.timing import Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import PoissonArguments
-from warp_lcp.problem.protocol import HasStencil, has
-from warp_lcp.problem.solve import Solver
-from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
+from warp_lcp.problem.operator_protocol import HasStencil, has
+from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.subproblems.multigrid_workspace import MultigridWorkspace
 
 TITLE = "Published methods for the pressure LCP"
 SIZES = (64, 128)
@@ -95,7 +95,7 @@ class TruncatedWorkspace(MultigridWorkspace):
         self.forget_direction()
         return False
 
-    def _creeps(self) -> bool:
+    def _needs_cycle(self) -> bool:
         self.judge()
         return False
 

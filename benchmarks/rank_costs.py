@@ -22,12 +22,12 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.benchmarks.harness.machine import cpu_model, forget_peak, resident_bytes
-from warp_lcp.distributed.halo import Gathering, Halo
+from warp_lcp.distributed.halo import GridGather, Halo
 from warp_lcp.distributed.messages import MpiMailbox
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.simulator import FluidsSimulator
-from warp_lcp.grid.part import subdomain_of
+from warp_lcp.grid.grid_part import subdomain_of
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph
 from warp_lcp.scene.scene_file import load_scene
 
@@ -36,7 +36,7 @@ SMALL = "domain.resolution=32"  # loads the kernels
 MEGA = 1 << 20
 
 
-class Traffic:
+class MessageCounter:
     """Counter of the bytes and messages that a rank receives, by kind.
 
     Exchanges of a recorded program count at each of its runs.
@@ -59,7 +59,7 @@ class Traffic:
         )
         self._listen(Halo, "fill", lambda halo, field: _ghosts(halo) * _item(field))
         self._listen(
-            Gathering,
+            GridGather,
             "collect",
             lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole),
         )
@@ -136,7 +136,7 @@ def main() -> None:
     wp.config.log_level = wp.LOG_ERROR
     ranks, (name, *overrides) = Ranks.world(), sys.argv[1:]
     traffic, make = (
-        Traffic(),
+        MessageCounter(),
         partial(FluidsSimulator().create, ranks=ranks, device="cpu", folder=Path()),
     )
     warm = make(load_scene(name, [*overrides, SMALL]))

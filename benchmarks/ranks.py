@@ -37,14 +37,14 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, SplashPart, natural, splash, splash_part
-from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
+from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, ScalingCase
 from warp_lcp.distributed import launch
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.kernels.thread_pool import VARIABLE
-from warp_lcp.problem.solve import Workspace
+from warp_lcp.problem.solve_loop import Workspace
 from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"
@@ -61,11 +61,11 @@ MEGA = 1 << 20
 WALLS = BOUNDS.index("walls")  # bounds whose memory is counted; the others need at most as much
 MEMORY = ("bytes_per_cell", "resident", "resident_more")
 
-Found = Mapping[tuple[int, str, int], BenchmarkRecord]  # by cells a side, bounds, ranks
+RecordsByCase = Mapping[tuple[int, str, int], BenchmarkRecord]  # by cells a side, bounds, ranks
 
 
 @dataclass
-class Shared:
+class RankScalingCase:
     """One kind of bounds at one size, on all ranks."""
 
     decomposition: Decomposition  # decomposition of the n^3 cells
@@ -175,7 +175,7 @@ class Shared:
         self.counts["resident"] = self.ranks.max(peak) / MEGA
         self.counts["resident_more"] = self.ranks.max(peak - before) / MEGA
 
-    def record(self, plain: Growing | None, team: Growing | None) -> BenchmarkRecord:
+    def record(self, plain: ScalingCase | None, team: ScalingCase | None) -> BenchmarkRecord:
         """Return the figures.
 
         `plain` is the same solve by one process, `team` by one with a thread for each rank.
@@ -310,7 +310,7 @@ def on_ranks(
         case.sample(keep=False)  # loads the kernels
     records, cases, threads = (
         list[BenchmarkRecord](),
-        list[tuple[Shared, Growing | None, Growing | None]](),
+        list[tuple[RankScalingCase, ScalingCase | None, ScalingCase | None]](),
         wl.get_threads(),
     )
     for n in sizes:
@@ -331,7 +331,7 @@ def on_ranks(
             case.counts |= {name: shared[WALLS].counts[name] for name in MEMORY}
         scene = splash(n) if ranks.is_root and _fits(n**3, own_device) else None
         alone = [
-            None if scene is None else Growing(scene, bounds, own_device)
+            None if scene is None else ScalingCase(scene, bounds, own_device)
             for bounds in BOUNDS
             for _ in range(2)
         ]
@@ -360,11 +360,11 @@ def on_ranks(
     return [*records, *(case.record(*others) for case, *others in cases)]
 
 
-def shared_cases(n: int, ranks: Ranks, device: str) -> list[Shared]:
+def shared_cases(n: int, ranks: Ranks, device: str) -> list[RankScalingCase]:
     """Return the problems of n^3 cells."""
     decomposition = Decomposition((n, n, n), ranks)
     part = splash_part(n, decomposition.box.slices)
-    return [Shared(decomposition, part, bounds, device) for bounds in BOUNDS]
+    return [RankScalingCase(decomposition, part, bounds, device) for bounds in BOUNDS]
 
 
 def _fits(cells: int, device: str) -> bool:
@@ -385,7 +385,7 @@ def _ratio(a: BenchmarkRecord | None, b: BenchmarkRecord | None, figure: str) ->
     return None if first is None or not second else Figure(first / second)
 
 
-def targets(records: Found, sizes: Sequence[int]) -> RecordTable:
+def targets(records: RecordsByCase, sizes: Sequence[int]) -> RecordTable:
     """Return the targets at the sizes from 128^3 on."""
     rows = []
     for n in (size for size in sizes if size >= 128):
@@ -426,7 +426,7 @@ def targets(records: Found, sizes: Sequence[int]) -> RecordTable:
     return table_of_targets("figure", rows)
 
 
-def _table(records: Found) -> RecordTable:
+def _table(records: RecordsByCase) -> RecordTable:
     columns = [
         "cells",
         "problem",
@@ -492,7 +492,7 @@ def _failures(records: Sequence[BenchmarkRecord]) -> list[str]:
     return lines
 
 
-def _chart(records: Found, sizes: Sequence[int]) -> RecordLines:
+def _chart(records: RecordsByCase, sizes: Sequence[int]) -> RecordLines:
     """Return the chart of the speedup by ranks."""
     gains: dict[str, tuple[list[float], list[float]]] = {
         "as many times as ranks": (list(RANKS), list(RANKS))

@@ -20,7 +20,7 @@ from warp_lcp.files.tables import Tables, TableView
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.problem.solve import Solver, Workspace
+from warp_lcp.problem.solve_loop import Solver, Workspace
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -43,7 +43,7 @@ STAGES: dict[str, tuple[ModuleType | type, str]] = {
 }
 
 
-class Watch:
+class LogCollector:
     """Observer that collects the rows of a run's log."""
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ def _overrides(duration: float, size: int) -> list[str]:
 
 def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]:
     """Run a scene in a temporary folder; return its steps and seconds by stage."""
-    scene, watch = load_scene(name, _overrides(duration, size)), Watch()
+    scene, watch = load_scene(name, _overrides(duration, size)), LogCollector()
     with tempfile.TemporaryDirectory() as folder, timed(device, STAGES) as seconds:
         begun = time.perf_counter()
         record = run_scene(
@@ -131,7 +131,7 @@ def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> BenchmarkRe
     return BenchmarkRecord(name, figures)
 
 
-class BothSolves:
+class PairedSolves:
     """Replacement of `wl.solve` that also solves without bounds.
 
     Each of the two solves starts from its own last solution.
@@ -203,8 +203,8 @@ def _walls(size: int, options: Options) -> BenchmarkRecord:
             "solver.tolerance=1e-6",
         ],
     )
-    watch = Watch()
-    both = BothSolves(wl.solve, options.device)
+    watch = LogCollector()
+    both = PairedSolves(wl.solve, options.device)
     with tempfile.TemporaryDirectory() as folder, mock.patch.object(wl, "solve", both):
         run_scene(
             RunRequest(scene=scene, out=Path(folder) / "run", device=options.device, force=True),

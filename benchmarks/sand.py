@@ -112,7 +112,7 @@ def _step(simulation: SandSimulation) -> Tables:
     return simulation.step(min(simulation.stable_dt(), simulation.scene.time.dt_max))
 
 
-class _Taken:
+class _ReplacedSolve:
     """Replacement of a simulation's solve by another method.
 
     It records the residual [rho g dx] and the seconds.
@@ -141,10 +141,10 @@ class _Taken:
 
 def _solve(
     simulation: SandSimulation, state: dict[str, np.ndarray], name: str, tolerance: float, most: int
-) -> _Taken:
+) -> _ReplacedSolve:
     """Solve the step that follows a state."""
     simulation.restore(state)
-    taken, usual = _Taken(simulation.stress, name, tolerance, most), simulation.solve_stress
+    taken, usual = _ReplacedSolve(simulation.stress, name, tolerance, most), simulation.solve_stress
     simulation.solve_stress = taken  # type: ignore[method-assign]
     _step(simulation)
     simulation.solve_stress = usual  # type: ignore[method-assign]
@@ -166,7 +166,7 @@ def _methods(
             _step(simulation)
         state = simulation.state()
         seconds: dict[str, list[float]] = {name: [] for name in METHODS}
-        solves: dict[str, _Taken] = {}
+        solves: dict[str, _ReplacedSolve] = {}
         for turn in range(options.repeat + 1):  # the first turn loads kernels
             for name in METHODS:
                 solve = _solve(simulation, state, name, TOLERANCE, MOST)

@@ -51,7 +51,7 @@ FIELD_BYTES = 8  # bytes per cell of a copy of a float32 field: a read and a wri
 
 
 @dataclass
-class Growing:
+class ScalingCase:
     """One kind of bounds at one size."""
 
     scene: Splash  # the problem
@@ -125,7 +125,9 @@ def measure(options: Options, out: Path) -> Results:
         options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat
     )
     cases = [
-        Growing(scene, bounds, options.device) for scene in map(splash, sizes) for bounds in BOUNDS
+        ScalingCase(scene, bounds, options.device)
+        for scene in map(splash, sizes)
+        for bounds in BOUNDS
     ]
     for turn in range(options.repeat + 1):  # the first turn loads kernels
         options.say(f"scaling to {max(sizes)}^3, round {turn} of {options.repeat}")
@@ -222,7 +224,7 @@ def exponent(unknowns: Sequence[float], seconds: Sequence[float]) -> float:
     return float(np.polyfit(np.log(unknowns), np.log(seconds), 1)[0])
 
 
-def _growth(bounds: str, cases: Sequence[Growing]) -> BenchmarkRecord:
+def _growth(bounds: str, cases: Sequence[ScalingCase]) -> BenchmarkRecord:
     """Return the growth exponents of each round."""
     large = (
         [c for c in cases if c.scene.n >= ASYMPTOTIC]

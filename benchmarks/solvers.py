@@ -28,11 +28,11 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.peers.libraries import pyamg, scipy_cg
-from warp_lcp.benchmarks.peers.peer import PeerAnswer, Question
+from warp_lcp.benchmarks.peers.peer import PeerAnswer, PeerProblem
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
 from warp_lcp.files.tables import Tables
 from warp_lcp.operators.grid_poisson import PoissonArguments
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.solvers.fallback import Progress
 
 TITLE = "Linear and LCP pressure solves"
@@ -99,10 +99,10 @@ def measure(options: Options, out: Path) -> Results:
 
 def _measure_size(
     n: int, options: Options
-) -> tuple[list[SolverCase], dict[str, list[PeerAnswer]], Question]:
+) -> tuple[list[SolverCase], dict[str, list[PeerAnswer]], PeerProblem]:
     """Measure one sample of every case and peer in each round."""
-    cases, question = _cases(n, options.device), Question(splash(n), "linear")
-    solves: dict[str, Callable[[Question, float], PeerAnswer]] = (
+    cases, question = _cases(n, options.device), PeerProblem(splash(n), "linear")
+    solves: dict[str, Callable[[PeerProblem, float], PeerAnswer]] = (
         {"PyAMG SA-CG": pyamg} if present("pyamg") else {}
     )
     solves |= {"SciPy CG": scipy_cg} if n <= SCIPY_CELLS else {}
@@ -162,7 +162,7 @@ def _cases(n: int, device: str) -> list[SolverCase]:
 
 
 def _records(
-    n: int, cases: list[SolverCase], answers: dict[str, list[PeerAnswer]], question: Question
+    n: int, cases: list[SolverCase], answers: dict[str, list[PeerAnswer]], question: PeerProblem
 ) -> list[BenchmarkRecord]:
     """Return the records of a size, with ratios of samples of the same rounds."""
     by_name = {case.name: case for case in cases}

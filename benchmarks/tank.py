@@ -52,7 +52,7 @@ MCADAMS = (
 
 
 @dataclass(frozen=True)
-class Tank:
+class ClosedTank:
     """Closed tank of liquid with a wavy surface, a sphere and a pillar.
 
     The axes are z, y, x, and y is up.
@@ -168,7 +168,7 @@ def measure(options: Options, out: Path) -> Results:
     try:
         for n in [min(asked), *sizes]:  # the first size loads kernels
             options.say(f"tank {n}^3")
-            records.append(record(Tank(n), options.repeat if n < ONCE else 1))
+            records.append(record(ClosedTank(n), options.repeat if n < ONCE else 1))
     finally:
         wl.set_threads(before)
     del records[1]
@@ -177,7 +177,7 @@ def measure(options: Options, out: Path) -> Results:
     )
 
 
-def record(tank: Tank, repeat: int) -> BenchmarkRecord:
+def record(tank: ClosedTank, repeat: int) -> BenchmarkRecord:
     """Solve cold from the arrays and check the result."""
     samples, counts = defaultdict[str, list[float]](list), dict[str, float]()
     for _ in range(repeat):
@@ -209,7 +209,9 @@ def record(tank: Tank, repeat: int) -> BenchmarkRecord:
     )
 
 
-def _solve(tank: Tank, samples: dict[str, list[float]], counts: dict[str, float]) -> wl.SolveResult:
+def _solve(
+    tank: ClosedTank, samples: dict[str, list[float]], counts: dict[str, float]
+) -> wl.SolveResult:
     """Take a sample: seconds, and resident memory [GB].
 
     The arrays are freed when the problem is made.

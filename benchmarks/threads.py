@@ -50,7 +50,7 @@ TARGETS = {
     "steps of a solve": 1.85,
     "solve, cold": 1.7,
 }
-Work = dict[str, Callable[[], object]]
+WorkFunctions = dict[str, Callable[[], object]]
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -135,14 +135,14 @@ def _at_once(copies: list[Callable[[], object]], turns: int) -> None:
         list(pool.map(several, copies))
 
 
-def _groups(sizes: tuple[int, ...]) -> Iterator[tuple[str, Callable[[int], Work]]]:
+def _groups(sizes: tuple[int, ...]) -> Iterator[tuple[str, Callable[[int], WorkFunctions]]]:
     for n in sizes:
-        yield f"{n}^3", _Grid(n).work
+        yield f"{n}^3", _GridBenchmark(n).work
     for name, (resolution, _) in SCENES.items():
         yield f"{name}, {resolution} cells", partial(_scene, name, resolution)
 
 
-class _Grid:
+class _GridBenchmark:
     """Kernels, a step and solves of the splash, recorded for a number of threads."""
 
     def __init__(self, n: int) -> None:
@@ -155,14 +155,14 @@ class _Grid:
             wp.ones(self.box.layout.size, dtype=wp.float32, device="cpu") for _ in range(2)
         )
 
-    def work(self, count: int) -> Work:
+    def work(self, count: int) -> WorkFunctions:
         """Return the measured functions by name."""
         wl.set_threads(count)
         workspace = wl.ProjectedMultigrid().init(self.problem)
         wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace)
         hierarchy: Hierarchy = workspace.hierarchy
         fine, coarse = hierarchy.levels[:2]
-        sweep = fine.sweeping(fine.t, fine.x, 0.5, projected=False)
+        sweep = fine.sweep_kernel(fine.t, fine.x, 0.5, projected=False)
         return {
             "x += z (what memory allows)": _program(
                 ADD.bind(rows_of(self.x), z=self.x, x=self.y).launch
@@ -171,7 +171,7 @@ class _Grid:
                 lambda launch: self.box.stencil.product(self.x, self.y, launch=launch)
             ),
             "sweep": _program(sweep.launch),
-            "restriction": _program(fine.restricting(coarse).launch),
+            "restriction": _program(fine.restrict_kernel(coarse).launch),
             "cycle": hierarchy.cycle.run,
             "steps of a solve": lambda: wl.solve(
                 self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=workspace
@@ -188,7 +188,7 @@ def _program(build: Callable[[Launch], object]) -> Callable[[], object]:
     return program.run
 
 
-def _scene(name: str, resolution: int, count: int) -> Work:
+def _scene(name: str, resolution: int, count: int) -> WorkFunctions:
     """Return the step function of a scene.
 
     The steps have equal bits for each number of threads.

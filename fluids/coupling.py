@@ -73,7 +73,7 @@ class BodyCoupling:
             self.columns.reserve(LEAST)
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
         body[bodies.numbers] = np.arange(len(bodies.bodies))
-        S = kernels.Solids()
+        S = kernels.CoupledBodies()
         S.walls, S.bodies = walls_of(grid, boundary), len(bodies.bodies)
         S.low, S.rows, S.row = wp.vec3i(*low.tolist()), int((high - low)[1]), int((high - low)[2])
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)

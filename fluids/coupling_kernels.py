@@ -14,7 +14,7 @@ _F64 = wp.array(dtype=wp.float64)
 
 
 @wp.struct
-class Solids:
+class CoupledBodies:
     """Indices and centers of mass of the rigid bodies, and the layout of the fields."""
 
     walls: WallKernelFields
@@ -27,7 +27,7 @@ class Solids:
 
 
 @wp.func
-def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
+def body_on_face(S: CoupledBodies, axis: int, k: int, j: int, i: int):
     """Return the body that covers a face, -1 without one, and the covered share."""
     free, solid, part = moving_on(S.walls, axis, k, j, i)
     share = (wp.float64(1.0) - wp.float64(free)) * wp.float64(part)
@@ -38,7 +38,7 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def beside_a_wall(S: Solids, k: int, j: int, i: int):
+def beside_a_wall(S: CoupledBodies, k: int, j: int, i: int):
     """Return whether a face of a cell is not fully open."""
     a = wp.min(
         wp.min(S.walls.open_x[k, j, i], S.walls.open_x[k, j, i + 1]),
@@ -50,7 +50,7 @@ def beside_a_wall(S: Solids, k: int, j: int, i: int):
 
 
 @wp.func
-def side(S: Solids, n: int, k: int, j: int, i: int):
+def side(S: CoupledBodies, n: int, k: int, j: int, i: int):
     """Return body and share on side n = 2 axis + (0: low, 1: high) of a cell."""
     axis = n >> 1
     high = n & 1
@@ -64,7 +64,7 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
 
 
 @wp.func
-def next_body(S: Solids, last: int, k: int, j: int, i: int):
+def next_body(S: CoupledBodies, last: int, k: int, j: int, i: int):
     """Return the next body number after `last` beside a cell.
 
     Returns the number of bodies if there is no further one.
@@ -83,7 +83,7 @@ def enter_kernel(
     j,
     first,
     end,
-    S: Solids,
+    S: CoupledBodies,
     kind: I8,
     counts: _I32,
     offsets: _I32,

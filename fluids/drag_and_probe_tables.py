@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from warp_lcp.scene.scene import Complaint, Table, Vector
+from warp_lcp.scene.scene import CrossKeyError, Table, Vector
 from warp_lcp.settings import NonNegative
 
 
@@ -55,20 +55,20 @@ class Probe(Table):
 
 def probe_complaints(
     probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]
-) -> list[Complaint]:
+) -> list[CrossKeyError]:
     """Return errors of the probes in a domain of given sides [m] and gravity [m/s^2]."""
     complaints = []
     for index, probe in enumerate(probes):
         place = ("probe", index, "position")
         if len(probe.position) != len(size):
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     place, probe.position, f"must have {len(size)} entries, as domain.size has"
                 )
             )
         elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     place,
                     probe.position,
                     f"lies outside the domain, which extends from the origin to {list(size)} m",
@@ -81,10 +81,10 @@ def probe_complaints(
                 f"is also the name of another probe of the {probe.quantity}: log columns "
                 "must differ"
             )
-            complaints.append(Complaint(("probe", index, "name"), probe.name, message))
+            complaints.append(CrossKeyError(("probe", index, "name"), probe.name, message))
         if probe.quantity == "level" and not any(gravity):
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("probe", index, "quantity"),
                     "level",
                     "needs gravity, along which it is measured",

@@ -15,11 +15,11 @@ from warp_lcp.fluids import forces_kernels as kernels
 from warp_lcp.fluids.thin_forces_kernels import thin_pressure_kernel
 from warp_lcp.fluids.wall_kernels import WallKernelFields
 from warp_lcp.grid.cell_kernel import scan
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_log import Row
 from warp_lcp.rigid.bodies import RigidBodies

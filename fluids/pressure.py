@@ -24,14 +24,14 @@ from warp_lcp.grid.staggered import (
     three_components,
 )
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.launch_graph import LaunchGraph, copy
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 
 CONSTANTS = {
@@ -275,8 +275,8 @@ class PressureProjection:
         opens = part.ranks.any(bool(boundary.open_sides & ~part.cuts))
         self._shift = grid.field() if phi is not None or opens else None
         self._count, self._contacts = (
-            WindowTally(COUNT, grid),
-            WindowTally(self._passes.contact, grid),
+            WindowReduction(COUNT, grid),
+            WindowReduction(self._passes.contact, grid),
         )
         # Cells of the unknowns.
         self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)

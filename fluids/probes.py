@@ -15,7 +15,7 @@ from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
 from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import LaunchGraph, launch
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.particle_log import Row
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 

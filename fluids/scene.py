@@ -10,8 +10,8 @@ from pydantic import Field
 
 from warp_lcp.fluids.drag_and_probe_tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.scene.models import Model
-from warp_lcp.scene.scene import Complaint, Liquid, Table
+from warp_lcp.scene.models import SceneModel
+from warp_lcp.scene.scene import CrossKeyError, Liquid, Table
 from warp_lcp.scene.shapes import LiquidProperties, MaterialProperties, Shape, SourceProperties
 from warp_lcp.scene.suspicious_settings import LIQUID_DENSITY, UsualRange
 from warp_lcp.settings import Positive
@@ -114,7 +114,7 @@ class LiquidScene(ParticleScene):
         """Return the key `liquid` and its shapes."""
         return "liquid", self.liquid
 
-    def complaints(self) -> list[Complaint]:
+    def complaints(self) -> list[CrossKeyError]:
         """Return errors that involve several keys."""
         complaints = super().complaints()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
@@ -122,10 +122,10 @@ class LiquidScene(ParticleScene):
                 "cannot be combined with rigid bodies (their part of the matrix has only "
                 f"products); use {', '.join(COUPLED_METHODS)}"
             )
-            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(CrossKeyError(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("pressure", "surface"),
                     "voxel",
                     'cannot be combined with pressure.model = "unilateral", which has no free '
@@ -137,19 +137,19 @@ class LiquidScene(ParticleScene):
                 'cannot be combined with pressure.model = "unilateral", whose liquid may '
                 "separate anywhere inside"
             )
-            complaints.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(CrossKeyError(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which computes how full cells are'
-            complaints.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(CrossKeyError(("particles", "narrow_band"), None, message))
         if self.surface_tension is not None and self.pressure.surface == "voxel":
             message = 'needs pressure.surface = "ghost-fluid", whose surface has a curvature'
-            complaints.append(Complaint(("surface_tension",), None, message))
+            complaints.append(CrossKeyError(("surface_tension",), None, message))
         if self.surface_tension is not None and self.pressure.model == "unilateral":
             message = (
                 'needs pressure.model = "incompressible": surface tension needs a pressure '
                 "that may be negative"
             )
-            complaints.append(Complaint(("surface_tension",), None, message))
+            complaints.append(CrossKeyError(("surface_tension",), None, message))
         return [
             *complaints,
             *self._viscosity_complaints(),
@@ -190,10 +190,10 @@ class LiquidScene(ParticleScene):
             notes += DRAG.notes(place, value)
         return notes
 
-    def _viscosity_complaints(self) -> list[Complaint]:
+    def _viscosity_complaints(self) -> list[CrossKeyError]:
         """Return errors of settings that need viscosity or exclude it."""
         if self.viscosity is not None and self.endless:
-            return [Complaint(("viscosity",), None, "cannot be combined with periodic axes")]
+            return [CrossKeyError(("viscosity",), None, "cannot be combined with periodic axes")]
         tables: dict[str, Sequence[LiquidProperties | SourceProperties]] = {
             "liquid": self.liquid,
             "source": self.source,
@@ -207,7 +207,7 @@ class LiquidScene(ParticleScene):
         if self.viscosity is not None:
             message = "cannot be combined with liquids of different viscosities"
             return (
-                [Complaint(("particles", "narrow_band"), None, message)]
+                [CrossKeyError(("particles", "narrow_band"), None, message)]
                 if own_settings and self.particles.narrow_band is not None
                 else []
             )
@@ -216,18 +216,20 @@ class LiquidScene(ParticleScene):
             (("domain", "wall"), self.domain.wall),
             *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid)),
         ]
-        complaints = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
+        complaints = [
+            CrossKeyError(place, wall, message) for place, wall in walls if wall == "sticky"
+        ]
         slips = [
             (n, solid.slip_length)
             for n, solid in enumerate(self.solid)
             if solid.slip_length is not None
         ]
         complaints += [
-            Complaint((key, n, "viscosity"), value, "needs the table [viscosity]")
+            CrossKeyError((key, n, "viscosity"), value, "needs the table [viscosity]")
             for key, n, value in own_settings
         ]
         return complaints + [
-            Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
+            CrossKeyError(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
             for n, slip in slips
         ]
 
@@ -258,23 +260,23 @@ class LiquidScene(ParticleScene):
             for wall, slip in slip_walls
         ]
 
-    def models(self) -> list[Model]:
+    def models(self) -> list[SceneModel]:
         """Return the models that the scene turns on, and those that have no effect."""
         full, ghost = self.stays_full, self.pressure.surface == "ghost-fluid"
         closed = "liquid fills a closed box: there is no free surface"
         models = []
         if self.pressure.model == "unilateral":
-            models.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
+            models.append(SceneModel("unilateral pressure", 'pressure.model = "unilateral"'))
         elif self.walls_separate:
             models.append(
-                Model(
+                SceneModel(
                     "separating walls",
                     "liquid may separate from domain.wall or a solid: bounds on the pressure",
                 )
             )
         elif self.domain.wall == "separating":
             models.append(
-                Model(
+                SceneModel(
                     "separating walls",
                     "the domain has no wall: equations without bounds",
                     built=False,
@@ -282,7 +284,7 @@ class LiquidScene(ParticleScene):
             )
         if ghost:
             models.append(
-                Model(
+                SceneModel(
                     "ghost-fluid surface",
                     closed if full else 'pressure.surface = "ghost-fluid"',
                     built=not full,
@@ -290,25 +292,27 @@ class LiquidScene(ParticleScene):
             )
         if self.pressure.smoothing and ghost:
             models.append(
-                Model("smoothing", closed if full else "pressure.smoothing", built=not full)
+                SceneModel("smoothing", closed if full else "pressure.smoothing", built=not full)
             )
         if self.viscosity is not None:
-            models.append(Model("viscosity", "viscosity.value"))
+            models.append(SceneModel("viscosity", "viscosity.value"))
         if self.surface_tension is not None:
             models.append(
-                Model("surface tension", closed if full else "[surface_tension]", built=not full)
+                SceneModel(
+                    "surface tension", closed if full else "[surface_tension]", built=not full
+                )
             )
         if self.short_steps:
-            models.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
+            models.append(SceneModel("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
-            models.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
+            models.append(SceneModel("automatic tolerance", 'solver.tolerance = "auto"'))
         if self.probe:
-            models.append(Model("probes", "[[probe]]"))
+            models.append(SceneModel("probes", "[[probe]]"))
         if self.output.forces:
-            models.append(Model("forces on solids", "output.forces"))
+            models.append(SceneModel("forces on solids", "output.forces"))
         if self.drags is not None:
             models.append(
-                Model(
+                SceneModel(
                     "drag along walls",
                     "[wall_drag]" if self.wall_drag is not None else "drag of a solid",
                 )

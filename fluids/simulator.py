@@ -24,7 +24,7 @@ from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface_tension import REACH
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
-from warp_lcp.grid.part import ONE_PROCESS
+from warp_lcp.grid.grid_part import ONE_PROCESS
 from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import particles_to_faces
@@ -34,7 +34,7 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_assembly import (
-    Parts,
+    GridComponents,
     make_bodies,
     make_boundary,
     make_narrow_band,
@@ -86,7 +86,7 @@ class LiquidSimulation(ParticleSimulation):
         self,
         scene: LiquidScene,
         grid: StaggeredGrid,
-        parts: Parts,
+        parts: GridComponents,
         particles: Particles,
         *,
         solids: Sequence[PlacedSolid] = (),
@@ -119,7 +119,7 @@ class LiquidSimulation(ParticleSimulation):
                 )
         self.mark()
 
-    def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
+    def allocate(self, grid: StaggeredGrid, parts: GridComponents) -> None:
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
         self.surface = make_surface(self.scene, grid, self.boundary, self._fill_density())
@@ -653,9 +653,9 @@ class FluidsSimulator:
         """
         warnings: list[str] = []
 
-        def make_parts(grid: StaggeredGrid) -> Parts:
+        def make_parts(grid: StaggeredGrid) -> GridComponents:
             boundary, warnings[:] = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
-            return Parts(
+            return GridComponents(
                 boundary,
                 make_sources(scene, grid, boundary, folder),
                 make_narrow_band(scene, grid, boundary, folder),

@@ -17,9 +17,9 @@ from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -119,7 +119,7 @@ class SurfaceTension:
         )
         self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
         self._passes = kernels.push_pass(bool(boundary.open))
-        self._energy = WindowTally(self._passes.energy, grid)
+        self._energy = WindowReduction(self._passes.energy, grid)
         self._blocked = grid.field(wp.int8)
         self._capacity, self._lean = boundary.capacity, grid.field()
         # kick_dt sigma / (rho dx^2), and the factor on velocity gradients.

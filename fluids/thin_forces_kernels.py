@@ -19,7 +19,7 @@ Numbers = wp.types.matrix(shape=(8, 3), dtype=wp.int32)
 
 
 @wp.struct
-class Cube:
+class DualCell:
     """Cube (in 2-D the square) between the centers of neighboring cells.
 
     Bit `a` of a corner's number is set if the corner is the far one along axis a.
@@ -55,7 +55,7 @@ def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
 
     The cell is corner 0.
     """
-    cube = Cube()
+    cube = DualCell()
     cube.planes = S.planes
     cube.sides = wp.vec3i(
         1 - 2 * (octant & 1), 1 - 2 * ((octant >> 1) & 1), 1 - 2 * ((octant >> 2) & 1)
@@ -73,7 +73,7 @@ def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
 
 
 @wp.func
-def connected(cube: Cube):
+def connected(cube: DualCell):
     """Return the corners that edges without walls connect with corner 0, one bit each."""
     found = int(1)
     for _pass in range(PASSES):
@@ -86,7 +86,7 @@ def connected(cube: Cube):
 
 
 @wp.func
-def open_length(cube: Cube, found: int, first: int, axis: int):
+def open_length(cube: DualCell, found: int, first: int, axis: int):
     """Return the length of an edge that belongs to the connected corners [cells]."""
     second = first ^ (1 << axis)
     length = float(0.0)
@@ -114,7 +114,7 @@ def arc_area(count: int, a: float, b: float, alike: bool):
 
 
 @wp.func
-def lean(S: WallKernelFields, cube: Cube, at: wp.vec3i, corner: int, axis: int, other: int):
+def lean(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis: int, other: int):
     """Return the slope of a wall, from its distance at the next cell center.
 
     That center lies outside of the square.
@@ -159,7 +159,13 @@ def corner_area(a: float, b: float, lean_a: float, lean_b: float):
 
 @wp.func
 def open_area(
-    S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, first: int, along: int, other: int
+    S: WallKernelFields,
+    cube: DualCell,
+    at: wp.vec3i,
+    found: int,
+    first: int,
+    along: int,
+    other: int,
 ):
     """Return the area of a square that belongs to the connected corners [cells^2].
 
@@ -198,7 +204,7 @@ def open_area(
 
 
 @wp.func
-def wall_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, axis: int):
+def wall_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, axis: int):
     """Return the component along an axis of the wall's vector area in the cube.
 
     The wall is the one around the connected corners; the vector points into it [cells, 3-D:
@@ -218,7 +224,7 @@ def wall_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, axis: i
 
 
 @wp.func
-def shared_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, crossed: int):
+def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, crossed: int):
     """Return the vector area of the wall on an edge of corner 0, as a share.
 
     Each component belongs to the walls on edges along its own axis; without such walls it is

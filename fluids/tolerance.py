@@ -11,7 +11,7 @@ import warp_lcp as wl
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.vectors import Communicator, Reduction, convert, rows_of
-from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.operator_protocol import Operator
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h")
 CHANGE = KERNELS["tolerance.change"]

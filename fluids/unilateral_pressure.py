@@ -16,12 +16,12 @@ from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import clear
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 
 
 class UnilateralPressure(PressureProjection):

@@ -40,7 +40,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids import viscosity_barriers as thin
-from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
+from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWallCoupling, ViscousWalls
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.domain_sides import open_sides_of
@@ -51,10 +51,10 @@ from warp_lcp.grid.staggered import (
     Window,
     three_components,
 )
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.problem.result import SolveStatus
@@ -200,7 +200,7 @@ class Viscosity:
         self._thin_owner = grid.faces(wp.int16) if held_apart else []
         self.relative = [] if thickest is None else grid.faces()
         self.change = self.multigrid.components(self._change)
-        self._pull: WallPull | None = None  # built at the first use
+        self._pull: ViscousWallCoupling | None = None  # built at the first use
         self._bodies: BodyDrag | None = None
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
@@ -210,7 +210,7 @@ class Viscosity:
         self._solver = self._krylov()
         self._trail, self._sums = (
             DirtyRegion(grid.everywhere),
-            [WindowTally(self._passes.force, grid, grid.domain) for _ in range(grid.dimension)],
+            [WindowReduction(self._passes.force, grid, grid.domain) for _ in range(grid.dimension)],
         )
         self._box, self._above = ActiveWindow(grid.everywhere), ActiveWindow(grid.everywhere)
         self._unknowns, self._tau = ActiveWindow(self._inner), Scalar()
@@ -364,7 +364,7 @@ class Viscosity:
             points: reference points of the moments [m], shape (1 + solids, 3).
         """
         if self._pull is None:
-            self._pull = WallPull(
+            self._pull = ViscousWallCoupling(
                 self.grid, self.boundary, range(len(points)), len(points), self._passes
             )
         self._pull.take(

@@ -42,7 +42,7 @@ class ViscousWalls:
     contact: wp.array
 
 
-class WallPull:
+class ViscousWallCoupling:
     """Viscous coupling coefficients between liquid faces and moving solids.
 
     The viscous force on a face due to a solid's velocity V is c'V. The motions of a solid are (vx,
@@ -193,7 +193,7 @@ class WallPull:
 
 
 class BodyDrag:
-    """Implicit coupling of liquid and rigid bodies by viscosity, see `WallPull`.
+    """Implicit coupling of liquid and rigid bodies by viscosity, see `ViscousWallCoupling`.
 
     With m = rho dx^d M^-1 a body's velocity is V = V1 + m (C'u - D V), so that a change of the
     liquid's velocity changes it by
@@ -227,7 +227,9 @@ class BodyDrag:
         comm: Communicator | None,
     ) -> None:
         self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved
-        self._pull = WallPull(grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes)
+        self._pull = ViscousWallCoupling(
+            grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes
+        )
         self._scale, self._width = density * grid.cell_volume, self._pull.width
         self.columns = BlockColumns(
             grid.dimension * grid.size, len(bodies.bodies), self._width, wp.float64, grid.device
@@ -245,7 +247,7 @@ class BodyDrag:
         With m = rho dx^d M^-1 it computes W = (1 + m D)^-1 m for each body, symmetrized against
         rounding, and the force C'u - D V of the current velocities.
 
-        Arguments as of `WallPull.take`.
+        Arguments as of `ViscousWallCoupling.take`.
         """
         block, bodies, dimension = (
             self.boundary.cut.moving_block(),

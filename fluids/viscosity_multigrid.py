@@ -8,7 +8,7 @@ from functools import partial
 import warp as wp
 
 from warp_lcp.fluids.viscosity_level import KNOWN, ViscosityLevel
-from warp_lcp.grid.part import subdomain_of
+from warp_lcp.grid.grid_part import subdomain_of
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.launch_graph import Launch, launch_now, perform

@@ -9,10 +9,10 @@ import warp as wp
 
 from warp_lcp.fluids.forces import WallSums
 from warp_lcp.fluids.pressure import PressureProjection
-from warp_lcp.fluids.wall_drag_kernels import Drag, drag_kernel
+from warp_lcp.fluids.wall_drag_kernels import WallDragFields, drag_kernel
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 
 
@@ -48,7 +48,7 @@ class WallDrag:
         self.grid, self._mass = grid, density * grid.cell_volume
         self._before = grid.faces()
         self._losses = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.float64, device=grid.device)
-        D = Drag()
+        D = WallDragFields()
         D.coefficient = wp.array(
             0.5 * np.asarray(coefficients), dtype=wp.float32, device=grid.device
         )

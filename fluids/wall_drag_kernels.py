@@ -20,7 +20,7 @@ HALF = wp.constant(0.5)
 
 
 @wp.struct
-class Drag:
+class WallDragFields:
     """Fields that the wall drag reads; velocities are those after the projection."""
 
     walls: WallKernelFields
@@ -53,7 +53,7 @@ def open_share(S: WallKernelFields, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def fill(D: Drag, k: int, j: int, i: int):
+def fill(D: WallDragFields, k: int, j: int, i: int):
     """Return the liquid fraction of a cell, from the free surface."""
     full = wp.where(D.kind[k, j, i] == _FLUID, 1.0, 0.0)
     if D.phi:
@@ -83,7 +83,7 @@ def mean_of(field: F32, known: I8, axis: int, component: int, k: int, j: int, i:
 
 
 @wp.func
-def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
+def velocity_on(D: WallDragFields, axis: int, k: int, j: int, i: int):
     """Return the velocity vector on a face [m/s].
 
     The component of the face's own axis is stored there; the others are means over the surrounding
@@ -163,7 +163,9 @@ def piece_of(S: WallKernelFields, n: int, along: int, k: int, j: int, i: int):
 
 
 @wp.func
-def pull(D: Drag, axis: int, q: wp.vec3, x: wp.vec3, area: float, normal: wp.vec3, solid: int):
+def pull(
+    D: WallDragFields, axis: int, q: wp.vec3, x: wp.vec3, area: float, normal: wp.vec3, solid: int
+):
     """Return the pull of a piece of wall on a face, and the speed that it removes.
 
     The pull is area x coefficient x speed. The second value is the velocity change until the face
@@ -189,7 +191,7 @@ def drag_kernel(
     offsets: INTS,
     owners: INTS,
     values: wp.array2d(dtype=wp.float64),
-    D: Drag,
+    D: WallDragFields,
     axis: int,
     dt: float,
     mass: wp.float64,

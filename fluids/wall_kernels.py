@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I16, I32, cell_below, of_axis
-from warp_lcp.grid.cut_cells_kernels import Moving, moving_part, open_face
+from warp_lcp.grid.cut_cells_kernels import MovingSolids, moving_part, open_face
 
 
 @wp.struct
@@ -20,7 +20,7 @@ class WallKernelFields:
     origin: wp.vec3i  # offset of this grid's first cell in a larger grid
     index: I32  # null with cut cells
     distance: F32  # distance of nodes from the solids [cells]; only with cut cells
-    moving: Moving  # share and number of moving solids
+    moving: MovingSolids  # share and number of moving solids
     open_x: F32
     open_y: F32
     open_z: F32

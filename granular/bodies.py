@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.granular.bodies_kernels import (
     FieldShape,
-    Places,
+    IncidenceFields,
     add_runs_kernel,
     body_kernels,
     flat_vector,
@@ -115,7 +115,11 @@ class SandBodies:
         self._in_contact = wp.zeros(1, dtype=wp.int32, device=device)
         self.faces: BodyFaces | None = None
         self._walls: SandWalls
-        self._faces, self._cells, self._edges = Places(), Places(), Places()
+        self._faces, self._cells, self._edges = (
+            IncidenceFields(),
+            IncidenceFields(),
+            IncidenceFields(),
+        )
 
     def place(self, index: np.ndarray, centers: np.ndarray, walls: SandWalls) -> None:
         """Find the faces, cells and edges where bodies meet sand.

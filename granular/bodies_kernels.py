@@ -58,7 +58,7 @@ class FieldShape:
 
 
 @wp.struct
-class Places:
+class IncidenceFields:
     """Faces, cells or edges beside bodies, see `body_faces.Incidence`."""
 
     at: _INTS
@@ -125,8 +125,8 @@ def force_kernel(
     grid: FieldShape,
     spans: _SPANS,
     stress: _SINGLE,
-    cells: Places,
-    edges: Places,
+    cells: IncidenceFields,
+    edges: IncidenceFields,
     share: Vector,
     out: _ROW,
 ):
@@ -216,7 +216,7 @@ def respond_kernel(
 
 
 @forward_kernel(**options)
-def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
+def layer_kernel(faces: IncidenceFields, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
     """Compute mass and velocity of the sand that moves with a body's face.
 
     It is half of the cell in front of the face.
@@ -234,7 +234,7 @@ def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _P
 @forward_kernel(**options)
 def stiffness_kernel(
     grid: FieldShape,
-    cells: Places,
+    cells: IncidenceFields,
     flags: _BYTES,
     drive: _SINGLE,
     stiff: _SINGLE,
@@ -266,7 +266,9 @@ def stiffness_kernel(
 
 
 @forward_kernel(**options)
-def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Vector, out: _REALS):
+def lightness_kernel(
+    grid: FieldShape, edges: IncidenceFields, share: Vector, inverse: Vector, out: _REALS
+):
     """Compute 1 / sum of the inverse masses around an edge.
 
     0 where it has no shear.
@@ -310,7 +312,7 @@ def body_kernels(dimension: int, real: type, box: bool, rate: bool = False) -> S
     module, Velocity = f"granular.{name}", vector_struct(real)
 
     @forward_kernel(module=module)
-    def move(faces: Places, velocity: _ROW, moved: Velocity):
+    def move(faces: IncidenceFields, velocity: _ROW, moved: Velocity):
         """Set the velocity of the bodies' faces."""
         n = wp.tid()
         b = faces.body[n]
@@ -320,7 +322,7 @@ def body_kernels(dimension: int, real: type, box: bool, rate: bool = False) -> S
         set_entry(moved, int(faces.axis[n]), faces.at[n], real(u))
 
     @forward_kernel(module=module)
-    def strain(grid: FieldShape, edges: Places, u: Velocity, rates: Velocity):
+    def strain(grid: FieldShape, edges: IncidenceFields, u: Velocity, rates: Velocity):
         """Compute twice the shear rate of the edges beside bodies, times dx."""
         n = wp.tid()
         i = edges.at[n]

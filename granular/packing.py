@@ -15,8 +15,8 @@ from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, launch
 from warp_lcp.kernels.layout import put
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.halo import StarForest
@@ -274,7 +274,7 @@ class Packing:
         have stresses of 0 on all ranks.
         """
         if self._forest is not None:
-            self.grid.part.filling(stress, forest=self._forest).launch(launch)
+            self.grid.part.fill_task(stress, forest=self._forest).launch(launch)
         if self.sides is not None:
             self.sides.wrap(stress, launch=launch)
 

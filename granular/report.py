@@ -10,7 +10,7 @@ import warp as wp
 from warp_lcp.granular.report_kernels import contact_kernel, report_pass, take_kernel
 from warp_lcp.granular.stress import Stress
 from warp_lcp.grid.staggered import Window
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels.launch_graph import LaunchGraph
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.particle_log import Row
@@ -37,7 +37,7 @@ class SandReport:
             grid.faces(wp.int8),
         )
         cut, stored = stress.packing.cut, Window((0, 0, 0), grid.shape, grid.device)
-        self._report = WindowTally(
+        self._report = WindowReduction(
             report_pass(grid.dimension, stress.rate, cut is not None), grid, stored
         )
         self._taking, self._reporting = (

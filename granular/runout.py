@@ -16,8 +16,8 @@ from warp_lcp.grid.cell_kernel import INTS, POINTS, launch_list, list_kernel
 from warp_lcp.grid.particles import Particles
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import LaunchGraph, launch
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 AXES, DIGITS, BITS = 2, 256, 8
 SIGN = wp.constant(wp.uint32(1 << 31))

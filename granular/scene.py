@@ -12,12 +12,12 @@ from pydantic_core import PydanticCustomError
 from warp_lcp.granular.materials import MATERIALS, FrictionAngleTest, Material, slope
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.presets import PresetName
-from warp_lcp.scene.scene import PRESET_KEY, Complaint, Domain, Table, Time
+from warp_lcp.scene.scene import PRESET_KEY, CrossKeyError, Domain, Table, Time
 from warp_lcp.scene.shapes import (
     FRICTIONS,
     STICKS,
     MaterialProperties,
-    OfAnyShape,
+    ShapeUnion,
     SolidProperties,
     WallFriction,
 )
@@ -188,17 +188,17 @@ class RoughProperties(SolidProperties):
     rubs: ClassVar[bool] = True
 
 
-Sand = OfAnyShape[SandProperties]
-Solid = OfAnyShape[RoughProperties]
+Sand = ShapeUnion[SandProperties]
+Solid = ShapeUnion[RoughProperties]
 
 
-def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[Complaint]:
+def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[CrossKeyError]:
     """Return the complaints whose condition is true.
 
     Each rule has a condition, the key, its value and the message.
     """
     return [
-        Complaint(tuple(key.split(".")), value, message)
+        CrossKeyError(tuple(key.split(".")), value, message)
         for case, key, value, message in rules
         if case
     ]
@@ -325,7 +325,7 @@ class SandScene(ParticleScene):
         """Return the friction coefficient of each solid's surface."""
         return self.wall_frictions()[1:]
 
-    def complaints(self) -> list[Complaint]:
+    def complaints(self) -> list[CrossKeyError]:
         """Return errors that involve several keys."""
         complaints = super().complaints()
         angles = [sand.friction_angle for sand in self.sand]
@@ -339,7 +339,7 @@ class SandScene(ParticleScene):
                     message = (
                         f"must be {first:g} as in the other [[sand]]: a scene has one material"
                     )
-                    complaints.append(Complaint(("sand", number, key), value, message))
+                    complaints.append(CrossKeyError(("sand", number, key), value, message))
         return (
             complaints
             + self._strength_complaints()
@@ -380,21 +380,23 @@ class SandScene(ParticleScene):
             )
         return notes
 
-    def _strength_complaints(self) -> list[Complaint]:
+    def _strength_complaints(self) -> list[CrossKeyError]:
         material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))
         if material.tensile_strength > most:
             message = (
                 f"must be at most {most:.4g}, the cohesion over the tangent of the friction angle"
             )
-            return [Complaint(("material", "tensile_strength"), material.tensile_strength, message)]
+            return [
+                CrossKeyError(("material", "tensile_strength"), material.tensile_strength, message)
+            ]
         if self._slope_of(self.friction_angle) > STEEPEST[self.dimension]:
             return [self._too_steep()]
         if material.density is not None and material.density != self.physics.density:
             message = f"differs from physics.density = {self.physics.density:g}; give one of them"
-            return [Complaint(("material", "density"), material.density, message)]
+            return [CrossKeyError(("material", "density"), material.density, message)]
         return []
 
-    def _too_steep(self) -> Complaint:
+    def _too_steep(self) -> CrossKeyError:
         """Return the complaint about a friction angle, at the key that sets it."""
         angle, message = self.friction_angle, self._at_most()
         number = next(
@@ -402,12 +404,12 @@ class SandScene(ParticleScene):
             None,
         )
         if number is None and self.material.friction_angle is None:
-            return Complaint(
+            return CrossKeyError(
                 ("material", "name"),
                 self.material.name,
                 f"has a friction angle of {angle:g} degrees, which {message}",
             )
-        return Complaint(
+        return CrossKeyError(
             ("material", "friction_angle")
             if number is None
             else ("sand", number, "friction_angle"),
@@ -426,7 +428,7 @@ class SandScene(ParticleScene):
             "cone would bear tension"
         )
 
-    def _rate_complaints(self) -> list[Complaint]:
+    def _rate_complaints(self) -> list[CrossKeyError]:
         """Return errors of friction that grows with the shear rate."""
         table, dynamic = self.friction, self.friction.dynamic_angle
         if dynamic is None:
@@ -464,7 +466,7 @@ class SandScene(ParticleScene):
             ]
         )
 
-    def _domain_complaints(self) -> list[Complaint]:
+    def _domain_complaints(self) -> list[CrossKeyError]:
         """Return errors of periodic axes, rigid bodies and keys that sand lacks."""
         domain, method, closed, periodic = (
             self.domain,

@@ -17,19 +17,19 @@ from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.runout import ParticlePercentiles
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.granular.solids import SandSolids
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import METHODS, StressWorkspace
+from warp_lcp.granular.wall_friction import SandSolids
 from warp_lcp.grid.extrapolate import complete
+from warp_lcp.grid.grid_part import ONE_PROCESS
 from warp_lcp.grid.level_set import particle_density
-from warp_lcp.grid.part import ONE_PROCESS
 from warp_lcp.grid.particles import SORTED, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.joined_graphs import joined
 from warp_lcp.kernels.launch_graph import LaunchGraph, copy
 from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_assembly import (
-    Parts,
+    GridComponents,
     make_bodies,
     make_boundary,
     make_outlets,
@@ -42,7 +42,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
 from warp_lcp.material.velocity_extrapolation import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.problem.solve import Solver, Workspace
+from warp_lcp.problem.solve_loop import Solver, Workspace
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.scene.scene import Scene
@@ -100,7 +100,7 @@ class SandSimulation(ParticleSimulation):
         self,
         scene: SandScene,
         grid: StaggeredGrid,
-        parts: Parts,
+        parts: GridComponents,
         particles: Particles,
         **more: Unpack[ParticleSimulationOptions],
     ) -> None:
@@ -119,7 +119,7 @@ class SandSimulation(ParticleSimulation):
         self._start = self._front()[0]
         self.mark()
 
-    def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
+    def allocate(self, grid: StaggeredGrid, parts: GridComponents) -> None:
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
         assert parts.solids is not None, "made by `make_parts`"
@@ -636,7 +636,7 @@ class GranularSimulator:
         cuts = scene.solver.method == "accelerated-projection"
         warnings: list[str] = []
 
-        def make_parts(grid: StaggeredGrid) -> Parts:
+        def make_parts(grid: StaggeredGrid) -> GridComponents:
             """Build walls, solids and sources on a grid."""
             boundary, notes = make_boundary(scene, grid, folder, solids=placed)
             solids = SandSolids(
@@ -648,7 +648,9 @@ class GranularSimulator:
                 cuts=cuts,
             )
             warnings[:] = [*notes, *solids.notes]
-            return Parts(boundary, make_sources(scene, grid, boundary, folder), solids=solids)
+            return GridComponents(
+                boundary, make_sources(scene, grid, boundary, folder), solids=solids
+            )
 
         if ranks is None:
             coverage, grid = start_of(scene, device)

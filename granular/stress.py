@@ -13,7 +13,6 @@ from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.cut_walls import WALL_FACE
 from warp_lcp.granular.fields import StressFields, VelocityFields
 from warp_lcp.granular.packing import REACH, SHEARS, Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress_kernels import (
     BETA_X,
     NEXT_X,
@@ -29,6 +28,7 @@ from warp_lcp.granular.stress_kernels import (
     stress_passes,
 )
 from warp_lcp.granular.stress_layout import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.launch_graph import (
@@ -39,7 +39,7 @@ from warp_lcp.kernels.launch_graph import (
     launch,
     launch_now,
 )
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.kernels.vectors import Reduction, sum_over_ranks
 from warp_lcp.settings import renamed_method
 

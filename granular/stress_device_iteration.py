@@ -11,8 +11,8 @@ import warp as wp
 from warp_lcp.granular import stress_kernels as kernels
 from warp_lcp.granular.stress import MOST_MOMENTUM, Stress
 from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, launch, loops_on_device
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 if TYPE_CHECKING:
     from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
@@ -64,7 +64,11 @@ class StressDeviceIteration:
         stress.set_steps(*method.steps(stress))
         limit, least, still = math.inf, method.least, 0.0
         if stress.cold:
-            limit, least, still = method.swing(stress), method.cold, kernels.STILL_SHARE * tolerance
+            limit, least, still = (
+                method.momentum_limit(stress),
+                method.cold,
+                kernels.STILL_SHARE * tolerance,
+            )
         for number, value in zip(
             self._scalars, (limit, tolerance, least, still, most), strict=True
         ):

@@ -26,7 +26,7 @@ from warp_lcp.granular.stress_kernels import (
 from warp_lcp.granular.stress_layout import CONSTANTS
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.solve import OptionalMembers
+from warp_lcp.problem.solve_loop import WorkspaceDefaults
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import (
     Count,
@@ -49,7 +49,7 @@ APART = 3
 KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
 
-class StressWorkspace(OptionalMembers):
+class StressWorkspace(WorkspaceDefaults):
     """Workspace of a stress solve; it iterates on the problem's own field.
 
     The last stresses are the result, even if the solve fails; see
@@ -161,7 +161,7 @@ class HeavyBallProjectedGradient(Settings):
         flat = stress.packing.grid.dimension == 2
         return self.pressure_step, self.shear_step * (1.0 if flat else 0.5), self.lookahead
 
-    def swing(self, stress: Stress) -> float:
+    def momentum_limit(self, stress: Stress) -> float:
         """Return the limit of the momentum of cold solves, see `SWING`."""
         return 1.0 - SWING / max(stress.packing.grid.domain_counts)
 
@@ -174,7 +174,7 @@ class MomentumWorkspace(StressWorkspace):
         method: the method.
     """
 
-    device_begins = True
+    begins_on_device = True
 
     def __init__(self, stress: Stress, method: HeavyBallProjectedGradient) -> None:
         super().__init__(stress)
@@ -187,7 +187,7 @@ class MomentumWorkspace(StressWorkspace):
         self._news: int | None = None
         self._steps_counted = 0  # steps that the outer loop has counted
 
-    def begin_ahead(
+    def begin_on_device(
         self, guess: DeviceArray | None, criteria: wl.StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve on the device; return the residual at its start.
@@ -262,7 +262,7 @@ class MomentumWorkspace(StressWorkspace):
         self._least, self._still = method.least, 0.0
         if stress.cold:
             self._least, self._still = method.cold, STILL_SHARE * tolerance
-            stress.limit_momentum(method.swing(stress))
+            stress.limit_momentum(method.momentum_limit(stress))
         if self.norm <= NOTHING * tolerance:
             self._least = 0
         return self._least > 0

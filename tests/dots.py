@@ -98,13 +98,13 @@ def dots(monkeypatch: pytest.MonkeyPatch) -> DotsSimulator:
     """Install the simulator `dots` as the only one."""
     simulator = DotsSimulator()
 
-    class Entry:
+    class DotsEntryPoint:
         name = "dots"
 
         def load(self) -> DotsSimulator:
             return simulator
 
-    monkeypatch.setattr(plug_ins, "entry_points", lambda group: [Entry()])
+    monkeypatch.setattr(plug_ins, "entry_points", lambda group: [DotsEntryPoint()])
     return simulator
 
 

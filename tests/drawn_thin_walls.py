@@ -34,7 +34,7 @@ Sides = Callable[[np.ndarray, Any], np.ndarray]
 
 
 @dataclass
-class Draw:
+class ThinWallScene:
     """A scene, and on which side of its walls a point is.
 
     Attributes:
@@ -53,7 +53,7 @@ class Draw:
 
 
 @dataclass
-class Outcome:
+class ThinWallOutcome:
     """What a draw came to.
 
     Attributes:
@@ -125,7 +125,7 @@ def filled(
 
 def bottle(
     rng: np.random.Generator, simulator: str, dimension: int, motion: str | None, mesh: bool
-) -> Draw:
+) -> ThinWallScene:
     """Draw a closed box, of a solid a side or of a mesh, that rests, is shaken or turns."""
     dx, cfl = 1.0 / COUNTS[dimension], float(rng.choice([2.0, 8.0]))
     thick, angle = float(rng.choice(THICKNESSES)), float(rng.choice(ANGLES))
@@ -168,7 +168,7 @@ def bottle(
     kind = f"{'mesh ' if mesh else ''}bottle {motion or 'at rest'}"
     label = f"{kind} {thick} cells, offset {offset.tolist()}, {angle} degrees, CFL {cfl}"
     tables = scene(simulator, dimension, material, solids, cfl)
-    return Draw(label, tables, side, 0.4, weight if motion is None else None)
+    return ThinWallScene(label, tables, side, 0.4, weight if motion is None else None)
 
 
 def walls_around(low: np.ndarray, high: np.ndarray, thick: float) -> list[Tables]:
@@ -199,7 +199,7 @@ def hollow_box(low: np.ndarray, high: np.ndarray, thick: float) -> list[Tables]:
     return [{"shape": "mesh", "file": file.name}]
 
 
-def plate(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
+def plate(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw a plate under a pool, from wall to wall, with another pool below it."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
     offset, depth = rng.integers(0, OFFSETS) / OFFSETS, 10.0 if dimension == 2 else 5.0
@@ -215,10 +215,10 @@ def plate(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
         return np.asarray(np.where(x[:, 1] < top - (thick - SLACK) * dx, 2, above))
 
     label = f"plate {thick} cells, offset {offset}"
-    return Draw(label, tables, side, 0.4, depth * dx * DENSITY * GRAVITY)
+    return ThinWallScene(label, tables, side, 0.4, depth * dx * DENSITY * GRAVITY)
 
 
-def divider(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
+def divider(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw an upright plate between two pools of different height, straight or at a slant."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
     offset, angle = rng.integers(0, OFFSETS) / OFFSETS, float(rng.choice([0.0, 0.0, 10.0, 30.0]))
@@ -240,10 +240,12 @@ def divider(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
         right = np.where(away > half - SLACK * dx, 2, -1)
         return np.asarray(np.where(away < -half + SLACK * dx, 1, right))
 
-    return Draw(f"divider {thick} cells, offset {offset}, {angle} degrees", tables, side, 0.4)
+    return ThinWallScene(
+        f"divider {thick} cells, offset {offset}, {angle} degrees", tables, side, 0.4
+    )
 
 
-def funnel(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
+def funnel(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw a closed vee, of capsules in 2-D and of boxes in 3-D."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
     offset, slope = rng.integers(0, OFFSETS) / OFFSETS, float(rng.choice([0.5, 1.0, 2.0]))
@@ -269,10 +271,10 @@ def funnel(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
         return np.asarray(np.where((above > 0.0) | (np.abs(x[:, 0] - middle) > 0.9 * reach), 1, -1))
 
     label = f"funnel {thick} cells, offset {offset}, slope {slope}"
-    return Draw(label, scene(simulator, dimension, [box(low, high)], solids), side, 0.4)
+    return ThinWallScene(label, scene(simulator, dimension, [box(low, high)], solids), side, 0.4)
 
 
-def tube(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
+def tube(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw two long plates a few cells apart, closed below, in a pool that is lower."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
     offset, bore = rng.integers(0, OFFSETS) / OFFSETS, float(rng.choice([2.5, 4.2]))
@@ -297,10 +299,10 @@ def tube(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
         return result
 
     label = f"tube of {bore} cells, {thick} cells, offset {offset}"
-    return Draw(label, scene(simulator, dimension, pools, solids), side, 0.3)
+    return ThinWallScene(label, scene(simulator, dimension, pools, solids), side, 0.3)
 
 
-def pushed(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
+def pushed(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw a piston from wall to wall, or a plate that is as fast as 20 m/s for a short way."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
     offset, cfl = rng.integers(0, OFFSETS) / OFFSETS, float(rng.choice([2.0, 8.0]))
@@ -319,10 +321,10 @@ def pushed(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
 
     label = f"piston {thick} cells, offset {offset}, {speed} m/s, CFL {cfl}"
     tables = scene(simulator, dimension, [box(a, b)], [box(low, high, motion=motion)], cfl)
-    return Draw(label, tables, side, min(stop + 0.1, 0.5))
+    return ThinWallScene(label, tables, side, min(stop + 0.1, 0.5))
 
 
-def blade(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
+def blade(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw a plate across a closed pool that swings like a paddle: each half keeps its material."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
     offset, cfl = rng.integers(0, OFFSETS) / OFFSETS, float(rng.choice([2.0, 8.0]))
@@ -346,10 +348,10 @@ def blade(rng: np.random.Generator, simulator: str, dimension: int) -> Draw:
         return np.asarray(np.where(away < -half + SLACK * dx, 1, right))
 
     label = f"blade {thick} cells, offset {offset}, period {period} s, CFL {cfl}"
-    return Draw(label, tables, side, 0.4)
+    return ThinWallScene(label, tables, side, 0.4)
 
 
-KINDS: dict[str, Callable[[np.random.Generator, str, int], Draw]] = {
+KINDS: dict[str, Callable[[np.random.Generator, str, int], ThinWallScene]] = {
     "plate": plate,
     "divider": divider,
     "funnel": funnel,
@@ -363,13 +365,13 @@ KINDS: dict[str, Callable[[np.random.Generator, str, int], Draw]] = {
 }
 
 
-def drawn(seed: int, kind: str, simulator: str, dimension: int) -> Draw:
+def drawn(seed: int, kind: str, simulator: str, dimension: int) -> ThinWallScene:
     """Return the draw of a seed."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), dimension, len(simulator)])
     return KINDS[kind](rng, simulator, dimension)
 
 
-def run(draw: Draw) -> Outcome:
+def run(draw: ThinWallScene) -> ThinWallOutcome:
     """Simulate a draw."""
     simulation = made(draw.tables)
     key = np.asarray(simulation.particles.position.numpy(), dtype=np.float64)
@@ -390,7 +392,7 @@ def run(draw: Draw) -> Outcome:
     passed = sum(abs(end[s] - start[s]) for s in {*start, *end}) // 2 + start[-1]
     density = row.get("max_density", row.get("max_fraction", 0.0))
     load = float(np.mean(loads)) if loads else None
-    return Outcome(len(x), passed, load, density, failures)
+    return ThinWallOutcome(len(x), passed, load, density, failures)
 
 
 def made(tables: Tables) -> Any:

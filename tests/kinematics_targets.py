@@ -29,7 +29,7 @@ MODELS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class FigureTarget:
     """Target of a figure, and its start.
 
     Args:
@@ -64,7 +64,7 @@ def figures(rng: np.random.Generator) -> dict[str, ArticulatedFigure]:
     return kinematics
 
 
-def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
+def targets(count: int, *, seed: int = 134) -> Iterator[FigureTarget]:
     """Yield targets for each kind of figure in turn.
 
     In every other round the goals are out of reach by a tenth to a half of the reach.
@@ -81,7 +81,7 @@ def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
             goals = goals * (
                 rng.uniform(1.1, 1.5) * figure.reach / np.linalg.norm(goals, axis=1, keepdims=True)
             )
-        yield Target(
+        yield FigureTarget(
             name,
             figure,
             goals,
@@ -90,7 +90,7 @@ def targets(count: int, *, seed: int = 134) -> Iterator[Target]:
         )
 
 
-def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.OptimizeResult:
+def peer(target: FigureTarget, start: np.ndarray | None = None) -> scipy.optimize.OptimizeResult:
     """Return the answer of scipy.optimize.least_squares from the same start.
 
     The method is its trust-region reflective one, with exact derivatives.
@@ -111,7 +111,7 @@ def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.Opti
 
 
 @dataclass
-class Comparison:
+class TargetCounts:
     """Counts over targets.
 
     Args:
@@ -146,7 +146,7 @@ class Comparison:
 
     def add(
         self,
-        target: Target,
+        target: FigureTarget,
         pose: ReachedPose,
         other: scipy.optimize.OptimizeResult,
         solver: InverseKinematics,
@@ -180,9 +180,9 @@ class Comparison:
 
 def compare(
     count: int, solvers: dict[str, InverseKinematics], *, seed: int = 134
-) -> dict[str, dict[str, Comparison]]:
+) -> dict[str, dict[str, TargetCounts]]:
     """Return, for each solver, counts by figure and reachability of the goal."""
-    counts: dict[str, dict[str, Comparison]] = {name: {} for name in solvers}
+    counts: dict[str, dict[str, TargetCounts]] = {name: {} for name in solvers}
     for target in targets(count, seed=seed):
         key, other = (
             f"{target.name}, {'in reach' if target.reachable else 'out of reach'}",
@@ -190,5 +190,5 @@ def compare(
         )
         for name, solver in solvers.items():
             pose = solver.solve(target.figure, target.goals, target.start)
-            counts[name].setdefault(key, Comparison()).add(target, pose, other, solver)
+            counts[name].setdefault(key, TargetCounts()).add(target, pose, other, solver)
     return counts

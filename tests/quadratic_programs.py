@@ -18,7 +18,7 @@ DISTINCT = 1e-3
 
 
 @dataclass(frozen=True)
-class Drawn:
+class RandomProgram:
     """Program, its verdict and, if it is solvable, a minimizer.
 
     Attributes:
@@ -103,7 +103,7 @@ def draw(seed, *, widest=8.0, columns=0.0, most=14):
     plain = {"P": P, "q": q, "G": G, "h": h, "A": A, "b": b, "lb": lower, "ub": upper}
     units = 10.0 ** rng.uniform(-columns, columns, n)
     cost = 10.0 ** rng.uniform(-widest, widest)
-    return Drawn(
+    return RandomProgram(
         plain,
         _scaled(rng, plain, cost, units, widest, density < 1),
         verdict,

@@ -17,7 +17,7 @@ MOTIONS = ("translation", "rotation", "sinusoid", "keyframes")
 GRAVITY = 9.81
 
 
-class Draw:
+class SceneDraw:
     """Draw one scene.
 
     Lengths are in units of the domain's longest side, times in those of a fall through it.
@@ -109,7 +109,7 @@ class Draw:
 
 def scene_of_every_table(seed: int) -> Tables:
     """Return the tables of a valid scene file."""
-    draw = Draw(seed)
+    draw = SceneDraw(seed)
     rng, side, fall = draw.rng, draw.side, draw.fall
     data: Tables = {
         "scene": {
@@ -168,7 +168,7 @@ def scene_of_every_table(seed: int) -> Tables:
     return data
 
 
-def _turn(draw: Draw, values: tuple[str, ...], step: int) -> str:
+def _turn(draw: SceneDraw, values: tuple[str, ...], step: int) -> str:
     """Return one of some values, by the seed.
 
     Combinations change from one round of seeds to the next.
@@ -176,7 +176,7 @@ def _turn(draw: Draw, values: tuple[str, ...], step: int) -> str:
     return values[(draw.turn // 2 + draw.turn // 10 * step) % len(values)]
 
 
-def _source(draw: Draw) -> Tables:
+def _source(draw: SceneDraw) -> Tables:
     schedule = {"start": 0.02 * draw.fall, "stop": 0.2 * draw.fall}
     return (
         draw.shape(_turn(draw, SHAPES[:3], 1), 0.14, 0.66, 0.1)
@@ -185,7 +185,7 @@ def _source(draw: Draw) -> Tables:
     )
 
 
-def _solids(draw: Draw) -> list[Tables]:
+def _solids(draw: SceneDraw) -> list[Tables]:
     """Return a fixed solid, a moving one and a rigid body, separate."""
     rng = draw.rng
     kind = _turn(draw, SHAPES, 1)
@@ -216,7 +216,7 @@ def _solids(draw: Draw) -> list[Tables]:
     return [standing, moving, body]
 
 
-def _liquid(draw: Draw, data: Tables, material: list[Tables]) -> None:
+def _liquid(draw: SceneDraw, data: Tables, material: list[Tables]) -> None:
     """Add the tables of a liquid.
 
     Its band, its unilateral pressure and its tension exclude each other.
@@ -261,7 +261,7 @@ def _liquid(draw: Draw, data: Tables, material: list[Tables]) -> None:
         data["probe"].pop()
 
 
-def _sand(draw: Draw, data: Tables, material: list[Tables]) -> None:
+def _sand(draw: SceneDraw, data: Tables, material: list[Tables]) -> None:
     """Add the tables of sand.
 
     Every fourth is a periodic layer, which excludes many models.

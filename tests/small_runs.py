@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.run.folder import RunRecord
 from warp_lcp.run.loop import RunRequest, run_scene
-from warp_lcp.run.progress import Lines, Observer
+from warp_lcp.run.progress import Observer, ProgressLines
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Part, Surface
@@ -46,7 +46,7 @@ def run_into(
     }
     return run_scene(
         RunRequest(scene=scene, out=out, **defaults),
-        observer=observer or Lines(Console(quiet=True)),
+        observer=observer or ProgressLines(Console(quiet=True)),
         **options,
     )
 

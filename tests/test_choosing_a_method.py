@@ -11,7 +11,7 @@ import pytest
 
 import warp_lcp as wl
 from warp_lcp import gallery
-from warp_lcp.gallery import Plant, planted
+from warp_lcp.gallery import PlantedSolution, planted
 from warp_lcp.gallery.matrices import spectrum_matrix
 from warp_lcp.method_rules import RULES
 from warp_lcp.problem import reformulate
@@ -33,7 +33,7 @@ def indefinite(n=60, seed=71):
     return planted(
         spectrum_matrix(values, rng),
         rng,
-        Plant(),
+        PlantedSolution(),
         name="indefinite",
         facts=frozenset({"symmetric"}),
     )

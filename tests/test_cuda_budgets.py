@@ -80,7 +80,7 @@ def known(kernel: str, among: dict[str, str]) -> bool:
     return any(fnmatch.fnmatchcase(kernel, pattern) for pattern in among)
 
 
-class Cost(NamedTuple):
+class KernelResources(NamedTuple):
     """Resources of a kernel on an architecture.
 
     Registers and bytes are per thread, shared bytes per block.
@@ -96,7 +96,7 @@ class Cost(NamedTuple):
     block: int
 
 
-def costs(ptx: Path, arch: str) -> list[Cost]:
+def costs(ptx: Path, arch: str) -> list[KernelResources]:
     """Assemble a module; return the resources of its kernels."""
     ptxas = tool("ptxas")
     assert ptxas
@@ -127,16 +127,16 @@ def costs(ptx: Path, arch: str) -> list[Cost]:
             int(shared[1]) if shared else 0,
             int(blocks.get(entry) or 256),
         )
-        found.append(Cost(f"{ptx.parent.name}:{name}", arch, *numbers))
+        found.append(KernelResources(f"{ptx.parent.name}:{name}", arch, *numbers))
     return found
 
 
-def table(rows: list[Cost]) -> str:
+def table(rows: list[KernelResources]) -> str:
     """Return a line per kernel.
 
     Registers on each architecture, other resources on the one where they are largest.
     """
-    lines = ["\t".join(["kernel", *ARCHS, *Cost._fields[3:]])]
+    lines = ["\t".join(["kernel", *ARCHS, *KernelResources._fields[3:]])]
     for kernel, group in itertools.groupby(sorted(rows), key=lambda row: row.kernel):
         by_arch = {row.arch: row for row in group}
         most = (max(values) for values in zip(*(row[3:] for row in by_arch.values()), strict=True))

@@ -36,8 +36,8 @@ from warp_lcp.kernels.vectors import CUDA_BLOCK
 from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.stencil_level import StencilLevel
-from warp_lcp.reduced.principal_system import principal_system
 from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.subproblems.principal_system import principal_system
 
 # Modules that have compiled for CUDA, with the hash of their sources.
 # `python tests/test_cuda_compiles.py` compiles the others and writes it.
@@ -80,7 +80,7 @@ def use_every_kernel(reals):
                         assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-4))
         assert Hierarchy(
             problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1]
-        )._small.coarsening.kernel
+        )._small.coarsen_kernel.kernel
     for real in (wp.float32, wp.float64):
         transfer_passes(real)
     wl.solve(

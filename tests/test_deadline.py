@@ -15,7 +15,7 @@ import warp_lcp as wl
 from default_run import by_turns
 from oracle import natural_residual
 from warp_lcp import deadline
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 S = wl.SolveStatus
 CRITERIA = wl.StoppingCriteria(rtol=1e-8, max_iterations=25, patience=25)
@@ -165,18 +165,20 @@ def test_set_up_counts(monkeypatch):
     problem, _, _ = case("dense", "psor")
     seconds = [0.0]
 
-    class Slow(wl.ProjectedSOR):
+    class SlowInitMethod(wl.ProjectedSOR):
         def init(self, problem):
             seconds[0] += 10
             return super().init(problem)
 
     monkeypatch.setattr(deadline, "now", lambda: seconds[0])
-    result = wl.solve(problem, Slow(), stopping=wl.StoppingCriteria(max_seconds=10))
+    result = wl.solve(problem, SlowInitMethod(), stopping=wl.StoppingCriteria(max_seconds=10))
     assert (result.status, result.iterations) == (S.TIME_LIMIT, 0)
     assert not result.x.numpy().any()
     assert (
         wl.solve(
-            problem, Slow(), stopping=wl.StoppingCriteria(max_seconds=11, max_iterations=1)
+            problem,
+            SlowInitMethod(),
+            stopping=wl.StoppingCriteria(max_seconds=11, max_iterations=1),
         ).status
         is S.MAX_ITERATIONS
     )
@@ -198,7 +200,7 @@ def test_a_solve_within_a_solve_ends_with_it(monkeypatch):
             assert deadline.time_is_up()
         assert not deadline.time_is_up()
         seconds[0] = 5
-        with pytest.raises(deadline.TimeIsUp):
+        with pytest.raises(deadline.DeadlineReached):
             deadline.check_time()
     assert deadline.seconds_left() == math.inf
 
@@ -206,7 +208,7 @@ def test_a_solve_within_a_solve_ends_with_it(monkeypatch):
 def test_time_is_up_for_all_ranks_as_soon_as_it_is_for_one(monkeypatch):
     monkeypatch.setattr(deadline, "now", lambda: 1.0)
 
-    class Across:
+    class OtherRanks:
         def __init__(self, others):
             self.others, self.asked = others, 0
 
@@ -214,10 +216,10 @@ def test_time_is_up_for_all_ranks_as_soon_as_it_is_for_one(monkeypatch):
             self.asked += 1
             return max(value, self.others)
 
-    assert deadline.Deadline(3.0, Across(-math.inf)).left() == 3.0
-    assert deadline.Deadline(3.0, Across(-2.0)).left() == 2.0
-    assert deadline.Deadline(3.0, Across(-0.0)).left() == 0.0
-    unlimited = Across(-0.0)
+    assert deadline.Deadline(3.0, OtherRanks(-math.inf)).left() == 3.0
+    assert deadline.Deadline(3.0, OtherRanks(-2.0)).left() == 2.0
+    assert deadline.Deadline(3.0, OtherRanks(-0.0)).left() == 0.0
+    unlimited = OtherRanks(-0.0)
     assert deadline.Deadline(math.inf, unlimited).left() == math.inf
     assert unlimited.asked == 0  # ranks exchange nothing where there is no limit
 

@@ -7,7 +7,7 @@ import pytest
 
 import warp_lcp as wl
 from code_blocks import blocks, links, run
-from warp_lcp.problem.protocol import CAPABILITIES, families, members
+from warp_lcp.problem.operator_protocol import CAPABILITIES, families, members
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.registry import grid_methods
 

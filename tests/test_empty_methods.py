@@ -14,12 +14,12 @@ ALLOWED = {
     "GridPart": "the one place where one process and a rank differ; here nothing is exchanged",
     "ParticleExchange": "likewise for particles",
     "Launcher": "carries a command in one process; that of ranks agrees on arguments first",
-    "OptionalMembers": "what a workspace says that begins nothing on the device",
+    "WorkspaceDefaults": "what a workspace says that begins nothing on the device",
     "Scene": "a scene without particles, sides and joints; the models of its simulators have them",
     "ParticleScene": "what a material says of itself; sand says it all with constants",
     "Sweep": "what sweeps a method that moves x by itself: nothing",
     "CommandBuffer.fits": "a recording for a GPU has launch dimensions that may be too small",
-    "_Loop._merits": "merit functions are those of boxes",
+    "_SolveLoop._merits": "merit functions are those of boxes",
     "_Shape.unit_length": "a mesh counts in units of its size",
 }
 

@@ -15,8 +15,8 @@ WRITES = {  # function: why it may
     "kernels/fields.py:unload": "sparse fields are the CPU's",
     "kernels/vectors.py:_sum_over_ranks": "on the CPU only; assigned on CUDA",
     "solvers/staggering.py:accept": "assigned afterwards",
-    "reduced/device_iteration.py:run": "on the CPU only, where the beginning is recorded",
-    "reduced/residual_and_active_set.py:set": "on the CPU only; filled on CUDA",
+    "subproblems/device_iteration.py:run": "on the CPU only, where the beginning is recorded",
+    "subproblems/residual_and_active_set.py:set": "on the CPU only; filled on CUDA",
 }
 
 

@@ -20,7 +20,7 @@ import warp_lcp as wl
 from default_run import slow
 from oracle import natural_residual
 from warp_lcp.gallery import FAMILIES
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.solvers.registry import METHODS
 
 RTOL = {"mixed": 1e-8, "double": 1e-8, "single": 1e-3}

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from warp_lcp.contacts.inverse_kinematics import InverseKinematics
-from warp_lcp.gallery.planted import Plant
+from warp_lcp.gallery.planted import PlantedSolution
 from warp_lcp.granular.stress_methods import METHODS as SAND
 from warp_lcp.grid import staggered
 from warp_lcp.material import density_correction
@@ -41,7 +41,7 @@ KINDS = [
     wl.CycleSettings,
     AlgebraicSettings,
     InverseKinematics,
-    Plant,
+    PlantedSolution,
 ]
 KINDS = [kind for kind in [*KINDS, *SAND.values()] if dataclasses.fields(kind)]
 # Values that are no numbers.
@@ -280,15 +280,17 @@ def test_old_names_of_modules_and_methods_warn_and_give_the_new_ones():
     with pytest.raises(AttributeError, match="no attribute 'Trace'"):
         staggered.Trace  # noqa: B018
 
-    class Doubled:
+    class WithOldMethodName:
         def twice(self, number: int) -> int:
             return 2 * number
 
         double = renamed_method("double", twice)
 
-    class Own(Doubled):
+    class SubclassOfRenamed(WithOldMethodName):
         def twice(self, number: int) -> int:
             return 2 * number + 1
 
-    with pytest.warns(DeprecationWarning, match=r"Own\.double is now Own\.twice"):
-        assert Own().double(2) == 5
+    with pytest.warns(
+        DeprecationWarning, match=r"SubclassOfRenamed\.double is now SubclassOfRenamed\.twice"
+    ):
+        assert SubclassOfRenamed().double(2) == 5

@@ -26,7 +26,7 @@ def onto_cones(x: np.ndarray) -> np.ndarray:
     return np.where(inside[:, None], x, np.where(polar[:, None], 0.0, onto))
 
 
-class Contacts(wl.VariationalInequality):
+class ContactInequality(wl.VariationalInequality):
     """Problem y = A x + b over a product of friction cones, A SPD."""
 
     def __init__(self, count: int, seed: int) -> None:
@@ -42,12 +42,12 @@ class Contacts(wl.VariationalInequality):
         return np.asarray(self.A @ x.ravel() + self.b).reshape(x.shape)
 
 
-class Work:
+class ImpulseWorkspace:
     """Workspace: impulses, their residual |x - P(x - y)|, and the best ones so far."""
 
     precision = wl.Precision.DOUBLE
 
-    def __init__(self, problem: Contacts) -> None:
+    def __init__(self, problem: ContactInequality) -> None:
         self.problem, self.residual = problem, self
         self.x = wp.zeros((len(problem.b) // 3, 3), dtype=wp.float64, device="cpu")
         self.norm, self.current, self.wanted, self.evaluated = 0.0, False, False, 0
@@ -81,16 +81,16 @@ class ProjectedGradient:
     It evaluates the residual only now and then.
     """
 
-    problems: ClassVar = Contacts
+    problems: ClassVar = ContactInequality
     at_once: int = 1
     due: int = 1  # calls between two residuals
     length: float = 1.0
     final: bool = False
 
-    def init(self, problem: Contacts) -> Work:
-        return Work(problem)
+    def init(self, problem: ContactInequality) -> ImpulseWorkspace:
+        return ImpulseWorkspace(problem)
 
-    def step(self, problem: Contacts, work: Work, x: Any) -> wl.Step:
+    def step(self, problem: ContactInequality, work: ImpulseWorkspace, x: Any) -> wl.Step:
         for _ in range(self.at_once):
             x.assign(onto_cones(x.numpy() - self.length * problem.length * problem.y(x.numpy())))
         work.calls = getattr(work, "calls", 0) + 1
@@ -111,7 +111,7 @@ def test_impulses_in_friction_cones_meet_the_conditions_of_optimality() -> None:
 
     x in K, y in its dual, x'y = 0: some contacts stick, some slide, some separate.
     """
-    problem = Contacts(40, 2024)
+    problem = ContactInequality(40, 2024)
     result = wl.solve(problem, ProjectedGradient(), stopping=STOPPING)
     x = result.x.numpy()
     y = problem.y(x)
@@ -132,7 +132,7 @@ def test_impulses_in_friction_cones_meet_the_conditions_of_optimality() -> None:
 
 
 def test_steps_at_once_count_and_the_residual_is_recomputed_where_it_is_due() -> None:
-    problem, method = Contacts(40, 2024), ProjectedGradient(at_once=5, due=4)
+    problem, method = ContactInequality(40, 2024), ProjectedGradient(at_once=5, due=4)
     work = method.init(problem)
     result = wl.solve(problem, method, stopping=STOPPING, workspace=work)
     assert result
@@ -152,7 +152,7 @@ def test_steps_at_once_count_and_the_residual_is_recomputed_where_it_is_due() ->
 
 
 def test_every_limit_ends_it() -> None:
-    problem = Contacts(30, 99)
+    problem = ContactInequality(30, 99)
     assert (
         wl.solve(problem, ProjectedGradient(length=4.0), stopping=STOPPING).status
         is wl.SolveStatus.STAGNATED
@@ -167,7 +167,7 @@ def test_every_limit_ends_it() -> None:
 
 
 def test_the_best_iterate_comes_back_unless_the_last_one_is_the_result() -> None:
-    problem, limit = Contacts(30, 99), wl.StoppingCriteria(rtol=0.0, max_iterations=7)
+    problem, limit = ContactInequality(30, 99), wl.StoppingCriteria(rtol=0.0, max_iterations=7)
     best, last = (
         wl.solve(problem, ProjectedGradient(length=4.0, final=final), stopping=limit)
         for final in (False, True)
@@ -178,7 +178,7 @@ def test_the_best_iterate_comes_back_unless_the_last_one_is_the_result() -> None
 
 
 def test_a_method_may_want_steps_from_a_start_within_the_tolerance() -> None:
-    problem = Contacts(30, 99)
+    problem = ContactInequality(30, 99)
     work = ProjectedGradient().init(problem)
     work.wanted = True
     for most, steps in ((100, 1), (0, 0)):
@@ -192,7 +192,7 @@ def test_a_method_may_want_steps_from_a_start_within_the_tolerance() -> None:
 
 
 def test_methods_and_problems_that_do_not_go_together() -> None:
-    problem = Contacts(2, 5)
+    problem = ContactInequality(2, 5)
     with pytest.raises(
         ValueError, match="ProjectedSOR takes problems of the class LCP: this is a Contacts"
     ):

@@ -6,8 +6,8 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.problem.protocol import families
-from warp_lcp.problem.protocol import members as names_of
+from warp_lcp.problem.operator_protocol import families
+from warp_lcp.problem.operator_protocol import members as names_of
 
 A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
 X = [0.5, 1.5]  # 2 * 0.5 - 1.5 + 0.5 = 0 and -0.5 + 2 * 1.5 - 2.5 = 0
@@ -163,7 +163,7 @@ def test_arrays_of_every_kind_are_taken(made, device):
         np.testing.assert_allclose(wl.solve(problem, x0=[0, 1]).x.numpy(), X, atol=1e-5)
 
 
-class Frame:
+class ArrayLikeFrame:
     """Stand-in for a pandas object.
 
     It is no array, but `__array__` makes one of it; it has an `apply` of its own.
@@ -179,7 +179,7 @@ class Frame:
         raise AssertionError
 
 
-class Table:
+class ToNumpyTable:
     """Stand-in that `to_numpy` alone makes into an array."""
 
     def __init__(self, values):
@@ -189,7 +189,7 @@ class Table:
         return np.array(self.values)
 
 
-@pytest.mark.parametrize("kind", [Frame, Table])
+@pytest.mark.parametrize("kind", [ArrayLikeFrame, ToNumpyTable])
 def test_what_converts_to_an_array_is_taken_as_one(kind):
     given = [kind(values) for values in (A, B, np.full(2, -1.0), np.full(2, 9.0))]
     np.testing.assert_allclose(
@@ -324,7 +324,7 @@ def test_operators_that_lack_members():
     )
     assert set(names_of(wl.Operator)) == members
 
-    class Half:
+    class IncompleteOperator:
         shape, dtype, symmetric = (2,), wp.float64, True
 
         def apply(self, x, out=None):
@@ -335,7 +335,7 @@ def test_operators_that_lack_members():
         match=r"A is a Half without device, apply_transpose, diagonal: an operator needs them; a "
         r"subclass of",
     ):
-        wl.LCP(Half(), B)
+        wl.LCP(IncompleteOperator(), B)
 
 
 def test_methods_by_name():

@@ -8,13 +8,13 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from warp_lcp.default import default_method, solve
 from warp_lcp.default_chain import default_chain
 from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.import_aliases import install_aliases
 from warp_lcp.kernels.log_filter import install_log_filter
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.linear_complementarity import linear_complementarity
+from warp_lcp.method_selection import default_method, solve
 from warp_lcp.monitor import plot_convergence, print_progress
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
@@ -35,9 +35,9 @@ from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve import Precision, Step, VariationalInequality
-from warp_lcp.problem.spare_workspace import release_workspace
+from warp_lcp.problem.solve_loop import Precision, Step, VariationalInequality
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.problem.workspace_cache import release_workspace
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines

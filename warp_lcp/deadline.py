@@ -1,6 +1,6 @@
 """Deadline of the current solve: a time limit that nested loops can query.
 
-The outer loop (`warp_lcp.problem.solve`) sets the deadline. The inner loops of a method call
+The outer loop (`warp_lcp.problem.solve_loop`) sets the deadline. The inner loops of a method call
 `check_time`, or end early where `time_is_up` returns True. The deadline is a context variable, not
 an argument, because Krylov methods, principal systems and the solves of blocks have no access to
 the outer loop, and a nested solve must end with the outer one.
@@ -16,7 +16,7 @@ from typing import Any
 now = time.perf_counter  # seconds; the one clock that limits are measured by
 
 
-class TimeIsUp(Exception):
+class DeadlineReached(Exception):
     """The solve under way has no time left; the outer loop catches it."""
 
 
@@ -92,4 +92,4 @@ def check_time() -> None:
         TimeIsUp: the time limit is reached.
     """
     if time_is_up():
-        raise TimeIsUp
+        raise DeadlineReached

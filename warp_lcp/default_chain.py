@@ -12,10 +12,9 @@ from warp_lcp.operators.banded_matrix import NARROW
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasColumns, HasRows, HasScale, HasStencil, has
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.operator_protocol import HasLowRankTerm, HasRows, HasScale, HasStencil, has
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.reduced.initial_cycles import LARGE
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.assembled_matrix import AssembledMatrix
 from warp_lcp.solvers.fallback import (
@@ -36,6 +35,7 @@ from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.staggering import Staggering
+from warp_lcp.subproblems.initial_cycles import LARGE
 
 FALL = 0.9  # a residual above this part of the smallest so far is no progress of a path
 # Steps without progress before the proximal-point method takes over: the central path is joined far
@@ -80,7 +80,7 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PathCreeps(Settings):
+class CentralPathStalls(Settings):
     """Condition: the last step has failed, or the central path makes no progress.
 
     Args:
@@ -146,7 +146,7 @@ def _of_multigrid(method: ProjectedMultigrid) -> Solver:
 def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
     """Return the chain of Newton's method for the problem's operator."""
     A = None if problem is None else problem.A
-    if problem is None or has(A, HasColumns):
+    if problem is None or has(A, HasLowRankTerm):
         return method
     if has(A, HasStencil):
         return method if takes_points(A) else Fallback(method, (_on_assembled(), stalls_or_crawls))
@@ -195,7 +195,7 @@ def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
     a step. The central path exists for every positive semi-definite A, and needs no free blocks.
     """
     return FallbackEntry(InteriorPoint(precision="double"), stalls, restart=True), FallbackEntry(
-        ProximalPoint(), PathCreeps(steps=steps)
+        ProximalPoint(), CentralPathStalls(steps=steps)
     )
 
 

@@ -14,6 +14,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MODULES = {
+    "warp_lcp.default": "warp_lcp.method_selection",
     "warp_lcp.distributed.petsc_matrix": "warp_lcp.extras.petsc_matrix",
     "warp_lcp.gallery.articulated_figure": "warp_lcp.contacts.articulated_figure",
     "warp_lcp.gallery.contact_models": "warp_lcp.rigid.contact_models",
@@ -23,10 +24,14 @@ MODULES = {
     "warp_lcp.gradients.jax": "warp_lcp.extras.gradients.jax",
     "warp_lcp.gradients.pytorch": "warp_lcp.extras.gradients.pytorch",
     "warp_lcp.gradients.tape": "warp_lcp.extras.gradients.tape",
+    "warp_lcp.grid.solids": "warp_lcp.grid.signed_distance",
     "warp_lcp.newton": "warp_lcp.extras.newton",
     "warp_lcp.newton.bodies": "warp_lcp.extras.newton.bodies",
     "warp_lcp.newton.shapes": "warp_lcp.extras.newton.shapes",
     "warp_lcp.newton.solver": "warp_lcp.extras.newton.solver",
+    "warp_lcp.problem.protocol": "warp_lcp.problem.operator_protocol",
+    "warp_lcp.problem.solve": "warp_lcp.problem.solve_loop",
+    "warp_lcp.problem.spare_workspace": "warp_lcp.problem.workspace_cache",
     "warp_lcp.qp": "warp_lcp.extras.qp",
     "warp_lcp.render.live": "warp_lcp.extras.live",
     "warp_lcp.render.usd": "warp_lcp.extras.usd",

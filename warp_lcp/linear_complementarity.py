@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve, solve_by_attempts
 from warp_lcp.kernels.fields import Array, real_array
 from warp_lcp.kernels.types import DataType, DeviceArray
+from warp_lcp.method_selection import solve, solve_by_attempts
 from warp_lcp.operators.matrix_conversion import RestatedProblem
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
-from warp_lcp.problem.data_types import BoundValues, Multiplies, OperatorLike
+from warp_lcp.problem.data_types import BoundValues, OperatorLike, SupportsMatmul
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve import Solver, Workspace
+from warp_lcp.problem.solve_loop import Solver, Workspace
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
 from warp_lcp.solvers.registry import method_of
@@ -45,7 +45,7 @@ WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # names of the criteria he
 
 
 @runtime_checkable
-class BoundsOfScipy(Protocol):
+class ScipyBounds(Protocol):
     """A `scipy.optimize.Bounds`."""
 
     lb: BoundValues
@@ -53,11 +53,11 @@ class BoundsOfScipy(Protocol):
 
 
 Pair: TypeAlias = Any  # (lo, hi) of an unknown, or a bound of all unknowns
-Sides: TypeAlias = BoundsOfScipy | Sequence[Pair] | np.ndarray
+Sides: TypeAlias = ScipyBounds | Sequence[Pair] | np.ndarray
 
 
 def linear_complementarity(
-    A: OperatorLike | Multiplies,
+    A: OperatorLike | SupportsMatmul,
     b: Array,
     *,
     bounds: Sides | None = None,
@@ -66,7 +66,7 @@ def linear_complementarity(
     atol: float = 0.0,
     method: str | Solver | None = None,
     maxiter: int = 1000,
-    preconditioner: Multiplies | None = None,
+    preconditioner: SupportsMatmul | None = None,
     callback: Callable[..., object] | None = None,
 ) -> OptimizeResult:
     """Solve a complementarity problem with SciPy's conventions.
@@ -222,7 +222,7 @@ def _sides_of(bounds: Sides | None, shape: tuple[int, ...]) -> tuple[BoundValues
     """Return lower and upper bounds of unknowns of a shape."""
     if bounds is None:
         return 0.0, np.inf
-    if isinstance(bounds, BoundsOfScipy):
+    if isinstance(bounds, ScipyBounds):
         return bounds.lb, bounds.ub
     expected = (
         f"expected a pair (lo, hi), a list of {int(np.prod(shape))} pairs, a "

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import cache
 
 from warp_lcp.operators.matrix_conversion import Form, as_dense, as_grid, as_sparse
-from warp_lcp.problem.solve import Solver
-from warp_lcp.problem_properties import Traits
+from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem_properties import ProblemProperties
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
@@ -54,16 +54,16 @@ class Attempt:
 
     method: str | None
     form: Form | None = None
-    when: Callable[[Traits], bool] | None = None
+    when: Callable[[ProblemProperties], bool] | None = None
     steps: int | None = None
     again: bool = False
 
-    def suits(self, t: Traits) -> bool:
+    def suits(self, t: ProblemProperties) -> bool:
         """Return whether the attempt is made on a problem with these traits."""
         return (self.when is None or self.when(t)) and (self.method is None or t.takes(self.method))
 
 
-def is_concave(t: Traits) -> bool:
+def is_concave(t: ProblemProperties) -> bool:
     """Return whether a symmetric matrix has a negative diagonal entry.
 
     Usually that is a sign error in A; pivoting may still find a solution.
@@ -107,7 +107,7 @@ class Rule:
     """
 
     reason: str
-    applies: Callable[[Traits], bool]
+    applies: Callable[[ProblemProperties], bool]
     steps: int | None
     attempts: tuple[Attempt, ...]
 
@@ -277,7 +277,7 @@ RULES: tuple[Rule, ...] = (
 )
 
 
-def rules_for(t: Traits) -> Iterator[Rule]:
+def rules_for(t: ProblemProperties) -> Iterator[Rule]:
     """Return the rules that apply and whose methods accept such a problem."""
     return (rule for rule in RULES if rule.applies(t) and t.takes(rule.method))
 
@@ -289,7 +289,7 @@ def steps_allowed(name: str, unknowns: int) -> int:
     return LONGEST if name in SWEEPING else OTHERS
 
 
-def method_for(name: str, t: Traits) -> Solver:
+def method_for(name: str, t: ProblemProperties) -> Solver:
     """Return a method with the settings that suit a problem."""
     return _method(name, t.direct, t.affine)
 

@@ -18,12 +18,13 @@ from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.data_types import Matrix, is_sparse
 from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, HasStencil, declared, has, layout_of, takes
-from warp_lcp.problem.solve import solve
+from warp_lcp.problem.operator_protocol import HasRows, HasStencil, declared, has, layout_of, takes
+from warp_lcp.problem.solve_loop import solve
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.reduced.host_system import suits
+from warp_lcp.settings import renamed_names
 from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
+from warp_lcp.subproblems.host_system import suits
 
 MOST_FACTORED = 500  # largest number of unknowns for a Cholesky factorization: 4 ms
 # Of a larger dense matrix every second row and column is factored, up to MOST_SAMPLED: 0.2 s.
@@ -40,7 +41,7 @@ PIVOT = 1e-11
 LOW_RANK, LOW_RANK_ITERATIVE = 0.1, 0.3
 
 
-class Traits:
+class ProblemProperties:
     """Properties of a problem, each computed when first read.
 
     Each costs a product with A or less unless stated otherwise.
@@ -255,14 +256,14 @@ def has_piqp() -> bool:
     return find_spec("piqp") is not None
 
 
-def traits_of(problem: LCP, accuracy: float) -> Traits:
+def traits_of(problem: LCP, accuracy: float) -> ProblemProperties:
     """Return the traits of a problem, without changing it.
 
     Args:
         problem: the LCP.
         accuracy: relative residual that the number of sweeps is for, in (0, 1).
     """
-    return Traits(problem, accuracy)
+    return ProblemProperties(problem, accuracy)
 
 
 def sweeps_to(problem: LCP, accuracy: float) -> float:
@@ -325,3 +326,6 @@ def _definiteness(A: Matrix, symmetric: bool, d: np.ndarray) -> str:
         if _pivots(shifted) is not None:
             return verdict
     return "indefinite"
+
+
+__getattr__ = renamed_names(__name__, Traits="ProblemProperties")

@@ -11,9 +11,9 @@ from typing import Literal
 from warp_lcp.default_chain import default_chain
 from warp_lcp.method_rules import LONGEST, Attempt, Rule, method_for, rules_for, steps_allowed
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve import Solver, solve
+from warp_lcp.problem.solve_loop import Solver, solve
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.problem_properties import TRIAL, Traits
+from warp_lcp.problem_properties import TRIAL, ProblemProperties
 from warp_lcp.settings import Count, Positive, Settings, Share, checked
 from warp_lcp.solvers.fallback import Fallback
 from warp_lcp.solvers.registry import METHODS
@@ -76,7 +76,7 @@ class Recommendation:
     reasons: tuple[str, ...]
     expected: str | None
     attempts: tuple[Attempt, ...]
-    traits: Traits
+    traits: ProblemProperties
 
     def __str__(self) -> str:
         """Return the methods in order, and the reasons, as text."""
@@ -140,18 +140,18 @@ def recommend(
         )
     given = checked("accuracy", accuracy, Share | Literal[tuple(ACCURACIES)])
     rtol = ACCURACIES.get(given, given)
-    traits = Traits(problem, rtol, trial=budget is not None)
+    traits = ProblemProperties(problem, rtol, trial=budget is not None)
     found = _from_rule(next(rules_for(traits)), traits, rtol)
     return _within(found, budget, problem) if budget else found
 
 
-def memory_of(name: str, t: Traits) -> int:
+def memory_of(name: str, t: ProblemProperties) -> int:
     """Estimate the bytes that a method holds besides the problem's own arrays."""
     square, fields = FIELDS_ONLY if name in (*LEAN, "nncg", "projected-multigrid") else SYSTEMS
     return 8 * (square * (t.entries if t.kind in ("dense", "sparse") else 0) + fields * t.unknowns)
 
 
-def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
+def _from_rule(rule: Rule, t: ProblemProperties, rtol: float) -> Recommendation:
     """Return the recommendation of a rule."""
     expected = None
     if rule.steps is not None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 
-class _OrInfinite:
+class _AllowsInfinity:
     """Marker of a range that may hold inf."""
 
     def __get_pydantic_core_schema__(
@@ -48,7 +48,7 @@ class _OrInfinite:
         return {**handler(source), "allow_inf_nan": True}
 
 
-OrInfinite = _OrInfinite()
+OrInfinite = _AllowsInfinity()
 Count = Annotated[int, Ge(1)]
 CountOrZero = Annotated[int, Ge(0)]
 Positive = Annotated[float, Gt(0)]

@@ -92,7 +92,7 @@ class SimulationFailed(RuntimeError):
 
 
 @runtime_checkable
-class Measured(Protocol):
+class HasTables(Protocol):
     """A simulation that fills tables of its own beside the log, a row a step.
 
     Attributes:
@@ -243,7 +243,7 @@ class Simulation(Protocol):
 
 
 @runtime_checkable
-class Scheduled(Protocol):
+class HasEvents(Protocol):
     """Optional interface of a simulation with events at known times.
 
     Something starts or stops at these times. Steps end there where that takes no step much shorter
@@ -255,7 +255,7 @@ class Scheduled(Protocol):
 
 
 @runtime_checkable
-class Profiled(Protocol):
+class HasStages(Protocol):
     """Optional interface of a simulation that times the stages of its step.
 
     It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is
@@ -266,7 +266,7 @@ class Profiled(Protocol):
 
 
 @runtime_checkable
-class Recorded(Protocol):
+class HasRecordedProblems(Protocol):
     """Optional interface of a simulation that records the problems it solves.
 
     Until a run sets `record`, it is None and costs nothing. Then each step calls it before its
@@ -278,7 +278,7 @@ class Recorded(Protocol):
 
 
 @runtime_checkable
-class Resampled(Protocol):
+class HasResampling(Protocol):
     """Optional interface of a simulation that can continue a state of another grid."""
 
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
@@ -294,7 +294,7 @@ class Resampled(Protocol):
 
 
 @runtime_checkable
-class Joined(Simulation, Protocol):
+class HasPieces(Simulation, Protocol):
     """Optional interface of a simulation that is distributed over MPI ranks.
 
     It can also be resumed from a run on several ranks. On several ranks it is a rank's part:

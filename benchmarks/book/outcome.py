@@ -15,7 +15,7 @@ from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.gallery import Problem
 from warp_lcp.kernels.fields import Array
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 
 RTOL = 1e-6  # relative natural residual at which this library calls a problem solved
 DEEP = 1e-12  # tolerance of the solves, small enough to show the final convergence rate
@@ -41,7 +41,7 @@ class Merit(Enum):
 
 
 @dataclass(frozen=True)
-class Limits:
+class BookLimits:
     """Limits of the book's tests: relative change and size of the merit, iterations."""
 
     rtol: float = 1e-6
@@ -50,7 +50,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Trace:
+class IterateTrace:
     """Iterates of a solve: merits and natural residuals.
 
     Args:
@@ -68,7 +68,7 @@ class Trace:
         """Steps until the natural residual is RTOL times the first; None if never."""
         return next((k for k, r in enumerate(self.residuals) if r <= RTOL), None)
 
-    def verdict(self, merit: Merit, limits: Limits) -> tuple[str, int, float]:
+    def verdict(self, merit: Merit, limits: BookLimits) -> tuple[str, int, float]:
         """Return state, iterations and relative residual at Num4LCP's stopping point.
 
         Sweeps are tested after each step. Newton methods are tested before each step, the first
@@ -105,7 +105,7 @@ def follow(
     *,
     most: int = 100,
     x0: Array | None = None,
-) -> Trace:
+) -> IterateTrace:
     """Solve a dense or sparse problem and record the merit of each iterate."""
     lcp = problem.lcp(device=device)
     work = solver.init(lcp)
@@ -120,7 +120,7 @@ def follow(
     )
     result = wl.solve(lcp, solver, stopping=stopping, workspace=work, callback=look, x0=x0)
     first = result.history[0].residual or 1.0
-    return Trace(merits, [r.residual / first for r in result.history], result.status)
+    return IterateTrace(merits, [r.residual / first for r in result.history], result.status)
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class BookOutcome:
     """Solves of one kind of problem by one method, with the book's verdicts."""
 
     name: str  # name of the record
-    traces: Sequence[Trace]
+    traces: Sequence[IterateTrace]
     verdicts: Sequence[tuple[str, int, float]]
 
     @property
@@ -195,11 +195,11 @@ def outcome(
     merit: Merit,
     device: str,
     *,
-    limits: Limits | None = None,
+    limits: BookLimits | None = None,
     starts: Sequence[Array] | None = None,
 ) -> BookOutcome:
     """Solve all problems by a method, from x = 0 or the given starts."""
-    limits = limits or Limits()
+    limits = limits or BookLimits()
     given = starts or [None] * len(problems)
     traces = [
         follow(p, solver, merit, device, most=limits.most, x0=x0)

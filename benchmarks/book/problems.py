@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.benchmarks.harness.timing import Options
-from warp_lcp.gallery import Plant, Problem, contact, planted, poisson
+from warp_lcp.gallery import PlantedSolution, Problem, contact, planted, poisson
 from warp_lcp.gallery.matrices import banded_matrix, spectrum_matrix
 from warp_lcp.host_problem import Matrix
 
@@ -68,7 +68,7 @@ def complementary(A: Matrix, rng: np.random.Generator, name: str) -> Problem:
 
     A quarter of x is 0, with y > 0 there.
     """
-    return planted(A, rng, Plant(active=ZEROS), name=name, facts=frozenset())
+    return planted(A, rng, PlantedSolution(active=ZEROS), name=name, facts=frozenset())
 
 
 RULES: dict[str, Callable[[Matrix, np.random.Generator, str], Problem]] = {
@@ -141,7 +141,7 @@ def kinds(scale: ProblemScale) -> dict[str, Callable[[int], Problem]]:
     def seven_point(k: int) -> Problem:
         return poisson(
             (scale.side,) * 3,
-            plant=Plant(active=ZEROS),
+            plant=PlantedSolution(active=ZEROS),
             seed=SEED + k,
             device="cpu",
             dtype=wp.float64,

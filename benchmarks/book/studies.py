@@ -20,7 +20,7 @@ from warp_lcp.benchmarks.book.appendix_c import (
     PGS,
     Method,
 )
-from warp_lcp.benchmarks.book.outcome import RTOL, Limits, Merit, outcome, spread
+from warp_lcp.benchmarks.book.outcome import RTOL, BookLimits, Merit, outcome, spread
 from warp_lcp.benchmarks.book.problems import RULES, SEED, ProblemScale, dense
 from warp_lcp.benchmarks.harness.record import (
     BenchmarkRecord,
@@ -31,7 +31,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, contact, splash
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 
 STEPS = 10  # steps that figure C.5 times
 # Fewest unknowns for fitted exponents on grids: below, launches cost as much as the work.
@@ -159,7 +159,7 @@ def exponent(sizes: np.ndarray, seconds: Sequence[float], least: int) -> float:
 def _warm(results: Results, scale: ProblemScale, options: Options) -> None:
     """Count Newton iterations from zero and from ten PGS sweeps (figure C.6)."""
     rows, panels = list[list[str]](), list[RecordLines]()
-    limits = Limits(rtol=1e-6, atol=1e-2, most=30)
+    limits = BookLimits(rtol=1e-6, atol=1e-2, most=30)
     for rule in RULES:
         options.say(f"book: warm starts, {rule}")
         problems, curves = (
@@ -227,7 +227,7 @@ def solvable(problem: Problem) -> bool:
 def _zeros(results: Results, scale: ProblemScale, options: Options) -> None:
     """Solve problems with a growing number of zero eigenvalues."""
     rows, panels = list[list[str]](), list[RecordLines]()
-    few, limits = max(2, scale.problems // 10), Limits(rtol=1e-4, atol=1e-2)
+    few, limits = max(2, scale.problems // 10), BookLimits(rtol=1e-4, atol=1e-2)
     for rule in RULES:
         curves = {name: (list[float](), list[float]()) for name in ("solvable", *SEMIDEFINITE)}
         for zeros in ZEROS:

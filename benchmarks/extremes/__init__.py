@@ -16,19 +16,19 @@ from random import SystemRandom
 
 from warp_lcp.benchmarks.extremes import (
     bounds,
-    broken,
     coefficients,
     matrices,
-    refused,
+    rejected_input,
     shapes,
     simulations,
+    wrong_methods,
 )
 from warp_lcp.benchmarks.extremes.case import (
     PRECISIONS,
     REFUSED,
-    Expected,
     ExtremeCase,
     ExtremeVerdict,
+    OutcomeKind,
     judge,
 )
 from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
@@ -50,11 +50,11 @@ FAMILIES = (
     bounds.tolerances,
     matrices.singular,
     matrices.cycling,
-    refused.wrong_arguments,
+    rejected_input.wrong_arguments,
     simulations.steps_and_forces,
     simulations.solids_and_depth,
     simulations.particles_anywhere,
-    broken.wrong_solvers,
+    wrong_methods.wrong_solvers,
 )
 
 
@@ -131,7 +131,7 @@ def by_family(verdicts: Sequence[ExtremeVerdict]) -> list[BenchmarkRecord]:
         }
         counts |= {
             kind.value: n
-            for kind in Expected
+            for kind in OutcomeKind
             if (n := sum(v.promise.expected is kind for v in family_verdicts))
         }
         seconds = [v.attempt.seconds for v in family_verdicts]
@@ -152,7 +152,7 @@ def families(records: Sequence[BenchmarkRecord]) -> RecordTable:
     for r in records:
         kinds = ", ".join(
             f"{figure.value:.0f} {kind.value}"
-            for kind in Expected
+            for kind in OutcomeKind
             if (figure := r.figures.get(kind.value))
         )
         rows.append(

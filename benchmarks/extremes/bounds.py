@@ -15,9 +15,9 @@ import numpy as np
 from warp_lcp.benchmarks.extremes.case import (
     BELOW_ROUNDING,
     EITHER,
-    Expected,
+    ExpectedOutcome,
     ExtremeCase,
-    Promise,
+    OutcomeKind,
     refusal,
     stopped,
 )
@@ -26,7 +26,7 @@ from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, chance, given, noise
 from warp_lcp.files.tables import Tables
 
 SHAPE = (40, 44)
-EXACT_OR_FLOOR = Promise(Expected.EITHER, frozenset({"FLOOR"}))
+EXACT_OR_FLOOR = ExpectedOutcome(OutcomeKind.EITHER, frozenset({"FLOOR"}))
 NOISE, ODD = noise(SHAPE), np.indices(SHAPE).sum(axis=0) % 2 == 1
 
 

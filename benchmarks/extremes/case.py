@@ -35,7 +35,7 @@ BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.Lin
 HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})
 
 
-class Expected(Enum):
+class OutcomeKind(Enum):
     """Kinds of expected outcome."""
 
     SOLVED = "solved to tolerance"
@@ -47,10 +47,10 @@ class Expected(Enum):
 
 
 @dataclass(frozen=True)
-class Promise:
+class ExpectedOutcome:
     """Expected outcome of a case: its kind, statuses and message."""
 
-    expected: Expected
+    expected: OutcomeKind
     statuses: frozenset[str] = frozenset()  # statuses that the case may stop with
     names: str = ""  # text that the message of a refusal must contain
 
@@ -59,21 +59,21 @@ class Promise:
         return f"{self.expected.value} ({detail})" if detail else self.expected.value
 
 
-SOLVED = Promise(Expected.SOLVED)
-EITHER = Promise(Expected.EITHER, HONEST)
+SOLVED = ExpectedOutcome(OutcomeKind.SOLVED)
+EITHER = ExpectedOutcome(OutcomeKind.EITHER, HONEST)
 
 
-def stopped(status: str, names: str = "") -> Promise:
+def stopped(status: str, names: str = "") -> ExpectedOutcome:
     """Return the promise of a stop with a status."""
-    return Promise(Expected.STOPPED, frozenset({status}), names)
+    return ExpectedOutcome(OutcomeKind.STOPPED, frozenset({status}), names)
 
 
 INFEASIBLE, BELOW_ROUNDING = stopped("INFEASIBLE"), stopped("FLOOR")
 
 
-def refusal(names: str) -> Promise:
+def refusal(names: str) -> ExpectedOutcome:
     """Return the promise of a ValueError whose message contains `names`."""
-    return Promise(Expected.REFUSED, names=names)
+    return ExpectedOutcome(OutcomeKind.REFUSED, names=names)
 
 
 @dataclass
@@ -113,13 +113,13 @@ class ExtremeCase(ABC):
     family: str  # the cases that share an expectation
     name: str  # unique in its family
     _: KW_ONLY
-    expected: Promise = SOLVED  # expected outcome
+    expected: ExpectedOutcome = SOLVED  # expected outcome
     # Other expected outcomes, by precision.
-    promises: Mapping[str, Promise] = field(default_factory=dict)
+    promises: Mapping[str, ExpectedOutcome] = field(default_factory=dict)
     budget: float = BUDGET  # CPU seconds that a precision may take
     precisions: tuple[str, ...] = PRECISIONS  # precisions in which the case runs
 
-    def promise(self, precision: str) -> Promise:
+    def promise(self, precision: str) -> ExpectedOutcome:
         """Return the expected outcome in a precision."""
         return self.promises.get(precision, self.expected)
 
@@ -265,7 +265,7 @@ class RefusalCase(ExtremeCase):
     call: Callable[[str, str], object]  # takes device and precision
     names: str  # name of the argument, which the message must contain
 
-    def promise(self, precision: str) -> Promise:
+    def promise(self, precision: str) -> ExpectedOutcome:
         """Return the promise of a refusal."""
         return refusal(self.names)
 
@@ -281,7 +281,7 @@ class ExtremeVerdict:
 
     case: ExtremeCase
     precision: str
-    promise: Promise
+    promise: ExpectedOutcome
     attempt: ExtremeAttempt
     wrong: Sequence[str]
 
@@ -323,23 +323,23 @@ def in_time(case: ExtremeCase, precision: str, device: str) -> ExtremeAttempt:
         return ExtremeAttempt(OUT_OF_TIME, seconds=time.perf_counter() - start_time)
 
 
-def violations(promise: Promise, attempt: ExtremeAttempt) -> list[str]:
+def violations(promise: ExpectedOutcome, attempt: ExtremeAttempt) -> list[str]:
     """Return the faults of an attempt for a promise."""
     wrong, status, expected = list(attempt.faults), attempt.status, promise.expected
-    if expected is Expected.CAUGHT:
+    if expected is OutcomeKind.CAUGHT:
         return [] if wrong or status != "CONVERGED" else ["a wrong solver passes"]
-    if expected is Expected.REFUSED:
+    if expected is OutcomeKind.REFUSED:
         if status != REFUSED:
             wrong.append(f"{status}, not refused")
         elif promise.names not in attempt.message:
             wrong.append(f"the message does not name {promise.names}: {attempt.message}")
     elif status == REFUSED:
         wrong.append(f"refused: {attempt.message}")
-    elif expected is Expected.SOLVED and not (status == "CONVERGED" and attempt.met):
+    elif expected is OutcomeKind.SOLVED and not (status == "CONVERGED" and attempt.met):
         wrong.append(f"{status}{attempt.at}, not solved")
-    elif expected is Expected.STOPPED and status not in promise.statuses:
+    elif expected is OutcomeKind.STOPPED and status not in promise.statuses:
         wrong.append(f"{status}{attempt.at}, not {'/'.join(sorted(promise.statuses))}")
-    elif expected in (Expected.EITHER, Expected.DONE) and status not in promise.statuses | {
+    elif expected in (OutcomeKind.EITHER, OutcomeKind.DONE) and status not in promise.statuses | {
         "CONVERGED",
         "done",
     }:

@@ -25,7 +25,7 @@ AXES = "xyz"
 
 
 @dataclass(frozen=True)
-class Exact:
+class ExactEquations:
     """Equations of the unknowns alone, in float64."""
 
     matrix: scipy.sparse.csr_array  # shape (n, n)

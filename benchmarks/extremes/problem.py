@@ -16,7 +16,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp import gallery
-from warp_lcp.benchmarks.extremes.exact import Exact, stencil
+from warp_lcp.benchmarks.extremes.exact import ExactEquations, stencil
 from warp_lcp.files.tables import Tables, TableView
 from warp_lcp.host_problem import Matrix
 
@@ -70,7 +70,7 @@ class GridProblem:
             A = wl.SumOperator(A, wl.LowRankOperator(self.columns, self.weights, device=device))
         return wl.LCP(A, self.b, self.lower, self.upper)
 
-    def exact(self) -> Exact:
+    def exact(self) -> ExactEquations:
         """Return the problem for the independent residual."""
         matrix, fluid = stencil(self.cells, self.faces, self.shift, self.periodic)
         b, lower, upper = (
@@ -82,7 +82,7 @@ class GridProblem:
             if self.columns is None
             else self.columns.reshape(-1, self.columns.shape[-1])[fluid]
         )
-        return Exact(matrix, b, lower, upper, U, self.weights)
+        return ExactEquations(matrix, b, lower, upper, U, self.weights)
 
     def unknowns(self, x: np.ndarray) -> np.ndarray:
         """Return the unknowns of a field x, shape (n,), float64."""
@@ -109,9 +109,9 @@ class MatrixProblem:
     upper: float | np.ndarray = np.inf
 
     @staticmethod
-    def of(problem: gallery.Problem | Exact) -> MatrixProblem:
+    def of(problem: gallery.Problem | ExactEquations) -> MatrixProblem:
         """Return a problem of the gallery; one on a grid as GridProblem."""
-        matrix = problem.matrix if isinstance(problem, Exact) else problem.A
+        matrix = problem.matrix if isinstance(problem, ExactEquations) else problem.A
         lower, upper = problem.lower, problem.upper
         assert not isinstance(matrix, wl.GridPoisson)
         assert isinstance(lower, np.ndarray) and isinstance(upper, np.ndarray)
@@ -124,12 +124,12 @@ class MatrixProblem:
             kind(self.matrix, device=device, dtype=storage), self.b, self.lower, self.upper
         )
 
-    def exact(self) -> Exact:
+    def exact(self) -> ExactEquations:
         """Return the problem for the independent residual."""
         lower, upper = (
             np.broadcast_to(f, self.b.shape).astype(np.float64) for f in (self.lower, self.upper)
         )
-        return Exact(
+        return ExactEquations(
             scipy.sparse.csr_array(self.matrix, dtype=np.float64),
             self.b.astype(np.float64),
             lower,
@@ -165,7 +165,7 @@ def with_solution(cells: np.ndarray, x: np.ndarray, y: np.ndarray) -> GridProble
 
 
 @dataclass(frozen=True)
-class Pools:
+class ProblemComponents:
     """Connected components of the unknowns, and their solvability.
 
     A pool is loose if no AIR, shift or bound holds it.
@@ -180,7 +180,7 @@ class Pools:
     above: np.ndarray  # whether one of its upper bounds is
 
     @staticmethod
-    def of(exact: Exact) -> Pools:
+    def of(exact: ExactEquations) -> ProblemComponents:
         """Return the pools of a symmetric problem whose off-diagonal entries are <= 0."""
         count, label = scipy.sparse.csgraph.connected_components(exact.matrix != 0, directed=False)
         tied = np.asarray(exact.matrix.sum(axis=1)).ravel() > 1e-12 * exact.matrix.diagonal()
@@ -190,7 +190,9 @@ class Pools:
         )
         net, size = (np.bincount(label, v, count) for v in (exact.b, np.abs(exact.b)))
         net = np.where(np.abs(net) <= BALANCED * size, 0.0, net)
-        return Pools(label, ~at_bound, net, size, np.bincount(label, minlength=count), below, above)
+        return ProblemComponents(
+            label, ~at_bound, net, size, np.bincount(label, minlength=count), below, above
+        )
 
     @property
     def lost(self) -> np.ndarray:
@@ -203,7 +205,7 @@ def solvable(problem: GridProblem) -> GridProblem:
 
     On pools without a solution, b moves by the least amount that gives them one, and a little more.
     """
-    pools = Pools.of(problem.exact())
+    pools = ProblemComponents.of(problem.exact())
     # If the sum is 0, a solution barely exists. Where only one bound exists, b moves towards the
     # sign that the bound can balance.
     moved = pools.lost | (pools.loose & (pools.net == 0) & (pools.below ^ pools.above))
@@ -223,4 +225,4 @@ def equality(problem: GridProblem) -> GridProblem | None:
     """
     b = problem.b if np.any(problem.b[problem.cells == wl.FLUID]) else -np.ones(problem.cells.shape)
     free = replace(problem, b=b, lower=-np.inf, upper=np.inf)
-    return None if Pools.of(free.exact()).lost.any() else free
+    return None if ProblemComponents.of(free.exact()).lost.any() else free

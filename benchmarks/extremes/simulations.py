@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 
 from warp_lcp.benchmarks.extremes.case import (
     PRECISIONS,
-    Expected,
+    ExpectedOutcome,
     ExtremeAttempt,
     ExtremeCase,
-    Promise,
+    OutcomeKind,
     stopped,
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem
@@ -35,14 +35,14 @@ from warp_lcp.scene.simulator import Simulator
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 ParticleSimulation = LiquidSimulation | SandSimulation
-DONE = Promise(Expected.DONE)
+DONE = ExpectedOutcome(OutcomeKind.DONE)
 STEPS = 5
 BUDGET = 20.0  # seconds of a case in one precision
 CROWD = 1_000_000  # particles in one cell; tested once, since it needs much memory
 CROWDED = 10_000_000
 
 
-def ended_with(names: str) -> Promise:
+def ended_with(names: str) -> ExpectedOutcome:
     """Return the promise of a simulation that ends with a message containing `names`."""
     return stopped(f"failed: {names}", names)
 
@@ -61,7 +61,7 @@ class RunCase(ExtremeCase):
     # Returns further faults, besides those that every case checks.
     check: Callable[[ParticleSimulation], list[str]] = lambda simulation: []
     leaves: bool = False  # whether particles may leave the domain
-    expected: Promise = DONE
+    expected: ExpectedOutcome = DONE
     budget: float = BUDGET
 
     def tried(self, precision: str, device: str) -> ExtremeAttempt:
@@ -370,10 +370,10 @@ def particles_anywhere() -> Iterator[ExtremeCase]:
     )
 
 
-Place = slice | EllipsisType | np.ndarray | tuple[int | slice, ...]  # of an array
+ArrayIndex = slice | EllipsisType | np.ndarray | tuple[int | slice, ...]  # of an array
 
 
-def put(field: str, at: Place, value: ArrayLike) -> Callable[[ParticleSimulation], None]:
+def put(field: str, at: ArrayIndex, value: ArrayLike) -> Callable[[ParticleSimulation], None]:
     """Return a function that overwrites some positions or velocities of particles."""
 
     def change(simulation: ParticleSimulation) -> None:

@@ -19,7 +19,7 @@ import warp_lcp as wl
 from warp_lcp.files.tables import TableValue
 from warp_lcp.host_problem import Matrix
 from warp_lcp.problem.affine_bounds import AffineBounds
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 if TYPE_CHECKING:
     import qpsolvers
@@ -113,7 +113,7 @@ class HostileProgram:
 
 
 @dataclass(frozen=True)
-class Values:
+class ExpectedArrays:
     """Expected arrays, to a tolerance relative to the largest entry of each."""
 
     expected: dict[str, np.ndarray]
@@ -121,7 +121,7 @@ class Values:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class MalformedInput:
     """Malformed input, which must be refused.
 
     Expected is a ValueError, or a solve that ends in a status other than CONVERGED.
@@ -143,7 +143,7 @@ class HostileCase:
 
     name: str
     solve: Callable[[], HostileAnswer]
-    truth: HostileBox | HostileProgram | Values | Refusal
+    truth: HostileBox | HostileProgram | ExpectedArrays | MalformedInput
     method: str | None = None
 
 

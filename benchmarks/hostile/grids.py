@@ -15,10 +15,10 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.hostile import draw
 from warp_lcp.benchmarks.hostile.case import (
     GRID_METHODS,
+    ExpectedArrays,
     HostileAnswer,
     HostileBox,
     HostileCase,
-    Values,
     box_case,
 )
 
@@ -145,7 +145,7 @@ def solid(rng: Rng) -> HostileCase:
                 {k: v.numpy().ravel()[F].astype(float) for k, v in fields.items()},
             )
 
-        return HostileCase(f"{name}, its parts", parts, Values(expected, 1e-12))
+        return HostileCase(f"{name}, its parts", parts, ExpectedArrays(expected, 1e-12))
     A = matrix[F][:, F].tocsr()
     kind, low, high = draw.bounds(rng, len(F))
     x, b = draw.plant(rng, A, low, high)
@@ -432,7 +432,7 @@ def gradients(rng: Rng) -> HostileCase:
         return HostileAnswer("CONVERGED", result.x.numpy().ravel()[F], "", values)
 
     name = f"gradients of a {kind} problem, n={n}, {free.sum()} free, {bound} bounds"
-    return HostileCase(name, solve, Values(expected, max(1e-6, 1e-8 * condition)))
+    return HostileCase(name, solve, ExpectedArrays(expected, max(1e-6, 1e-8 * condition)))
 
 
 def _by_offset(

@@ -18,12 +18,12 @@ from warp_lcp.benchmarks.hostile.case import (
     EXCEPTION,
     INFEASIBLE,
     REFUSED,
+    ExpectedArrays,
     HostileAnswer,
     HostileBox,
     HostileCase,
     HostileProgram,
-    Refusal,
-    Values,
+    MalformedInput,
 )
 
 if TYPE_CHECKING:
@@ -38,24 +38,24 @@ def judge(case: HostileCase, answer: HostileAnswer) -> Verdicts:
     """Return pairs of a category and a reason; the first is the end of the solve."""
     if answer.status == EXCEPTION:
         return [("EXCEPTION", answer.note)]
-    if isinstance(case.truth, Refusal):
+    if isinstance(case.truth, MalformedInput):
         return _refusal(case.truth, answer)
     if answer.status == REFUSED:
         return [("other method" if case.method else "refused", answer.note)]
-    if isinstance(case.truth, Values):
+    if isinstance(case.truth, ExpectedArrays):
         return _values(case.truth, answer)
     if isinstance(case.truth, HostileProgram):
         return _program(case.truth, answer)
     return _box(case.truth, answer, case.method)
 
 
-def _refusal(truth: Refusal, answer: HostileAnswer) -> Verdicts:
+def _refusal(truth: MalformedInput, answer: HostileAnswer) -> Verdicts:
     if answer.status == CONVERGED:
         return [("FALSE CONVERGED", truth.why)]
     return [("honest", answer.note)]
 
 
-def _values(truth: Values, answer: HostileAnswer) -> Verdicts:
+def _values(truth: ExpectedArrays, answer: HostileAnswer) -> Verdicts:
     if answer.status != CONVERGED:
         return [("not solved", f"{answer.status}: {answer.note}")]
     magnitude = max(

@@ -19,7 +19,7 @@ from warp_lcp.benchmarks.hostile.case import (
     HostileAnswer,
     HostileBox,
     HostileCase,
-    Refusal,
+    MalformedInput,
     box_case,
 )
 from warp_lcp.host_problem import Matrix
@@ -430,7 +430,7 @@ def malformed(rng: Rng) -> HostileCase:
     return HostileCase(
         f"malformed {M.format} matrix, n={n}: {way}, {method or 'default'}",
         solve,
-        Refusal(f"{way} of a malformed matrix"),
+        MalformedInput(f"{way} of a malformed matrix"),
         None,
     )
 

@@ -32,7 +32,7 @@ def _changes(module: str, tests: str, *pairs: tuple[str, str]) -> list[Formula]:
 
 
 MAP, NEWTON, PATH = (
-    "reduced/test_nonsmooth_map.py",
+    "subproblems/test_nonsmooth_map.py",
     "solvers/test_fischer_newton_steps.py",
     "solvers/test_interior_point_steps.py",
 )
@@ -45,7 +45,7 @@ SUBSPACE, BLOCKS, PIVOTS = (
 
 FORMULAS = [
     *_changes(
-        "reduced/headers/nonsmooth_map.h",
+        "subproblems/headers/nonsmooth_map.h",
         MAP,
         ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)1, kq = (R)0;"),
         ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)0, kq = (R)0;"),
@@ -72,7 +72,7 @@ FORMULAS = [
         ("top = high & (-c > least)", "top = high & (c > least)"),
     ),
     *_changes(
-        "reduced/headers/nonsmooth_map.h",
+        "subproblems/headers/nonsmooth_map.h",
         MAP,
         ("solved ? size * p / qs : 0.0", "solved ? p / qs : 0.0"),
         ("-scale * f / qs", "-scale * f"),
@@ -88,21 +88,21 @@ FORMULAS = [
         ),
     ),
     *_changes(
-        "reduced/headers/nonsmooth_map.h",
+        "subproblems/headers/nonsmooth_map.h",
         MAP,
         ("(gradient[i] + product[i]) / size", "(gradient[i] - product[i]) / size"),
         ("gradient[i] = g / size", "gradient[i] = g"),
     ),
-    *_changes("reduced/headers/nonsmooth_map.h", MAP, ("size * p * f", "p * f")),
+    *_changes("subproblems/headers/nonsmooth_map.h", MAP, ("size * p * f", "p * f")),
     *_changes(
-        "reduced/nonsmooth_map.py",
+        "subproblems/nonsmooth_map.py",
         MAP,
         ("LEAST_Q = 1e-6", "LEAST_Q = 1e-3"),
         ("(Kink.ZERO, Kink.APPROXIMATION)", "(Kink.ZERO,)"),
         ("self.residual.norm_of_b() / np.sqrt(count)", "self.residual.norm_of_b()"),
     ),
     *_changes(
-        "reduced/nonsmooth_map.py",
+        "subproblems/nonsmooth_map.py",
         NEWTON,
         ("((by_x, along), (by_y, product))", "((by_y, along), (by_x, product))"),
         ("np.clip(at - step, lower, upper)", "np.clip(at + step, lower, upper)"),
@@ -131,7 +131,7 @@ FORMULAS = [
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.NON_DESCENT if stationary"),
     ),
     *_changes(
-        "reduced/energy_monitor.py",
+        "subproblems/energy_monitor.py",
         NEWTON,
         ("DECREASE = 1e-4", "DECREASE = 0.3"),
         ("limit + DECREASE * length * slope", "limit - DECREASE * length * slope"),
@@ -156,7 +156,7 @@ FORMULAS = [
         ("if failure and np.linalg.norm(inside)", "if not failure and np.linalg.norm(inside)"),
     ),
     *_changes(
-        "reduced/nonsmooth_map.py",
+        "subproblems/nonsmooth_map.py",
         NEWTON,
         ("self._element = np.zeros(n), np.ones(n)", "self._element = np.ones(n), np.zeros(n)"),
         ("self._element = np.zeros(n), np.ones(n)", "self._element = np.zeros(n), np.zeros(n)"),
@@ -165,13 +165,13 @@ FORMULAS = [
         ("share=1.0 if smoothing", "share=0.5 if smoothing"),
     ),
     *_changes(
-        "reduced/nonsmooth_map.py",
+        "subproblems/nonsmooth_map.py",
         MAP,
         ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"),
         ("kinks=KINK * self.scale", "kinks=0.0"),
     ),
     *_changes(
-        "reduced/headers/nonsmooth_map.h",
+        "subproblems/headers/nonsmooth_map.h",
         MAP,
         ("SMOOTHED(v) ((v) + twice_mu)", "SMOOTHED(v) ((v) - twice_mu)"),
         ("LOWERED(v) ((v) - twice_mu)", "LOWERED(v) ((v) + twice_mu)"),
@@ -246,7 +246,7 @@ FORMULAS = [
         ("vn = v[i] - length * dx", "vn = v[i] + length * dx"),
     ),
     *_changes(
-        "reduced/headers/active_set.h",
+        "subproblems/headers/active_set.h",
         ACTIVE,
         ("low = v<l", "low = v <= l"),
         ("high = v> u", "high = v >= u"),
@@ -254,15 +254,17 @@ FORMULAS = [
         ("v = x[k] - known[k] / e", "v = x[k] - known[k]"),
     ),
     *_changes(
-        "reduced/headers/grid_step.h",
+        "subproblems/headers/grid_step.h",
         ACTIVE,
         ("low = below<v", "low = below <= v"),
         ("high = above> v", "high = above >= v"),
         ("(low ? -mark : mark)", "(low ? mark : -mark)"),
     ),
-    *_changes("reduced/headers/grid_step.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")),
     *_changes(
-        "reduced/host_system.py",
+        "subproblems/headers/grid_step.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")
+    ),
+    *_changes(
+        "subproblems/host_system.py",
         ACTIVE,
         ("target < self._lower", "target <= self._lower"),
         ("target > self._upper", "target >= self._upper"),
@@ -277,7 +279,7 @@ FORMULAS = [
         ("limit = self.system, max(self.norms)", "limit = self.system, min(self.norms)"),
     ),
     *_changes(
-        "reduced/correction_system.py",
+        "subproblems/correction_system.py",
         ACTIVE,
         (
             "        if not self._settings.safeguard:\n",
@@ -286,7 +288,7 @@ FORMULAS = [
         ("helped = problem.bounded and settings.safeguard", "helped = problem.bounded"),
     ),
     *_changes(
-        "reduced/reduced_system.py",
+        "subproblems/reduced_system.py",
         ACTIVE,
         ("if settings.safeguard and takes_points", "if takes_points"),
     ),
@@ -400,7 +402,7 @@ FORMULAS = [
         ("before = s != 0 ? own : g[k]", "before = g[k]"),
     ),
     *_changes(
-        "reduced/grid_step_kernels.py",
+        "subproblems/grid_step_kernels.py",
         GRADIENTS,
         ("ratio = -zap / pap", "ratio = zap / pap"),
         ("gz + ratio * gp", "gz - ratio * gp"),

@@ -72,7 +72,7 @@ NATIVE = re.compile(
 Position = tuple[int, int]  # line and column
 
 
-class LeaveOut(Operator):
+class StatementDeletion(Operator):
     """Replace a call statement or an in-place change of a variable by `pass`."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[tuple[Position, Position]]:
@@ -111,7 +111,7 @@ class Mutant(NamedTuple):
 
 def operator(name: str) -> Operator:
     """Return a mutation operator by name."""
-    return LeaveOut() if name == "LeaveOut" else get_operator(name)()
+    return StatementDeletion() if name == "StatementDeletion" else get_operator(name)()
 
 
 def native_places(source: str) -> list[re.Match[str]]:
@@ -208,7 +208,7 @@ def _places(module: str, source: str) -> list[tuple[int, str, int]]:
         ]
     nodes = [(node, _inert(node)) for node in ast_nodes(parso.parse(source))]
     places, lines = [], source.splitlines()
-    for name in (*NAMES, "LeaveOut"):
+    for name in (*NAMES, "StatementDeletion"):
         change, occurrence = operator(name), 0
         for node, inert in nodes:
             for begin, _ in change.mutation_positions(node):

@@ -25,8 +25,8 @@ from warp_lcp.benchmarks.harness.record import (
     table_of_targets,
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
-from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, Question
-from warp_lcp.benchmarks.peers.roster import Roster, roster
+from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, PeerProblem
+from warp_lcp.benchmarks.peers.peer_list import PeerList, roster
 from warp_lcp.benchmarks.problems import BOUNDS, splash
 
 TITLE = "Pressure solves against peers"
@@ -41,11 +41,11 @@ GROWTH = 4 / 3  # least exponent of the expected time, for solves whose iteratio
 
 
 @dataclass
-class Contest:
+class PeerComparison:
     """Peer on one problem, with its answers."""
 
     peer: Peer  # the solver
-    question: Question  # the problem
+    question: PeerProblem  # the problem
     # Tolerance given to the peer, such that its residual is the required one.
     tolerance: float = RTOL
     answers: list[PeerAnswer] = field(default_factory=list)  # one for each round
@@ -143,7 +143,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_size(
-    n: int, roster: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
+    n: int, roster: PeerList, seconds: dict[tuple[str, str], tuple[int, float]], options: Options
 ) -> list[BenchmarkRecord]:
     """Measure one sample of each solver in every round."""
     scene = splash(n)
@@ -151,8 +151,10 @@ def _measure_size(
         bounds: SolverCase("unit", scene, bounds, wl.ProjectedMultigrid(), options.device)
         for bounds in BOUNDS
     }
-    questions = {bounds: Question(scene, bounds) for bounds in BOUNDS}
-    contests = [Contest(peer, questions[bounds]) for peer in roster.peers for bounds in peer.bounds]
+    questions = {bounds: PeerProblem(scene, bounds) for bounds in BOUNDS}
+    contests = [
+        PeerComparison(peer, questions[bounds]) for peer in roster.peers for bounds in peer.bounds
+    ]
     for contest in contests:
         peer = contest.peer
         m, last = seconds.get((peer.name, contest.question.bounds), (n, 0.0))

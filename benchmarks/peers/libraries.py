@@ -12,13 +12,13 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-from warp_lcp.benchmarks.peers.peer import PeerAnswer, Question
+from warp_lcp.benchmarks.peers.peer import PeerAnswer, PeerProblem
 
 CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
 
 
 def pyamg(
-    question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver"
+    question: PeerProblem, tolerance: float, *, build: str = "smoothed_aggregation_solver"
 ) -> PeerAnswer:
     """Solve by CG with one of PyAMG's hierarchies, all defaults."""
     import pyamg as library
@@ -33,7 +33,7 @@ def pyamg(
     return PeerAnswer(x, middle - start_time, time.perf_counter() - middle, len(residuals) - 1)
 
 
-def scipy_cg(question: Question, tolerance: float) -> PeerAnswer:
+def scipy_cg(question: PeerProblem, tolerance: float) -> PeerAnswer:
     """Solve by plain conjugate gradients."""
     A, b, count = question.matrix, -question.b, list[int]()
     begun = time.perf_counter()
@@ -43,7 +43,7 @@ def scipy_cg(question: Question, tolerance: float) -> PeerAnswer:
     return PeerAnswer(x, 0.0, time.perf_counter() - begun, len(count))
 
 
-def amgcl(question: Question, tolerance: float) -> PeerAnswer:
+def amgcl(question: PeerProblem, tolerance: float) -> PeerAnswer:
     """Solve by CG with AMGCL's smoothed aggregation.
 
     One sweep of its ILU(0) smooths; it is the fastest of its smoothers here.
@@ -61,7 +61,7 @@ def amgcl(question: Question, tolerance: float) -> PeerAnswer:
     return PeerAnswer(x, middle - start_time, time.perf_counter() - middle, int(solver.iters))
 
 
-def warp_cg(question: Question, tolerance: float, *, device: str) -> PeerAnswer:
+def warp_cg(question: PeerProblem, tolerance: float, *, device: str) -> PeerAnswer:
     """Solve by Warp's conjugate gradients with a diagonal preconditioner.
 
     The matrix is a Warp BSR matrix in float64.
@@ -88,7 +88,7 @@ def warp_cg(question: Question, tolerance: float, *, device: str) -> PeerAnswer:
     return PeerAnswer(x.numpy(), middle - begun, time.perf_counter() - middle, int(iterations))
 
 
-def cupy_cg(question: Question, tolerance: float) -> PeerAnswer:
+def cupy_cg(question: PeerProblem, tolerance: float) -> PeerAnswer:
     """Solve by CuPy's plain conjugate gradients on its current CUDA device."""
     import cupy
     import cupyx.scipy.sparse
@@ -108,7 +108,7 @@ def cupy_cg(question: Question, tolerance: float) -> PeerAnswer:
     return PeerAnswer(cupy.asnumpy(x), 0.0, time.perf_counter() - begun, len(count))
 
 
-def osqp(question: Question, tolerance: float) -> PeerAnswer:
+def osqp(question: PeerProblem, tolerance: float) -> PeerAnswer:
     """Solve by OSQP: operator splitting with one factorization.
 
     Its tolerances are absolute, in units of b.
@@ -138,7 +138,7 @@ def osqp(question: Question, tolerance: float) -> PeerAnswer:
     )
 
 
-def piqp(question: Question, tolerance: float) -> PeerAnswer:
+def piqp(question: PeerProblem, tolerance: float) -> PeerAnswer:
     """Solve by PIQP: a proximal interior-point method, sparse factorizations."""
     import piqp as library
 
@@ -159,7 +159,7 @@ def piqp(question: Question, tolerance: float) -> PeerAnswer:
     )
 
 
-def clarabel(question: Question, tolerance: float) -> PeerAnswer:
+def clarabel(question: PeerProblem, tolerance: float) -> PeerAnswer:
     """Solve by Clarabel: an interior-point method on a homogeneous embedding.
 
     Its factorizations are sparse.

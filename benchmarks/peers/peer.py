@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from warp_lcp.benchmarks.extremes.exact import Exact
+from warp_lcp.benchmarks.extremes.exact import ExactEquations
 from warp_lcp.benchmarks.problems import BOUNDS, Splash
 from warp_lcp.operators.grid_poisson import FLUID
 
@@ -21,7 +21,7 @@ class PeerFailed(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Question:
+class PeerProblem:
     """Assembled problem y = A x + b, x >= lower, on the FLUID cells of a scene."""
 
     scene: Splash  # the scene
@@ -55,9 +55,9 @@ class Question:
         ]
 
     @cached_property
-    def exact(self) -> Exact:
+    def exact(self) -> ExactEquations:
         """Equations of the natural residual."""
-        return Exact(self.matrix, self.b, self.lower, np.full_like(self.b, np.inf))
+        return ExactEquations(self.matrix, self.b, self.lower, np.full_like(self.b, np.inf))
 
     def residual(self, x: np.ndarray) -> float:
         """Return the relative natural residual of x, in float64.
@@ -91,7 +91,7 @@ class Peer:
         name: name in tables.
         library: name of its distribution.
         solve: solves to the peer's own tolerance; the harness tightens it until
-            `Question.residual` is small enough.
+            `PeerProblem.residual` is small enough.
         bounds: kinds of bounds that it solves.
         most: most cells along a side that are measured.
         settings: non-default settings.
@@ -100,7 +100,7 @@ class Peer:
 
     name: str
     library: str
-    solve: Callable[[Question, float], PeerAnswer]
+    solve: Callable[[PeerProblem, float], PeerAnswer]
     bounds: tuple[str, ...] = ("linear",)
     most: int = 1 << 20
     settings: str = "defaults"

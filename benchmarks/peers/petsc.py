@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer, PeerAnswer, PeerFailed, Question
+from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer, PeerAnswer, PeerFailed, PeerProblem
 from warp_lcp.benchmarks.problems import BOUNDS
 from warp_lcp.files.tables import Tables, TableView
 
@@ -101,7 +101,7 @@ def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
     if python is None:
         yield [], missing()
         return
-    worker = Worker("petsc4py", [python, str(Path(__file__).with_name("petsc_worker.py"))])
+    worker = PeerWorker("petsc4py", [python, str(Path(__file__).with_name("petsc_worker.py"))])
     ask = partial(asked, worker=worker, folder=folder)
     try:
         found = METHODS.items()
@@ -116,7 +116,7 @@ def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
         worker.close()
 
 
-class Worker:
+class PeerWorker:
     """Running process of a peer.
 
     Args:
@@ -174,10 +174,10 @@ class Worker:
 
 
 def asked(
-    question: Question,
+    question: PeerProblem,
     tolerance: float,
     *,
-    worker: Worker,
+    worker: PeerWorker,
     folder: Path,
     options: Mapping[str, str],
 ) -> PeerAnswer:
@@ -193,7 +193,7 @@ def asked(
         for old in folder.glob("*.npz"):
             old.unlink()
         fields: Tables = {
-            f"lower_{name}": Question(question.scene, name).lower for name in INEQUALITIES
+            f"lower_{name}": PeerProblem(question.scene, name).lower for name in INEQUALITIES
         }
         fields |= {
             "data": A.data,

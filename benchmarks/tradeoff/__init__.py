@@ -18,7 +18,7 @@ from warp_lcp.benchmarks.tradeoff.charts import (
     solve_table,
 )
 from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Runs
-from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
+from warp_lcp.benchmarks.tradeoff.settings import TradeoffSetting, settings_of
 from warp_lcp.benchmarks.tradeoff.solves import measure_solves
 from warp_lcp.scene.presets import PRESETS, price_table
 from warp_lcp.scene.scene_file import load_scene
@@ -51,7 +51,8 @@ def _measure_scene(
     scene = runs.scene()
     settings = settings_of(scene.scene.simulator)
     presets = [
-        Setting(f"preset {preset}", _overrides(scene.scene.simulator, preset)) for preset in PRESETS
+        TradeoffSetting(f"preset {preset}", _overrides(scene.scene.simulator, preset))
+        for preset in PRESETS
     ]
     measured = runs.measure([*presets, *settings])
     scene_records = [runs.record(run) for run in measured]

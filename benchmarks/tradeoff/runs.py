@@ -10,7 +10,7 @@ from functools import cache
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
+from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, TradeoffSetting
 from warp_lcp.files.tables import Tables
 from warp_lcp.run.trial import BIN, Trial, trial
 from warp_lcp.scene.presets import changed, price_table
@@ -26,7 +26,7 @@ FRAMES = 18
 class TradeoffRun:
     """Runs of one setting."""
 
-    setting: Setting  # the setting
+    setting: TradeoffSetting  # the setting
     trial: Trial | None = None  # result of its first run
     seconds: list[float] = field(default_factory=list)  # seconds of all its runs
     bytes: int = 0  # device arrays at the end
@@ -54,7 +54,7 @@ class Runs:
             self.name, [f"domain.resolution={round(scale * self.resolution)}", *overrides]
         )
 
-    def measure(self, settings: Sequence[Setting]) -> list[TradeoffRun]:
+    def measure(self, settings: Sequence[TradeoffSetting]) -> list[TradeoffRun]:
         """Run all settings, interleaved."""
         runs = [TradeoffRun(setting) for setting in settings]
         for turn in range(self.options.repeat):

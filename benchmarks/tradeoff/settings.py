@@ -21,7 +21,7 @@ REFERENCE = 2.0  # factor of the finest run's resolution
 
 
 @dataclass(frozen=True)
-class Setting:
+class TradeoffSetting:
     """Scene keys with other values."""
 
     curve: str  # the curve of the setting; its settings differ in one key alone
@@ -36,13 +36,16 @@ class Setting:
         )
 
 
-def settings_of(simulator: str) -> list[Setting]:
+def settings_of(simulator: str) -> list[TradeoffSetting]:
     """Return the settings to measure.
 
     Raises:
         ValueError: the simulator has no settings here.
     """
-    lists: dict[str, Callable[[], Iterator[Setting]]] = {"fluids": _liquid, "granular": _sand}
+    lists: dict[str, Callable[[], Iterator[TradeoffSetting]]] = {
+        "fluids": _liquid,
+        "granular": _sand,
+    }
     if simulator not in lists:
         raise ValueError(f"simulator {simulator}: has no settings to compare")
     return list(dict.fromkeys(lists[simulator]()))
@@ -50,10 +53,10 @@ def settings_of(simulator: str) -> list[Setting]:
 
 def _along(
     curve: str, steps: Sequence[Step], tolerance: float, *overrides: str, scale: float = 1.0
-) -> Iterator[Setting]:
+) -> Iterator[TradeoffSetting]:
     """Yield a setting with time steps of all lengths."""
     for cfl, dt in steps:
-        yield Setting(
+        yield TradeoffSetting(
             curve,
             (
                 f"time.cfl={cfl:g}",
@@ -67,7 +70,7 @@ def _along(
 
 def _usual(
     steps: Sequence[Step], tolerances: Sequence[float], scaled: Sequence[float]
-) -> Iterator[Setting]:
+) -> Iterator[TradeoffSetting]:
     """Yield tolerances, and resolutions with some of them."""
     for tolerance in tolerances:
         yield from _along(f"tolerance {tolerance:g}", steps, tolerance)
@@ -81,7 +84,7 @@ def _usual(
             )
 
 
-def _liquid() -> Iterator[Setting]:
+def _liquid() -> Iterator[TradeoffSetting]:
     steps = LIQUID_STEPS
     yield from _usual(steps, (1e-1, 1e-2, 1e-4, 1e-6), (1e-2, 1e-4))
     for precision in ("single", "double"):
@@ -107,7 +110,7 @@ def _liquid() -> Iterator[Setting]:
     yield from _particles(steps[1:3], 1e-4, (1, 4))
 
 
-def _sand() -> Iterator[Setting]:
+def _sand() -> Iterator[TradeoffSetting]:
     steps = SAND_STEPS
     yield from _usual(steps, (1e-1, 1e-2, 1e-3, 1e-4), (1e-2, 1e-3))
     for tolerance in (1e-1, 1e-2, 1e-3):
@@ -127,7 +130,7 @@ def _sand() -> Iterator[Setting]:
 
 def _particles(
     steps: Sequence[Step], tolerance: float, corrections: Sequence[int]
-) -> Iterator[Setting]:
+) -> Iterator[TradeoffSetting]:
     """Yield the particle settings common to both materials."""
     offered = [(f"{n} particles along a cell", f"particles.per_axis={n}") for n in (1, 3)]
     offered += [

@@ -13,19 +13,19 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.extremes.exact import Exact
+from warp_lcp.benchmarks.extremes.exact import ExactEquations
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.files.tables import Tables, TableValue
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.recorded_problem import RecordedProblem, files, load
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.presets import changed
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.simulator import simulators
-from warp_lcp.simulation import Recorded, Simulation
+from warp_lcp.simulation import HasRecordedProblems, Simulation
 from warp_lcp.solvers.registry import grid_methods
 
 # Numbers of problems of a run of liquid and of states of sand, at equal distances.
@@ -40,7 +40,7 @@ MOST_LIQUID, MOST_SAND = 1000, 3000  # iterations
 
 
 @dataclass(frozen=True)
-class Found:
+class SolvedProblem:
     """Results of a solve of one problem."""
 
     seconds: float
@@ -67,7 +67,7 @@ class SolveProbe(ABC):
     @abstractmethod
     def solves(
         self, method: str, precision: str, tolerance: float
-    ) -> Iterator[Callable[[], Found]]:
+    ) -> Iterator[Callable[[], SolvedProblem]]:
         """Yield a solve function for each problem."""
 
 
@@ -109,7 +109,7 @@ def measure_solves(scene: Scene, options: Options, frames: int) -> list[Benchmar
 
 
 def _measured(
-    solves: Iterator[Callable[[], Found]], warm: int, repeat: int
+    solves: Iterator[Callable[[], SolvedProblem]], warm: int, repeat: int
 ) -> tuple[dict[str, Figure], str]:
     """Solve all problems `repeat` times.
 
@@ -149,7 +149,7 @@ def _simulation(scene: Scene, device: str) -> Simulation:
     return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
 
 
-class Reference:
+class ReferenceSolution:
     """Reference solution of a problem, to measure errors from.
 
     It comes from a solve in float64 that converged to rounding. Residuals are recomputed in float64
@@ -163,7 +163,7 @@ class Reference:
         )
         sparse = problem.sparse()
         assert isinstance(sparse.lower, np.ndarray) and isinstance(sparse.upper, np.ndarray)
-        self._exact = Exact(sparse.A, sparse.b, sparse.lower, sparse.upper)
+        self._exact = ExactEquations(sparse.A, sparse.b, sparse.lower, sparse.upper)
         self._fluid = problem.grid.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == wl.FLUID
         self._unit = self._exact.residual(self._exact.start) or 1.0
         self._x = result.x.numpy().ravel()[self._fluid]
@@ -185,7 +185,7 @@ class Reference:
         return float(np.sqrt(max(difference @ (A @ difference), 0.0) / (self._x @ (A @ self._x))))
 
 
-class Pressures(SolveProbe):
+class RecordedPressures(SolveProbe):
     """Pressure problems recorded in a run of liquid.
 
     They are solved from the initial guess of the run.
@@ -200,7 +200,7 @@ class Pressures(SolveProbe):
     def __init__(self, scene: Scene, device: str, frames: int) -> None:
         super().__init__(scene, device)
         simulation = _simulation(scene, device)
-        if not isinstance(simulation, Recorded):
+        if not isinstance(simulation, HasRecordedProblems):
             raise ValueError(f"{scene.scene.simulator}: shows no problems")
         with tempfile.TemporaryDirectory() as folder:
             simulation.record = ProblemFolder(Path(folder) / "problems").write
@@ -209,7 +209,9 @@ class Pressures(SolveProbe):
             paths = [
                 found[i] for i in np.unique(np.linspace(1, len(found) - 1, PROBLEMS).astype(int))
             ]
-            self.problems = [(load(path, device=device), Reference(path, device)) for path in paths]
+            self.problems = [
+                (load(path, device=device), ReferenceSolution(path, device)) for path in paths
+            ]
         self.residual = max(reference.residual_of_solution for _, reference in self.problems)
         tried = [
             (m, p)
@@ -220,7 +222,7 @@ class Pressures(SolveProbe):
 
     def solves(
         self, method: str, precision: str, tolerance: float
-    ) -> Iterator[Callable[[], Found]]:
+    ) -> Iterator[Callable[[], SolvedProblem]]:
         """Yield a solve function for each problem."""
         solver, stopping = (
             wl.METHODS[method](precision=precision),
@@ -232,21 +234,21 @@ class Pressures(SolveProbe):
     def _solve(
         self,
         problem: RecordedProblem,
-        reference: Reference,
+        reference: ReferenceSolution,
         solver: Solver,
         stopping: wl.StoppingCriteria,
-    ) -> Callable[[], Found]:
+    ) -> Callable[[], SolvedProblem]:
         lcp, before = problem.lcp(), array_bytes()
         work = solver.init(lcp)
         held_bytes = array_bytes() - before
 
-        def solve() -> Found:
+        def solve() -> SolvedProblem:
             begun = self.read()
             result = wl.solve(lcp, solver, stopping=stopping, x0=problem.x0, workspace=work)
             wp.synchronize_device(self.device)
             taken, x = self.read() - begun, result.x.numpy()
             iterations = result.linear_iterations or result.iterations
-            return Found(
+            return SolvedProblem(
                 taken,
                 iterations,
                 reference.residual(x),
@@ -258,7 +260,7 @@ class Pressures(SolveProbe):
         return solve
 
 
-class Steps(SolveProbe):
+class RecordedSteps(SolveProbe):
     """Steps of a run of sand, from recorded states.
 
     The error is that of the velocity over g dt.
@@ -284,7 +286,7 @@ class Steps(SolveProbe):
 
     def solves(
         self, method: str, precision: str, tolerance: float
-    ) -> Iterator[Callable[[], Found]]:
+    ) -> Iterator[Callable[[], SolvedProblem]]:
         """Yield a function that takes the step from each state."""
         keys: dict[str, float | str] = {
             "solver.method": method,
@@ -296,12 +298,12 @@ class Steps(SolveProbe):
 
     def _solve(
         self, scene: Scene, state: Mapping[str, np.ndarray], dt: float, exact: np.ndarray
-    ) -> Found:
+    ) -> SolvedProblem:
         velocity, row, taken = self._step(scene, state, dt)
         error = float(np.sqrt(np.mean(np.sum((velocity - exact) ** 2, axis=1)))) / (
             self.gravity * dt
         )
-        return Found(taken, row["solve_iterations"], row["coupled_residual"], error)
+        return SolvedProblem(taken, row["solve_iterations"], row["coupled_residual"], error)
 
     def _step(
         self, scene: Scene, state: Mapping[str, np.ndarray], dt: float
@@ -320,6 +322,6 @@ class Steps(SolveProbe):
 
 
 PROBES: dict[str, Callable[[Scene, str, int], SolveProbe]] = {
-    "fluids": Pressures,
-    "granular": Steps,
+    "fluids": RecordedPressures,
+    "granular": RecordedSteps,
 }

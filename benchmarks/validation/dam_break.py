@@ -15,7 +15,7 @@ from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, ch
 from warp_lcp.benchmarks.validation.scenes import (
     GRAVITY,
     SUB_CELL,
-    Numerics,
+    NumericalSettings,
     Row,
     box,
     create_liquid,
@@ -88,7 +88,9 @@ class DamCollapse(NamedTuple):
 
 
 @check_at("dam break", "{cells} cells of a, {numerics.name}")
-def front_and_height(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def front_and_height(
+    findings: Findings, cells: int, numerics: NumericalSettings = SUB_CELL
+) -> None:
     """Compare a collapse with the data.
 
     The controls have wrong gravity, but their time is measured with the true one.
@@ -156,7 +158,7 @@ def plate_friction() -> float:
 
 
 @check_at("dam break with drag", "{cells} cells of a, {numerics.name}")
-def far_front(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def far_front(findings: Findings, cells: int, numerics: NumericalSettings = SUB_CELL) -> None:
     """Compare the speed of the front at large distances.
 
     A floor without drag lets it run too fast; the control has no drag.
@@ -184,7 +186,7 @@ def far_front(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> 
 
 
 def create(
-    cells: int, numerics: Numerics, length: float = LENGTH, **tables: TableValue
+    cells: int, numerics: NumericalSettings, length: float = LENGTH, **tables: TableValue
 ) -> LiquidSimulation:
     """Return a column on a free-slip floor in a tank.
 
@@ -196,7 +198,7 @@ def create(
     )
 
 
-def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> DamCollapse:
+def collapse(cells: int, numerics: NumericalSettings, *, gravity: float = GRAVITY) -> DamCollapse:
     """Simulate a collapse.
 
     T and tau are measured with the true gravity, whatever `gravity` [m/s^2] is.
@@ -253,7 +255,7 @@ DAM_BREAK = ValidationCheck(
 
 
 @check_at("volume", "{resolution} cells, {numerics.name}")
-def columns(findings: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
+def columns(findings: Findings, resolution: int, numerics: NumericalSettings = SUB_CELL) -> None:
     """Compare the volume inside the surface with the one at the start.
 
     The control has no density correction; otherwise it is on by default.
@@ -280,7 +282,7 @@ def columns(findings: Findings, resolution: int, numerics: Numerics = SUB_CELL) 
 
 
 @check_at("volume of the dam break", "{cells} cells of a, {numerics.name}")
-def dam(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def dam(findings: Findings, cells: int, numerics: NumericalSettings = SUB_CELL) -> None:
     """Compare the volume of Martin & Moyce's column with its initial volume.
 
     It has then come to the far wall and back. The control has no density correction.

@@ -41,7 +41,7 @@ class EnergyStep:
         return self.after - self.before - self.given
 
 
-class Ledger:
+class EnergyBalance:
     """Step a simulation and record its energy balance.
 
     Energies are computed in float64 from particles and bodies. A particle's velocity is that of the

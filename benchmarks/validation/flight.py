@@ -108,7 +108,7 @@ def off(moved: np.ndarray, velocity: np.ndarray, duration: float) -> float:
 
 
 def _liquid(
-    cells: int, numerics: scenes.Numerics, liquid: Row = BLOCK, **tables: TableValue
+    cells: int, numerics: scenes.NumericalSettings, liquid: Row = BLOCK, **tables: TableValue
 ) -> LiquidSimulation:
     return create_liquid(numerics, SIZE, cells, [liquid], **tables)
 

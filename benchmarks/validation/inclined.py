@@ -36,8 +36,8 @@ from warp_lcp.benchmarks.validation.scenes import (
 from warp_lcp.files.tables import Tables, TableValue
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.simulator import SandSimulation
-from warp_lcp.granular.solids import SandSolids
-from warp_lcp.material.particle_assembly import Parts
+from warp_lcp.granular.wall_friction import SandSolids
+from warp_lcp.material.particle_assembly import GridComponents
 
 DEPTH, LENGTH = 0.32, 0.16  # [m] depth of the layer and length of the domain
 RESOLUTIONS = (16, 32)  # cells of the depth
@@ -408,7 +408,7 @@ def with_stairs(simulation: SandSimulation) -> SandSimulation:
     return SandSimulation(
         scene,
         simulation.grid,
-        Parts(boundary, solids=solids),
+        GridComponents(boundary, solids=solids),
         simulation.particles,
         outlets=simulation.outlets,
     )

@@ -29,7 +29,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     GRAVITY,
     SUB_CELL,
     VOXEL,
-    Numerics,
+    NumericalSettings,
     box,
     pressures,
     steps,
@@ -76,7 +76,7 @@ SPEED = "t [s]", "largest speed / sqrt(g dx)"
 STAIRS = "whole cells: error of the period"  # negative control
 
 
-class Rest(NamedTuple):
+class RestResult(NamedTuple):
     """Results of a liquid that should rest."""
 
     time: np.ndarray  # ends of the steps [s]
@@ -94,7 +94,7 @@ class Rest(NamedTuple):
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
-def whole_cells(findings: Findings, resolution: int, numerics: Numerics = VOXEL) -> None:
+def whole_cells(findings: Findings, resolution: int, numerics: NumericalSettings = VOXEL) -> None:
     """Test rest with a surface and solids of whole cells.
 
     The controls are a pool with tilted gravity, and a surface within the cells.
@@ -119,7 +119,7 @@ def whole_cells(findings: Findings, resolution: int, numerics: Numerics = VOXEL)
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
-def sub_cell(findings: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
+def sub_cell(findings: Findings, resolution: int, numerics: NumericalSettings = SUB_CELL) -> None:
     """Test rest with a sub-cell surface and cut cells.
 
     The control is the bias of a surface of whole cells.
@@ -156,7 +156,7 @@ def sub_cell(findings: Findings, resolution: int, numerics: Numerics = SUB_CELL)
 
 @check_at("tilted rest", "{resolution} cells, {numerics.name}")
 def tilted_surface(
-    findings: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED
+    findings: Findings, resolution: int, numerics: NumericalSettings = scenes.SMOOTHED
 ) -> None:
     """Test rest of a free surface with tilted gravity.
 
@@ -189,8 +189,12 @@ def tilted_surface(
 
 
 def settle(
-    resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: TableValue
-) -> Rest:
+    resolution: int,
+    numerics: NumericalSettings,
+    duration: float,
+    level: float = LEVEL,
+    **tables: TableValue,
+) -> RestResult:
     """Let a liquid rest for a time [s].
 
     `level` is the height of a level surface [m].
@@ -205,7 +209,7 @@ def settle(
         if row["time"] > duration - AVERAGED:
             fields.append(pressures(simulation))
     bias, profile = _bias(np.mean(fields, axis=0), dx, level)
-    return Rest(
+    return RestResult(
         np.array(time),
         np.array(speed),
         bias,
@@ -230,7 +234,7 @@ def _bias(
     return float((pressure - hydrostatic)[deep].mean() / (DENSITY * GRAVITY * dx)), (y[rows], means)
 
 
-def _draw_profile(found: Findings, rest: Rest) -> None:
+def _draw_profile(found: Findings, rest: RestResult) -> None:
     y, pressure = rest.profile
     found.curve("profile", y / LEVEL, pressure / (DENSITY * GRAVITY * LEVEL))
 
@@ -263,7 +267,7 @@ RESTING = ValidationCheck(
 
 
 @check_at("sloshing", "{cells} cells of depth, {numerics.name}")
-def sloshing(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def sloshing(findings: Findings, cells: int, numerics: NumericalSettings = SUB_CELL) -> None:
     """Measure the sloshing period, the worst of some samples.
 
     The control is a surface of whole cells, which resolves waves in stairs only.
@@ -283,7 +287,9 @@ def sloshing(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> N
             findings.must_break(STAIRS, error, high=8.0, unit="%")
 
 
-def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndarray, np.ndarray]:
+def slosh(
+    cells: int, numerics: NumericalSettings, seed: int = SEEDS[0]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return times [s] and the amplitude of the first mode [m].
 
     The seed is that of the particles' positions.

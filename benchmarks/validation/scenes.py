@@ -38,7 +38,7 @@ Simulation = LiquidSimulation | SandSimulation
 
 
 @dataclass(frozen=True)
-class Numerics:
+class NumericalSettings:
     """Representation of solids and surface: keys of a scene."""
 
     name: str
@@ -47,13 +47,13 @@ class Numerics:
     smoothing: int = 0
 
 
-VOXEL = Numerics("voxel", "voxel", "voxel")
-SUB_CELL = Numerics("sub-cell", "cut-cell", "ghost-fluid")
-SMOOTHED = Numerics("sub-cell, 2 smoothing passes", "cut-cell", "ghost-fluid", 2)
+VOXEL = NumericalSettings("voxel", "voxel", "voxel")
+SUB_CELL = NumericalSettings("sub-cell", "cut-cell", "ghost-fluid")
+SMOOTHED = NumericalSettings("sub-cell, 2 smoothing passes", "cut-cell", "ghost-fluid", 2)
 
 
 def create_liquid(
-    numerics: Numerics,
+    numerics: NumericalSettings,
     size: list[float],
     resolution: int,
     liquid: list[Row],

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.validation.energy import Ledger
+from warp_lcp.benchmarks.validation.energy import EnergyBalance
 from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import (
     SHORTEST,
@@ -105,7 +105,7 @@ def collapse(
         simulation = create_liquid(numerics, SIZE, cells, [COLUMN], **tables)
     if change is not None:
         change(simulation)
-    ledger = Ledger(simulation)
+    ledger = EnergyBalance(simulation)
     total, most, energy = ledger.total(), -np.inf, []
     for moment in moments:
         while simulation.time < moment - SHORTEST:

@@ -34,7 +34,7 @@ VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96
 
 
 @dataclass
-class Cloud:
+class ParticleCloud:
     """Particles away from the walls, and the fields of their transfers."""
 
     grid: StaggeredGrid
@@ -95,7 +95,7 @@ def angular_momentum(
     return total
 
 
-def cloud(n: int, real: str, *, affine: bool) -> Cloud:
+def cloud(n: int, real: str, *, affine: bool) -> ParticleCloud:
     """Return a spinning, disturbed disk of particles in the middle of n x n cells."""
     scalar, vector, numpy_type, _ = REALS[real]
     grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, DEVICE.get())
@@ -116,7 +116,9 @@ def cloud(n: int, real: str, *, affine: bool) -> Cloud:
         wp.array(values.astype(numpy_type), dtype=vector, device=DEVICE.get())
         for values in (position, velocity, *gradients)
     )
-    return Cloud(grid, position, velocity, gradients, grid.faces(scalar), grid.faces(scalar))
+    return ParticleCloud(
+        grid, position, velocity, gradients, grid.faces(scalar), grid.faces(scalar)
+    )
 
 
 @check_at("transfers", "{n} cells")
@@ -134,7 +136,7 @@ def round_trip(findings: Findings, n: int) -> None:
     findings.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
 
 
-def changes(c: Cloud) -> tuple[float, float]:
+def changes(c: ParticleCloud) -> tuple[float, float]:
     """Return the relative changes of momentum and angular momentum in a round trip.
 
     The changes are relative to the sums of the particles' |v| and |x| |v|.

@@ -17,7 +17,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     GRAVITY,
     SUB_CELL,
     VOXEL,
-    Numerics,
+    NumericalSettings,
     box,
     create_liquid,
     positions,
@@ -47,7 +47,7 @@ POINT = np.array([0.1, 0.06])  # [m] point of the wall on which the layer's end 
 SLOPE_SIZE = [1.4, 1.0]  # [m]
 
 
-class Fall(NamedTuple):
+class FallResult(NamedTuple):
     """Fall of particles: ways [cells], the expected way, and extreme pressures [Pa].
 
     Ways are sorted from the floor up.
@@ -65,7 +65,9 @@ class Fall(NamedTuple):
 
 
 @check_at("ceiling", "{resolution} cells, {numerics.name}, {ceiling}")
-def falling(findings: Findings, resolution: int, numerics: Numerics, ceiling: str = "flat") -> None:
+def falling(
+    findings: Findings, resolution: int, numerics: NumericalSettings, ceiling: str = "flat"
+) -> None:
     """Drop the block; then repeat with each thing that would hold it."""
     fall = drop(resolution, numerics, ceiling)
     findings.add("expected way", fall.expected, low=8.0, unit="cells")
@@ -88,12 +90,12 @@ def falling(findings: Findings, resolution: int, numerics: Numerics, ceiling: st
 
 def drop(
     resolution: int,
-    numerics: Numerics,
+    numerics: NumericalSettings,
     ceiling: str = "flat",
     *,
     wall: str = "separating",
     release: bool = True,
-) -> Fall:
+) -> FallResult:
     """Let a block fall.
 
     Particles are matched by their order from the floor up. A rigid fall keeps it, and a straggler
@@ -116,7 +118,7 @@ def drop(
         pressure = scenes.pressures(simulation)
         lowest, highest = min(lowest, pressure.min()), max(highest, pressure.max())
     dx, way = simulation.grid.spacing, 0.5 * GRAVITY * DURATION**2
-    return Fall(
+    return FallResult(
         (start - np.sort(positions(simulation)[:, 1])) / dx, way / dx, float(lowest), float(highest)
     )
 
@@ -149,7 +151,7 @@ CEILING = ValidationCheck(
 
 
 @check_at("slope", "{cells} cells of depth, {numerics.name}")
-def sliding(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+def sliding(findings: Findings, cells: int, numerics: NumericalSettings = SUB_CELL) -> None:
     """Let a layer slide on both kinds of wall.
 
     The control is a free-slip wall of whole cells, whose stairs stop it.
@@ -167,7 +169,7 @@ def sliding(findings: Findings, cells: int, numerics: Numerics = SUB_CELL) -> No
     )
 
 
-def slide(cells: int, numerics: Numerics, wall: str) -> tuple[float, float, float]:
+def slide(cells: int, numerics: NumericalSettings, wall: str) -> tuple[float, float, float]:
     """Let a layer of `cells` cells of depth slide up a slope for its way.
 
     `wall` is separating or free-slip.

@@ -20,7 +20,6 @@ from PIL import Image
 import warp_lcp as wl
 from warp_lcp.gallery.contact_scenes import contact_scene, incline
 from warp_lcp.krylov import GMRES
-from warp_lcp.reduced.energy_monitor import DECREASE, NonmonotoneSearch
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
@@ -28,6 +27,7 @@ from warp_lcp.rigid.contact_models import (
     StewartTrinkleModel,
     proximal_sweeps,
 )
+from warp_lcp.subproblems.energy_monitor import DECREASE, NonmonotoneSearch
 
 OUT = Path(__file__).parents[1] / "algorithms.png"
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=400, patience=400)
@@ -268,7 +268,7 @@ def gmres_panel(axes: Any) -> None:
         axes.semilogy(norms, lw=0.8, label=f"SciPy, restart {restart}")
         counts, ends = [], []
         for tolerance in (1e-2, 1e-4, 1e-6, 1e-8):
-            identity = NoPreconditioner(n * n)
+            identity = IdentityPreconditioner(n * n)
             krylov = GMRES(operator.product, identity, restart=restart)
             identity.r.assign(b)
             count, norm = krylov.solve(tolerance * float(np.linalg.norm(b)), 400)
@@ -279,7 +279,7 @@ def gmres_panel(axes: Any) -> None:
     axes.legend(fontsize=6)
 
 
-class NoPreconditioner:
+class IdentityPreconditioner:
     """Identity preconditioner, z = r."""
 
     def __init__(self, n: int) -> None:

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 import warp_lcp as wl
 from warp_lcp.benchmarks import book
 from warp_lcp.benchmarks.book import appendix_c, contact_scenes, outcome, studies
-from warp_lcp.benchmarks.book.outcome import Limits, Merit, Trace, follow
+from warp_lcp.benchmarks.book.outcome import BookLimits, IterateTrace, Merit, follow
 from warp_lcp.benchmarks.book.problems import ProblemScale, contact_matrix, dense, kinds
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.gallery import contact_scenes as gallery
@@ -121,7 +121,7 @@ def test_the_contact_recipe_has_the_pattern_of_stewart_and_trinkle_on_its_diagon
 def test_the_book_s_stopping_test_accepts_wrong_solutions():
     p = kinds(ProblemScale(5, 4, 10, 12, (8,), (2,), 10))["contact, recipe"](0)
     trace = follow(p, appendix_c.PGS, Merit.PRODUCT, "cpu")
-    state, _, residual = trace.verdict(Merit.PRODUCT, Limits())
+    state, _, residual = trace.verdict(Merit.PRODUCT, BookLimits())
     assert state == "absolute"
     assert residual > 0.01
     assert trace.solved is None
@@ -144,18 +144,17 @@ def test_the_recipe_with_many_zero_eigenvalues_has_no_solution(zeros):
 
 def test_statuses_agree_with_num4lcp():
     def trace(merits, status=wl.SolveStatus.MAX_ITERATIONS):
-        return Trace(merits, [1.0] * len(merits), status)
+        return IterateTrace(merits, [1.0] * len(merits), status)
 
-    assert trace([9.0, 1.0, 1e-4]).verdict(Merit.FISCHER, Limits())[:2] == ("absolute", 3)
-    assert trace([9.0, 1.0, 1.0]).verdict(Merit.FISCHER, Limits())[:2] == ("relative", 3)
+    assert trace([9.0, 1.0, 1e-4]).verdict(Merit.FISCHER, BookLimits())[:2] == ("absolute", 3)
+    assert trace([9.0, 1.0, 1.0]).verdict(Merit.FISCHER, BookLimits())[:2] == ("relative", 3)
     # Sweeps are tested after each one.
-    assert trace([9.0, 1.0, 1e-4]).verdict(Merit.PRODUCT, Limits())[:2] == ("absolute", 2)
-    assert trace([9.0, 8.0, 7.0]).verdict(Merit.FISCHER, Limits(most=2))[:2] == (
+    assert trace([9.0, 1.0, 1e-4]).verdict(Merit.PRODUCT, BookLimits())[:2] == ("absolute", 2)
+    assert trace([9.0, 8.0, 7.0]).verdict(Merit.FISCHER, BookLimits(most=2))[:2] == (
         "max iterations",
         2,
     )
-    assert trace([9.0, 1.0], wl.SolveStatus.NON_DESCENT).verdict(Merit.MINIMUM, Limits())[:2] == (
-        "non-descent",
-        2,
-    )
+    assert trace([9.0, 1.0], wl.SolveStatus.NON_DESCENT).verdict(Merit.MINIMUM, BookLimits())[
+        :2
+    ] == ("non-descent", 2)
     assert outcome.spread([1, 2, 3]) == "2.00 (1 to 3, 0.82)"

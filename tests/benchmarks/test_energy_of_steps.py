@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from warp_lcp.benchmarks.validation import flight, scenes, time_steps
-from warp_lcp.benchmarks.validation.energy import Ledger
+from warp_lcp.benchmarks.validation.energy import EnergyBalance
 from warp_lcp.benchmarks.validation.scenes import DENSITY, SUB_CELL, VOXEL, box
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -20,7 +20,7 @@ STILL = {"gravity": [0.0, 0.0]}
 
 
 def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
-    ledger = Ledger(
+    ledger = EnergyBalance(
         scenes.create_liquid(
             VOXEL, [1.0, 1.0], 16, [box([0.3, 0.6], [0.6, 0.9], velocity=[0.5, 1.0])]
         )
@@ -41,7 +41,7 @@ def test_energy_of_source_inflow_is_not_counted_as_gain() -> None:
     """
     source = box([0.0, 0.25], [0.125, 0.5], velocity=[2.0, 0.0])
     simulation = scenes.create_liquid(VOXEL, [1.0, 1.0], 16, [], source=[source], physics=STILL)
-    ledger = Ledger(simulation)
+    ledger = EnergyBalance(simulation)
     before = simulation.particles.count
     done = ledger.step(0.0625)  # the particles move by two cells
     emitted = simulation.particles.count - before
@@ -67,7 +67,7 @@ def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its
         wall="free-slip",
         solver={"tolerance": 1e-8},
     )
-    done = Ledger(simulation).step(1e-4)
+    done = EnergyBalance(simulation).step(1e-4)
     assert done.given == pytest.approx(DENSITY * 0.25 * 0.25 * 0.8**2, rel=0.1)
     assert done.gained == pytest.approx(-0.5 * done.given, rel=0.1)
 
@@ -113,7 +113,7 @@ SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], shorter than the normal step
 MOST = 1e-3  # share of the total that a step may add
 
 
-class Rise(NamedTuple):
+class EnergyGain(NamedTuple):
     """Energy gained by a step of a length [s], and its part from density correction.
 
     Both are divided by the total energy.
@@ -124,12 +124,12 @@ class Rise(NamedTuple):
     displaced: float
 
 
-def along(ledger: Ledger, moments: list[float], dt_max: float) -> list[Rise]:
+def along(ledger: EnergyBalance, moments: list[float], dt_max: float) -> list[EnergyGain]:
     """Step from moment to moment and try steps of all lengths at each.
 
     Also rows of short and normal steps in turns.
     """
-    simulation, rises = ledger.simulation, list[Rise]()
+    simulation, rises = ledger.simulation, list[EnergyGain]()
     for moment in moments:
         while simulation.time < moment or simulation.step_count == 0:
             ledger.step(min(simulation.stable_dt(), dt_max))
@@ -141,7 +141,7 @@ def along(ledger: Ledger, moments: list[float], dt_max: float) -> list[Rise]:
         for row in [*rows, (0.0, 1e-6) * 2, (0.0, 1e-4) * 2]:
             for length in row:
                 done = ledger.step(length or min(simulation.stable_dt(), dt_max))
-                rises.append(Rise(length, done.gained / total, done.displaced / total))
+                rises.append(EnergyGain(length, done.gained / total, done.displaced / total))
             ledger.set_back(state, energy)
     return rises
 
@@ -154,7 +154,7 @@ def test_no_step_in_the_middle_of_a_scene_makes_energy(name: str) -> None:
     simulation: Any = simulators()[scene.scene.simulator].create(
         scene, device="cpu", folder=Path.cwd()
     )
-    rises = along(Ledger(simulation), [0.05 * time, 0.5 * time, time], scene.time.dt_max)
+    rises = along(EnergyBalance(simulation), [0.05 * time, 0.5 * time, time], scene.time.dt_max)
     assert max(rise.gained for rise in rises) < MOST
 
 
@@ -176,7 +176,7 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
         simulation = scenes.create_liquid(
             VOXEL, [1.0, 0.75], 16, [box([0.0, 0.0], [0.375, 0.5])], **tables
         )
-    found = along(Ledger(simulation), [0.02, 0.2], simulation.scene.time.dt_max)
+    found = along(EnergyBalance(simulation), [0.02, 0.2], simulation.scene.time.dt_max)
     assert len(found) > 20
     # Loss of creeping material.
     assert max(rise.gained - rise.displaced for rise in found) < (

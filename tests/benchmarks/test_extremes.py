@@ -14,17 +14,24 @@ import warp_lcp as wl
 from default_run import covering
 from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
-from warp_lcp.benchmarks.extremes import bounds, broken, case, matrices, refused, shapes
+from warp_lcp.benchmarks.extremes import (
+    bounds,
+    case,
+    matrices,
+    rejected_input,
+    shapes,
+    wrong_methods,
+)
 from warp_lcp.benchmarks.extremes.case import (
-    Expected,
+    ExpectedOutcome,
     ExtremeAttempt,
-    Promise,
+    OutcomeKind,
     RefusalCase,
     SolveCase,
     judge,
     violations,
 )
-from warp_lcp.benchmarks.extremes.exact import Exact, norm, stencil
+from warp_lcp.benchmarks.extremes.exact import ExactEquations, norm, stencil
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 from warp_lcp.cli import commands as cli
 
@@ -33,7 +40,7 @@ FAST = (
     shapes.closed_pools,
     matrices.singular,
     matrices.cycling,
-    refused.wrong_arguments,
+    rejected_input.wrong_arguments,
 )
 
 
@@ -59,20 +66,22 @@ def test_there_are_enough_cases_of_every_kind():
     cases = list(extremes.cases(4217))  # refuses names that occur twice
     kinds = Counter(c.promise(p).expected for c in cases for p in c.precisions)
     assert len(cases) >= 150
-    assert set(kinds) == set(Expected)
-    assert kinds[Expected.EITHER] < 0.35 * sum(kinds.values()), (
+    assert set(kinds) == set(OutcomeKind)
+    assert kinds[OutcomeKind.EITHER] < 0.35 * sum(kinds.values()), (
         "what may end either way tests little"
     )
 
 
 @pytest.mark.parametrize(
-    ("name", "precision"), covering(list(broken.SOLVERS), list(case.PRECISIONS))
+    ("name", "precision"), covering(list(wrong_methods.SOLVERS), list(case.PRECISIONS))
 )
 def test_a_wrong_solver_is_caught(name, precision):
     """Expected to solve the problem, as a right one is, see below."""
-    for _, make, method in broken.RIGHT:
+    for _, make, method in wrong_methods.RIGHT:
         verdict = judge(
-            SolveCase("wrong", name, make, method, solve=broken.SOLVERS[name]), precision, "cpu"
+            SolveCase("wrong", name, make, method, solve=wrong_methods.SOLVERS[name]),
+            precision,
+            "cpu",
         )
         assert verdict.wrong
         if name == "steps backwards":
@@ -84,12 +93,12 @@ def test_a_wrong_solver_is_caught(name, precision):
 
 @pytest.mark.parametrize("precision", case.PRECISIONS)
 def test_cases_for_wrong_solvers_pass_with_a_correct_solver(precision):
-    for _, make, method in broken.RIGHT:
+    for _, make, method in wrong_methods.RIGHT:
         assert judge(SolveCase("right", "right", make, method), precision, "cpu").wrong == []
 
 
 def test_a_wrong_solver_that_passes_fails_the_suite():
-    promise = Promise(Expected.CAUGHT)
+    promise = ExpectedOutcome(OutcomeKind.CAUGHT)
     assert violations(promise, ExtremeAttempt("CONVERGED", 1e-9, met=True)) == [
         "a wrong solver passes"
     ]
@@ -171,7 +180,7 @@ def test_the_matrix_is_that_of_the_oracle(seed):
     np.testing.assert_allclose(matrix.toarray(), expected, atol=1e-14)
     n = int(fluid.sum())
     b, x, lower = rng.standard_normal((3, n))
-    own = Exact(matrix, b, lower, lower + 1.5)
+    own = ExactEquations(matrix, b, lower, lower + 1.5)
     assert own.residual(x) == pytest.approx(
         natural_residual(expected, b, lower, lower + 1.5, x), rel=1e-12
     )

@@ -10,14 +10,14 @@ from warp_lcp.scene.scene_file import built_in_scenes
 
 
 def test_listed_methods_and_scenes_exist() -> None:
-    found = list(gpu_turns.pieces(gpu_turns.Sizes()))
+    found = list(gpu_turns.pieces(gpu_turns.WorkSizes()))
     assert all(hasattr(wl, name) for kind, name, _ in found if kind != "step")
     assert set(gpu_turns.SCENES.values()) <= set(built_in_scenes())
     assert len(found) == len(set(found)) == 3 + 9 + len(gpu_turns.METHODS) - 1
 
 
 def test_files_are_written_after_each_piece_of_work(tmp_path: Path) -> None:
-    turns = gpu_turns.Turns(tmp_path, ["one", "other"], left_out=["step sand 256"])
+    turns = gpu_turns.InterleavedTurns(tmp_path, ["one", "other"], left_out=["step sand 256"])
     found: dict[str, dict[str, Any]] = {
         "one": {"ms": 5.25, "iterations": 9, "status": "CONVERGED"},
         "other": {"ms": 10.0, "iterations": 200, "status": "MAX_ITERATIONS"},

@@ -12,12 +12,12 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.hostile import KINDS, attempt, draw, draw_case, examine, judge
 from warp_lcp.benchmarks.hostile.__main__ import FAULTS, report, supervise
 from warp_lcp.benchmarks.hostile.case import (
+    ExpectedArrays,
     HostileAnswer,
     HostileBox,
     HostileCase,
     HostileProgram,
-    Refusal,
-    Values,
+    MalformedInput,
 )
 from warp_lcp.benchmarks.hostile.judge import exists, residual, scales
 
@@ -103,8 +103,8 @@ def test_failure_statuses_are_not_counted_as_false_answers():
         "honest"
     ]
     assert categories(known, HostileAnswer("REFUSED", None)) == ["refused"]
-    assert categories(Refusal("no matrix"), HostileAnswer("REFUSED", None)) == ["honest"]
-    assert categories(Refusal("no matrix"), HostileAnswer("CONVERGED", np.zeros(2))) == [
+    assert categories(MalformedInput("no matrix"), HostileAnswer("REFUSED", None)) == ["honest"]
+    assert categories(MalformedInput("no matrix"), HostileAnswer("CONVERGED", np.zeros(2))) == [
         "FALSE CONVERGED"
     ]
 
@@ -144,7 +144,7 @@ def test_programs_are_judged_in_plain_units():
 
 
 def test_values_and_exceptions():
-    truth = Values({"b": np.array([1.0, -2.0])}, 1e-6)
+    truth = ExpectedArrays({"b": np.array([1.0, -2.0])}, 1e-6)
     assert categories(
         truth, HostileAnswer("CONVERGED", None, "", {"b": np.array([1.0, -2.0])})
     ) == ["converged"]

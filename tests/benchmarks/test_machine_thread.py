@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.machine_code import Instruction, parsed
 from benchmarks.machine_counts import issued
-from benchmarks.machine_memory import Memory, ProcessMemory, constants_of, packed
+from benchmarks.machine_memory import EmulatedMemory, ProcessMemory, constants_of, packed
 from benchmarks.machine_thread import Lane
 
 AT = 0x7000_0000_0000  # address of the memory
@@ -21,7 +21,7 @@ def code_of(*lines: str) -> dict[int, Instruction]:
     return {16 * n: parsed(line) for n, line in enumerate((*lines, "EXIT"))}
 
 
-def lane_of(memory: Memory, *lines: str, thread: int = 0) -> Lane:
+def lane_of(memory: EmulatedMemory, *lines: str, thread: int = 0) -> Lane:
     """Execute a thread with the address of the memory in R2 and R3."""
     lane = Lane(code_of(*lines), constants_of(b"", 32, 1), memory, thread, 0)
     lane.registers |= {"R2": AT & 0xFFFFFFFF, "R3": AT >> 32}
@@ -29,8 +29,8 @@ def lane_of(memory: Memory, *lines: str, thread: int = 0) -> Lane:
     return lane
 
 
-def memory_of(values: np.ndarray) -> Memory:
-    return Memory([(AT, values)])
+def memory_of(values: np.ndarray) -> EmulatedMemory:
+    return EmulatedMemory([(AT, values)])
 
 
 def bits_of(value: float) -> str:

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 import warp_lcp as wl
 from warp_lcp.benchmarks import peers as suite
 from warp_lcp.benchmarks.peers import libraries, petsc
-from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, Question
-from warp_lcp.benchmarks.peers.petsc import Worker
-from warp_lcp.benchmarks.peers.roster import roster
+from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, PeerProblem
+from warp_lcp.benchmarks.peers.peer_list import roster
+from warp_lcp.benchmarks.peers.petsc import PeerWorker
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.cli import commands as cli
 
@@ -45,7 +45,7 @@ serve("1.2", {"double": double, "fail": fail, "end": lambda request: os._exit(7)
 
 @pytest.fixture(scope="module")
 def question():
-    return Question(splash(12), "walls")
+    return PeerProblem(splash(12), "walls")
 
 
 def dense_solution(question, rounds=200):
@@ -76,7 +76,7 @@ def test_residuals_of_the_peer_problem_agree(question):
 
 
 def test_peers_of_the_linear_solve_find_its_solution():
-    question = Question(splash(12), "linear")
+    question = PeerProblem(splash(12), "linear")
     x = np.linalg.solve(question.matrix.toarray(), -question.b)
     classical = partial(libraries.pyamg, build="ruge_stuben_solver")
     for solve in (
@@ -102,7 +102,7 @@ def test_quadratic_programs_find_the_solution(name, question):
 
 def test_amgcl_finds_the_solution():
     pytest.importorskip("pyamgcl")
-    question = Question(splash(12), "linear")
+    question = PeerProblem(splash(12), "linear")
     assert question.residual(libraries.amgcl(question, 1e-8).x) < 1e-7
 
 
@@ -114,7 +114,7 @@ def test_petsc_finds_the_solutions(question):
         assert len(peers) == 7
         for peer in peers:
             for bounds in peer.bounds:
-                asked = Question(question.scene, bounds)
+                asked = PeerProblem(question.scene, bounds)
                 answer = peer.solve(asked, 1e-8)
                 assert asked.residual(answer.x) < 1e-6, peer.name
                 assert answer.linear_iterations >= answer.iterations > 0
@@ -127,7 +127,7 @@ def test_petsc_finds_the_solutions(question):
 @pytest.fixture
 def stub(tmp_path):
     (tmp_path / "stub.py").write_text(STUB)
-    worker = Worker(
+    worker = PeerWorker(
         "json", [sys.executable, str(tmp_path / "stub.py"), str(Path(petsc.__file__).parent)]
     )
     yield worker
@@ -168,7 +168,7 @@ def contest(question, errors):
             raise PeerFailed("it is made of cheese")
         return PeerAnswer(x * (1 + errors * tolerance), 0.1, 0.2, 3)
 
-    return suite.Contest(Peer("stub", "none", solve), question)
+    return suite.PeerComparison(Peer("stub", "none", solve), question)
 
 
 def test_tolerances_are_tightened_until_the_residual_is_as_asked(question):

@@ -13,7 +13,7 @@ from warp_lcp.benchmarks.harness import report
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.tradeoff import solves
 from warp_lcp.benchmarks.tradeoff.runs import Runs, front_of
-from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
+from warp_lcp.benchmarks.tradeoff.settings import TradeoffSetting, settings_of
 from warp_lcp.cli import commands as cli
 from warp_lcp.scene.scene_file import load_scene
 
@@ -73,8 +73,8 @@ def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
     runs = Runs("dam-break-2d", 16, 3, options())
     long, short = runs.measure(
         [
-            Setting("a", ("time.dt_max=0.04", "time.cfl=8")),
-            Setting("b", ("time.dt_max=0.004", "time.cfl=0.5")),
+            TradeoffSetting("a", ("time.dt_max=0.04", "time.cfl=8")),
+            TradeoffSetting("b", ("time.dt_max=0.004", "time.cfl=0.5")),
         ]
     )
     for run in (long, short):
@@ -84,7 +84,7 @@ def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
     assert far["distance"].value > near["distance"].value > 0.0
     assert near["distance_to_finest"].value > near["distance"].value  # error of the grid itself
     assert far["steps"].value < near["steps"].value
-    refused = runs.measure([Setting("c", ("time.cfl=1", "liquid.0.max=[9.0]"))])[0]
+    refused = runs.measure([TradeoffSetting("c", ("time.cfl=1", "liquid.0.max=[9.0]"))])[0]
     assert refused.trial is None
     assert "liquid" in refused.failed
     assert runs.figures(refused) == {}
@@ -94,14 +94,14 @@ def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the suite small."""
     kept = [
-        Setting(f"cfl {cfl:g}", (f"time.cfl={cfl:g}", f"time.dt_max={0.005 * cfl:g}"))
+        TradeoffSetting(f"cfl {cfl:g}", (f"time.cfl={cfl:g}", f"time.dt_max={0.005 * cfl:g}"))
         for cfl in (4.0, 1.0)
     ]
     monkeypatch.setattr(tradeoff, "settings_of", lambda simulator: kept)
     monkeypatch.setattr(solves, "grid_methods", lambda: ("projected-multigrid", "psor"))
-    monkeypatch.setattr(solves.Pressures, "tolerances", (1e-1, 1e-3, 1e-5))
-    monkeypatch.setattr(solves.Steps, "tolerances", (1e-1, 1e-5))
-    monkeypatch.setattr(solves.Steps, "tried", ("accelerated-projection",))
+    monkeypatch.setattr(solves.RecordedPressures, "tolerances", (1e-1, 1e-3, 1e-5))
+    monkeypatch.setattr(solves.RecordedSteps, "tolerances", (1e-1, 1e-5))
+    monkeypatch.setattr(solves.RecordedSteps, "tried", ("accelerated-projection",))
 
 
 @pytest.mark.parametrize("scene", ["dam-break-2d", slow("column-collapse-2d")])

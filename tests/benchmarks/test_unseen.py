@@ -13,9 +13,9 @@ import warp_lcp as wl
 from default_run import covering
 from oracle import boxed, lemke
 from warp_lcp.benchmarks import extremes
-from warp_lcp.benchmarks.extremes import broken, unseen
+from warp_lcp.benchmarks.extremes import unseen, wrong_methods
 from warp_lcp.benchmarks.extremes.case import ExtremeAttempt, ExtremeVerdict, judge
-from warp_lcp.benchmarks.extremes.problem import GridProblem, Pools, equality, solvable
+from warp_lcp.benchmarks.extremes.problem import GridProblem, ProblemComponents, equality, solvable
 from warp_lcp.benchmarks.extremes.unseen import judging
 from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, changed
 from warp_lcp.benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase
@@ -89,7 +89,7 @@ def test_problems_are_well_posed(kind):
             assert np.isfinite(exact.matrix.data).all()
             assert (exact.lower <= exact.upper).all()
             if isinstance(problem, GridProblem):
-                assert not Pools.of(exact).lost.any()
+                assert not ProblemComponents.of(exact).lost.any()
 
 
 def test_small_grids_have_a_solution_by_enumeration():
@@ -152,13 +152,13 @@ def test_hard_matrices_have_a_solution_by_lemke(kind):
 
 @pytest.mark.parametrize(
     ("kind", "name"),
-    covering(list(MUTATED), [name for name in broken.SOLVERS if name != "steps backwards"]),
+    covering(list(MUTATED), [name for name in wrong_methods.SOLVERS if name != "steps backwards"]),
 )
 def test_a_wrong_solver_is_caught(kind, name):
     """Where `test_default_method` finds nothing wrong."""
     assert kind in unseen.KINDS
     assert SEEDS[0] == 4217
-    verdict = judge(UnseenCase(kind, 4217, solve=broken.SOLVERS[name]), "mixed", "cpu")
+    verdict = judge(UnseenCase(kind, 4217, solve=wrong_methods.SOLVERS[name]), "mixed", "cpu")
     assert verdict.attempt.status == "CONVERGED"
     assert any("CONVERGED at a residual of" in line for line in verdict.wrong)
 
@@ -237,11 +237,13 @@ def test_equations_that_are_not_solved_are_a_fault():
     assert verdict.attempt.facts["equality"] is None
 
 
-@pytest.mark.parametrize("name", [name for name in broken.SOLVERS if name != "steps backwards"])
+@pytest.mark.parametrize(
+    "name", [name for name in wrong_methods.SOLVERS if name != "steps backwards"]
+)
 def test_every_method_is_judged(name):
     problem = unseen.problem("shifted", 4217, small=True).problem
     assert judging.by_method("psor", problem, "cpu") == ("CONVERGED", [])
-    _, found = judging.by_method("psor", problem, "cpu", broken.SOLVERS[name])
+    _, found = judging.by_method("psor", problem, "cpu", wrong_methods.SOLVERS[name])
     assert any("CONVERGED at a residual of" in line for line in found)
 
 

@@ -26,7 +26,13 @@ from warp_lcp.benchmarks.validation.finding import (
     control,
     table,
 )
-from warp_lcp.benchmarks.validation.scenes import SUB_CELL, VOXEL, Numerics, create_liquid, fill
+from warp_lcp.benchmarks.validation.scenes import (
+    SUB_CELL,
+    VOXEL,
+    NumericalSettings,
+    create_liquid,
+    fill,
+)
 from warp_lcp.benchmarks.validation.signals import cumulative, enclosed_cells, filled_fraction
 from warp_lcp.grid.triangle_mesh import load_surface
 from warp_lcp.simulation import StepFailed
@@ -265,7 +271,7 @@ def test_the_advection_has_its_orders_and_worse_ones_do_not() -> None:
 
 @pytest.mark.parametrize(("numerics", "shape"), [(VOXEL, "flat"), (SUB_CELL, "slanted")])
 def test_a_block_separates_from_the_ceiling_and_its_controls_do_not(
-    numerics: Numerics, shape: str
+    numerics: NumericalSettings, shape: str
 ) -> None:
     trial = walls.falling(24, numerics, shape)
     assert trial.failures() == []

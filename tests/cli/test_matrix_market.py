@@ -13,7 +13,7 @@ import scipy.io
 import scipy.sparse
 
 from warp_lcp.cli.matrix_market import HEAD, MarketError, read_market, read_shape
-from warp_lcp.files.size_limits import ClaimError
+from warp_lcp.files.size_limits import SizeLimitError
 
 RANDOM = np.random.default_rng(733)
 FULL = RANDOM.standard_normal((5, 5))
@@ -104,7 +104,7 @@ def test_packed_files(tmp_path, suffix, pack):
 def test_invalid_files_are_refused_with_a_reason(tmp_path, data, message):
     with pytest.raises(ValueError, match=message) as found:
         read(tmp_path / "a.mtx", data)
-    assert isinstance(found.value, MarketError | ClaimError) or "complex" in message
+    assert isinstance(found.value, MarketError | SizeLimitError) or "complex" in message
 
 
 def test_a_shape_is_refused_before_its_matrix_is_read(tmp_path):
@@ -138,5 +138,5 @@ def test_the_shape_is_read_without_the_entries(tmp_path):
 
 def test_a_device_is_no_file(tmp_path):
     (tmp_path / "zero.mtx").symlink_to("/dev/zero")
-    with pytest.raises(ClaimError, match="it is not a file"):
+    with pytest.raises(SizeLimitError, match="it is not a file"):
         read_market(tmp_path / "zero.mtx", lambda rows, columns: True, "")

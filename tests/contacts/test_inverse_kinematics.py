@@ -19,7 +19,7 @@ from warp_lcp.contacts.articulated_figure import (
     spatial_chain,
 )
 from warp_lcp.contacts.inverse_kinematics import InverseKinematics, StepProblem
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 FIGURES = {
     "planar": planar_chain([1.0, 0.8, 0.6, 0.4]),

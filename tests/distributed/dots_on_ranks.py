@@ -20,7 +20,7 @@ import numpy as np
 from warp_lcp.cli import commands as cli
 from warp_lcp.distributed import collective
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.frames import frames
+from warp_lcp.frames import frame_folder
 from warp_lcp.scene import simulator as plug_ins
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Points, SimulationFailed, StepFailed
@@ -41,7 +41,7 @@ checkpoint_every = 4
 COUNT, CELLS = 200, 8
 
 
-class Dots:
+class DotsOnRanks:
     """Dots that fall, bounce and drift; a rank owns those in its columns of cells."""
 
     def __init__(self, scene: Scene, ranks: Ranks) -> None:
@@ -121,7 +121,7 @@ class Dots:
         )
 
 
-class DotsSimulator:
+class DotsOnRanksSimulator:
     """Plug-in of the simulator."""
 
     name = "dots"
@@ -130,15 +130,15 @@ class DotsSimulator:
 
     def create(
         self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None
-    ) -> Dots:
+    ) -> DotsOnRanks:
         if ranks is None:
-            return Dots(scene, Ranks(SimpleNamespace(rank=0, size=1)))
+            return DotsOnRanks(scene, Ranks(SimpleNamespace(rank=0, size=1)))
         if os.environ.get("DOTS_REFUSE"):
             raise ValueError(os.environ["DOTS_REFUSE"].format(rank=ranks.rank))
-        return Dots(scene, ranks)
+        return DotsOnRanks(scene, ranks)
 
 
-def trouble(dots: Dots) -> None:
+def trouble(dots: DotsOnRanks) -> None:
     """Let a step fail on one rank, or on all ("-1")."""
     step, rank, kind = (os.environ.get("DOTS_TROUBLE") or "0 0 nothing").split()
     if dots.step_count + 1 != int(step) or int(rank) not in (-1, dots.ranks.rank):
@@ -158,12 +158,12 @@ def trouble(dots: Dots) -> None:
         def full(*arguments: object) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        frames.FrameFolder.write_part = full
+        frame_folder.FrameFolder.write_part = full
 
 
 def main(words: list[str]) -> None:
     """Run commands of the command line with this simulator alone."""
-    plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)]
+    plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=DotsOnRanksSimulator)]
     collective.PATIENCE = 1.0
     while words:
         end = words.index("then") if "then" in words else len(words)

@@ -45,7 +45,7 @@ PLACES = ("file", "wait", "wait-end", "step")
 HEARD = threading.Event()  # a signal that this process handles
 
 
-class Fault:
+class RankFault:
     """Fault of this rank, which occurs once.
 
     Args:
@@ -92,7 +92,7 @@ def listen() -> None:
     signal.signal = hearing  # type: ignore[assignment]
 
 
-def lay_in_wait(place: str, fault: Fault) -> None:
+def lay_in_wait(place: str, fault: RankFault) -> None:
     """Install a fault at a place."""
     if place == "file":
         out = str(Path("out").resolve())
@@ -126,7 +126,7 @@ def main(words: list[str]) -> None:
     rank, kind, place, number = os.environ["FAULT"].split()
     if launch.rank_here() == int(rank):
         listen()
-        lay_in_wait(place, Fault(kind, int(number)))
+        lay_in_wait(place, RankFault(kind, int(number)))
     if "dots.toml" in words:
         dots_on_ranks.main(words)
     else:

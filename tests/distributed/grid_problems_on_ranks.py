@@ -16,7 +16,7 @@ from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.kernels.launch_graph import Task, run_table
+from warp_lcp.kernels.launch_graph import HostTask, run_table
 from warp_lcp.kernels.thread_pool import OperationTable
 from warp_lcp.multigrid import halo_levels
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
@@ -326,8 +326,8 @@ def memory_in_place(ranks):
 
 def as_on_devices(ranks):
     """Compare with ghost cells through host memory and unfused cycles."""
-    fill, filling, fuses = Halo.fill, Halo.filling, StencilLevel.fuses
-    Halo.filling = lambda self, field: Task(partial(self.fill, field))
+    fill, filling, fuses = Halo.fill, Halo.fill_task, StencilLevel.fuses
+    Halo.fill_task = lambda self, field: HostTask(partial(self.fill, field))
     Halo.fill = lambda self, field: (
         self._fill_through_host(field.reshape(self.shape))
         if isinstance(field, wp.array)
@@ -338,7 +338,7 @@ def as_on_devices(ranks):
     b = rng.standard_normal(cells.shape)
     for method in (PM, NEWTON):
         compare(ranks, "as on a device", cells, b, 0.0, method=method, **coefficients(cells.shape))
-    Halo.fill, Halo.filling, StencilLevel.fuses = fill, filling, fuses
+    Halo.fill, Halo.fill_task, StencilLevel.fuses = fill, filling, fuses
 
 
 def legs(ranks):
@@ -471,16 +471,16 @@ def messages_in_tables(ranks):
     nothing is sent after it.
     """
     sums = np.array([0.1, 10.0**ranks.rank])
-    run_table(OperationTable([ranks.adding(sums)]))
+    run_table(OperationTable([ranks.sum_operation(sums)]))
     expected = ranks.sum(np.array([0.1, 10.0**ranks.rank]))
     assert sums.tobytes() == expected.tobytes()
     waiting.native[1] = 15
     try:
-        run_table(OperationTable([ranks.adding(np.ones(2))]))
+        run_table(OperationTable([ranks.sum_operation(np.ones(2))]))
         raise AssertionError("no error")
     except RuntimeError as error:
         assert "error 15" in str(error), error
-    run_table(OperationTable([ranks.adding(sums)]))
+    run_table(OperationTable([ranks.sum_operation(sums)]))
     assert waiting.native[0] % 2 == 0
 
 

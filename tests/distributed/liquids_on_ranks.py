@@ -21,7 +21,7 @@ from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.fluids import SIMULATOR, viscosity_multigrid
 from warp_lcp.frames.pieces import one_mesh
-from warp_lcp.frames.vtu import Mesh
+from warp_lcp.frames.vtu import VtuMesh
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
 from warp_lcp.kernels.thread_pool import ThreadPool
 from warp_lcp.material.particle_scene import ParticleScene
@@ -473,7 +473,7 @@ def wrap(ranks: Ranks, folder: Path) -> None:
             _, _, surface, *volumes = simulation.frame()
             assert ranks.is_root or not volumes
             pieces = [
-                Mesh(part.points, part.corners, part.fields)
+                VtuMesh(part.points, part.corners, part.fields)
                 for part in ranks.comm.allgather(surface)
             ]
             if ranks.is_root:

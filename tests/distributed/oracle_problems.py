@@ -10,7 +10,7 @@ BOUNDS = ("walls", "everywhere", "boxed")
 
 
 @dataclass
-class Small:
+class OracleProblem:
     """Grid problem as arrays.
 
     Cells and fields (nz, ny, nx) or (ny, nx); faces and shift as in GridPoisson.
@@ -59,7 +59,7 @@ class Small:
         return (v > self.upper[self.fluid]).astype(int) - (v < self.lower[self.fluid]).astype(int)
 
 
-def small(name: str, bounds: str) -> Small:
+def small(name: str, bounds: str) -> OracleProblem:
     """Return liquid below air with a solid ball in it, in a closed box.
 
     Args:
@@ -96,7 +96,7 @@ def small(name: str, bounds: str) -> Small:
         lower[:] = 0.0
     else:
         lower, upper = -0.02 * rng.uniform(0.5, 1.0, shape), 0.02 * rng.uniform(0.5, 1.0, shape)
-    return Small(cells, coefficients, b, lower, upper)
+    return OracleProblem(cells, coefficients, b, lower, upper)
 
 
 def _beside_solid(cells: np.ndarray) -> np.ndarray:

@@ -197,7 +197,7 @@ def bounded_methods():
         assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max(), kind
 
 
-class Sums:
+class AggregateSums:
     """Sums over aggregates of the next finer level's cells, by NumPy.
 
     The transpose, times a factor, is included.
@@ -261,7 +261,9 @@ def cycles_of_pcmg():
             smoother.getPC().setType("jacobi")
             smoother.setFromOptions()
             sizes = [m.getSize()[0] for m in (matrices[level], matrices[level + 1])]
-            sums = Sums(levels[level], levels[level + 1], grid.hierarchy.settings.over_correction)
+            sums = AggregateSums(
+                levels[level], levels[level + 1], grid.hierarchy.settings.over_correction
+            )
             restriction = PETSc.Mat().createPython((sizes[1], sizes[0]), sums, comm=PETSc.COMM_SELF)
             restriction.setUp()
             pc.setMGRestriction(k, restriction)

@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 from warp_lcp.distributed import balance
-from warp_lcp.distributed.balance import Load, edge_of_blocks
-from warp_lcp.distributed.decomposition import OPEN, balanced_processes, parts, pool, seen_by
+from warp_lcp.distributed.balance import WorkLoad, edge_of_blocks
+from warp_lcp.distributed.decomposition import (
+    OPEN,
+    balanced_processes,
+    cells_with_ghosts,
+    parts,
+    pool,
+)
 
 ALL = np.zeros(3), np.array([64.0, 32.0, 32.0])
 
@@ -72,7 +78,7 @@ def busiest(load, cut):
     ends = [[0, *-(-np.cumsum(part) // load.edge)] for part in cut]
     boxes = itertools.product(*(list(itertools.pairwise(end)) for end in ends))
     full = [load.material[tuple(slice(a, b) for a, b in box)].sum() for box in boxes]
-    return (np.array(full) + OPEN * seen_by(load.counts, cut, load.layers).ravel()).max()
+    return (np.array(full) + OPEN * cells_with_ghosts(load.counts, cut, load.layers).ravel()).max()
 
 
 @pytest.mark.parametrize(("least", "pays"), [(560.0, True), (780.0, False)])
@@ -87,10 +93,12 @@ def test_boxes_are_repartitioned_only_if_the_step_gets_a_quarter_shorter(least, 
     ranks = SimpleNamespace(size=2, rank=0, collect=lambda mine: [mine, None])
     part = SimpleNamespace(decomposition=now, layers=3, ranks=ranks)
     particles = SimpleNamespace(exchange=SimpleNamespace(counts=[1000, 100]))
-    monkeypatch.setattr(balance, "seen_by", lambda counts, parts, layers: np.zeros((2, 1, 1)))
+    monkeypatch.setattr(
+        balance, "cells_with_ghosts", lambda counts, parts, layers: np.zeros((2, 1, 1))
+    )
     monkeypatch.setattr(balance, "blocks", lambda part, particles, edge: np.zeros(1))
     monkeypatch.setattr(
-        balance, "Load", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts))
+        balance, "WorkLoad", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts))
     )
     found = balance.Balance(fixed=1000.0).rebalance(part, particles, 1)
     assert found == (cuts if pays else None)
@@ -108,7 +116,7 @@ def every_cut(blocks, p, least):
 def test_cuts_by_load_leave_the_busiest_rank_as_little_as_any_cuts_along_one_axis(draw):
     drawn = np.random.default_rng(7300 + draw)
     counts = tuple(int(n) for n in drawn.integers(9, 17, 3))
-    load = Load(counts, 3, 1, drawn.random(counts) ** 8 * 40.0)
+    load = WorkLoad(counts, 3, 1, drawn.random(counts) ** 8 * 40.0)
     ranks = int(drawn.integers(2, 4))
     work, cut = load.best(ranks)
     assert work == pytest.approx(busiest(load, cut), rel=1e-12)
@@ -124,11 +132,11 @@ def test_cuts_by_load_lie_between_blocks_that_multigrid_gathers():
     counts = (100, 90, 61)
     material = np.zeros([math.ceil(n / 4) for n in counts])
     material[:5, :, :3] = 64.0
-    load = Load(counts, 5, edge_of_blocks(counts, 8), material)
+    load = WorkLoad(counts, 5, edge_of_blocks(counts, 8), material)
     assert load.edge == 4
     work, cut = load.best(8)
     assert all(m % 4 == 0 for part in cut for m in part[:-1])
     assert work == pytest.approx(busiest(load, cut))
     assert work < 0.7 * busiest(load, [[parts(n, 2)[0], n - parts(n, 2)[0]] for n in counts])
     assert load.best(8, cut)[0] == work
-    assert Load((16, 8, 8), 5, 1, np.ones((16, 8, 8))).best(8) is None
+    assert WorkLoad((16, 8, 8), 5, 1, np.ones((16, 8, 8))).best(8) is None

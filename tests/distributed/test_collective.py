@@ -46,7 +46,7 @@ lambda text: sys.stderr.write(text + "\\n"))
                 raise ValueError("wrong")
 
     def led():
-        with collective.led():
+        with collective.root_only():
             if ranks.is_root:
                 raise ValueError("from the first")
 
@@ -107,10 +107,10 @@ def test_a_rank_without_a_collective_partner_aborts_all(mpi):
 
 
 def test_one_process_needs_no_communication():
-    alone = Collective.of_one()
+    alone = Collective.for_one_process()
     with pytest.raises(KeyError), alone.together():
         {}["key"]
-    with pytest.raises(OSError, match="full") as found, alone.led():
+    with pytest.raises(OSError, match="full") as found, alone.root_only():
         raise OSError("full")
     assert str(found.value) == "full"
     with alone.together():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from warp_lcp.distributed.ranks import dealt
+from warp_lcp.distributed.ranks import device_by_number
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ from warp_lcp.distributed.ranks import dealt
     ],
 )
 def test_devices_are_assigned_round_robin(name, number, found, expected):
-    assert dealt(name, number, found) == expected
+    assert device_by_number(name, number, found) == expected
 
 
 @pytest.mark.parametrize(("name", "choices"), [("cuda", "cpu"), ("cuda:0", "cpu"), ("tpu", "cpu")])
@@ -25,7 +25,7 @@ def test_a_missing_device_is_named(name, choices):
         ValueError,
         match=f"--device {name}: there is no such device on this machine; choose from {choices}",
     ):
-        dealt(name, 0, [])
+        device_by_number(name, 0, [])
 
 
 def test_ranks_of_one_machine_count_through_its_devices(mpi):

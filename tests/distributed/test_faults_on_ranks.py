@@ -105,14 +105,14 @@ AFTER = """
     sys.path.insert(0, {folder!r})
     import dots_on_ranks
     from mpi4py import MPI
-    from warp_lcp.run.progress import Lines
+    from warp_lcp.run.progress import ProgressLines
     from warp_lcp.run import rank_frames
 
     if MPI.COMM_WORLD.rank == {rank}:
         def fail(self, row):
             if row["step"] == 30:
                 raise LookupError("nothing to show")
-        Lines.step = fail
+        ProgressLines.step = fail
     dots_on_ranks.main(["run", "dots.toml", "--engine", "petsc", "--device", "cpu", "--out", "out"])
 """
 

@@ -23,12 +23,12 @@ from liquids_on_ranks import (
     scene,
     sponge,
 )
+from ranks_in_turn import RankInTurn
 from scipy.spatial import cKDTree
-from turns import Seat
 
 from small_liquids import box
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.ghost_width import too_far
+from warp_lcp.distributed.ghost_width import displacement_beyond_ghosts
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids import SIMULATOR
@@ -118,7 +118,7 @@ def single(model_) -> ParticleSimulation:
 def alone(model_, **options):
     """Return a simulation on one rank, which needs no MPI."""
     return simulators()[model_.scene.simulator].create(
-        model_, device="cpu", folder=Path(), ranks=Ranks(Seat(0, 1)), **options
+        model_, device="cpu", folder=Path(), ranks=Ranks(RankInTurn(0, 1)), **options
     )
 
 
@@ -301,7 +301,7 @@ def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
     for ranks, what in ((2, "keep,go-on"), (4, "go-on")):
         assert mpi(ranks, PROGRAM, what, tmp_path, environment=environment).returncode == 0
-    liquids_on_ranks.go_on(Ranks(Seat(0, 1)), tmp_path)
+    liquids_on_ranks.go_on(Ranks(RankInTurn(0, 1)), tmp_path)
     for name in RESUMED:
         whole = json.loads((tmp_path / f"{name}_whole.json").read_text())[5:]
         for ranks in (1, 2, 4):
@@ -348,7 +348,7 @@ def test_a_source_keeps_its_cells_in_other_boxes_wherever_bodies_are():
 
 def test_too_large_velocities_are_detected_near_and_along_cuts():
     part = Subdomain(
-        Decomposition((40, 8, 1), Ranks(Seat(0, 2))),
+        Decomposition((40, 8, 1), Ranks(RankInTurn(0, 2))),
         spacing=0.1,
         dimension=2,
         device="cpu",
@@ -366,7 +366,7 @@ def test_too_large_velocities_are_detected_near_and_along_cuts():
         velocity = part.grid.faces()
         host = velocity[axis].numpy()
         host[1, 4, place] = cells * 0.1 / 0.02
-        assert too_far(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
+        assert displacement_beyond_ghosts(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
 
 
 def damaged(name, change):

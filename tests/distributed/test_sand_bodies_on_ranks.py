@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import warp as wp
-from turns import Seat, on_ranks
+from ranks_in_turn import RankInTurn, on_ranks
 
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress_layout import NUMBERS
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -89,7 +89,7 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
         base = wp.array(np.where(index >= 0, SOLID, 0), dtype=wp.int8)
         return Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32))
 
-    def work(seat: Seat) -> list[np.ndarray]:
+    def work(seat: RankInTurn) -> list[np.ndarray]:
         boxes = Decomposition(grid.counts, Ranks(seat))
         part = Subdomain(boxes, spacing=DX, dimension=dimension, device="cpu", layers=LAYERS)
         here = tuple(

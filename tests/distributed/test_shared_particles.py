@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from turns import Seat, on_ranks
+from ranks_in_turn import RankInTurn, on_ranks
 
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.particles import REACH
@@ -20,7 +20,9 @@ LAYERS = 5
 SPACING = 0.03
 
 
-def part_of(seat: Seat, counts: tuple[int, int, int], periodic: tuple[int, ...] = ()) -> Subdomain:
+def part_of(
+    seat: RankInTurn, counts: tuple[int, int, int], periodic: tuple[int, ...] = ()
+) -> Subdomain:
     """Return a rank's part of a grid."""
     dimension, boxes = (
         2 if counts[2] == 1 else 3,
@@ -83,7 +85,7 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
         orders.append((alone.position.numpy().copy(), alone.velocity.numpy().copy()))
         alone.position.assign(moved(alone.position.numpy(), counts, step))
 
-    def work(seat: Seat) -> list[tuple[np.ndarray, np.ndarray]]:
+    def work(seat: RankInTurn) -> list[tuple[np.ndarray, np.ndarray]]:
         part = part_of(seat, counts)
         mine = part.owners(cells_of(position)) == seat.rank
         particles = Particles(part.grid, position[mine], velocity[mine], affine=True)
@@ -101,7 +103,7 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
         return rows
 
     found = on_ranks(size, work)
-    boxes = Decomposition(counts, Ranks(Seat(0, size))).boxes
+    boxes = Decomposition(counts, Ranks(RankInTurn(0, size))).boxes
     for step, (where, how) in enumerate(orders):
         cells = cells_of(where)
         for rank, box in enumerate(boxes):
@@ -129,7 +131,7 @@ def test_particles_go_around(counts, size, periodic):
         [n * SPACING if axis in periodic else np.inf for axis, n in enumerate(counts)]
     )
 
-    def work(seat: Seat) -> None:
+    def work(seat: RankInTurn) -> None:
         part = part_of(seat, counts, periodic)
         low, high = ((np.array(corner) - 0.5) * SPACING for corner in (part.box.low, part.box.high))
         mine = part.owners(cells_of(position)) == seat.rank
@@ -175,7 +177,7 @@ def test_gradients_travel_with_their_particles():
     counts = (24, 20, 1)
     position, velocity = scattered(counts, 300)
 
-    def work(seat: Seat) -> bool:
+    def work(seat: RankInTurn) -> bool:
         part = part_of(seat, counts)
         mine = part.owners(cells_of(position)) == seat.rank
         particles = Particles(part.grid, position[mine], velocity[mine], affine=True)
@@ -202,7 +204,7 @@ def test_sums_are_of_all_ranks_and_count_each_particle_once():
         StaggeredGrid(counts, SPACING, 3, "cpu"), position, velocity, affine=False
     ).totals()
 
-    def work(seat: Seat) -> Any:
+    def work(seat: RankInTurn) -> Any:
         part = part_of(seat, counts)
         mine = (
             (part.owners(cells_of(position)) == seat.rank)
@@ -228,7 +230,7 @@ def test_particles_that_are_not_finite_are_counted_on_all_ranks():
     position, velocity = scattered(counts, 40)
     velocity[7, 1], position[9, 0] = np.nan, np.inf
 
-    def work(seat: Seat) -> Any:
+    def work(seat: RankInTurn) -> Any:
         part = part_of(seat, counts)
         half = slice(0, 20) if seat.rank == 0 else slice(20, 40)
         return Particles(part.grid, position[half], velocity[half], affine=False).totals()
@@ -246,7 +248,7 @@ def test_a_rank_may_have_no_particle():
     counts = (24, 12, 1)
     position = np.array([[0.4 * SPACING, 0.5 * SPACING, 0.0]], dtype=np.float32)
 
-    def work(seat: Seat) -> int:
+    def work(seat: RankInTurn) -> int:
         part = part_of(seat, counts)
         n = 1 - seat.rank
         particles = Particles(
@@ -263,7 +265,7 @@ def test_a_rank_may_have_no_particle():
 
 
 def test_boxes_thinner_than_the_ghost_layers_are_refused():
-    def work(seat: Seat) -> None:
+    def work(seat: RankInTurn) -> None:
         part_of(seat, (16, 3, 1))
 
     with pytest.raises(
@@ -275,7 +277,7 @@ def test_boxes_thinner_than_the_ghost_layers_are_refused():
 
 
 def test_a_part_has_the_cells_around_its_box_and_ends_where_the_domain_does():
-    def work(seat: Seat) -> tuple[Any, ...]:
+    def work(seat: RankInTurn) -> tuple[Any, ...]:
         part = part_of(seat, (24, 12, 1))
         return part.grid.counts, part.grid.origin, part.cuts, part.owned.low, part.owned.high
 

@@ -109,7 +109,7 @@ def test_a_long_wait_uses_no_core(monkeypatch):
         now[0] += seconds
         slept[0] += seconds
 
-    class Request:
+    class DelayedRequest:
         end = 0.3
 
         def Test(self) -> bool:  # noqa: N802  # MPI's name
@@ -117,7 +117,7 @@ def test_a_long_wait_uses_no_core(monkeypatch):
 
     monkeypatch.setattr(time, "monotonic", look)
     monkeypatch.setattr(time, "sleep", sleep)
-    request = Request()
+    request = DelayedRequest()
     assert finish(request)
     assert 0.28 < slept[0] < 0.31
     request.end = 100.0

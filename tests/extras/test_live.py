@@ -24,11 +24,11 @@ from warp_lcp.extras.live import (
     LOOPBACK,
     MOST_ANSWERED,
     MOST_CONNECTIONS,
-    Answers,
     LiveServer,
+    PageRequestHandler,
     live_server,
 )
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.render.recording import RenderError
 from warp_lcp.simulation import Points
@@ -283,7 +283,7 @@ def test_idle_connections_take_few_threads_and_descriptors(dots, tmp_path):
 
 
 def test_an_idle_connection_ends(dots, tmp_path, monkeypatch):
-    monkeypatch.setattr(Answers, "timeout", 0.1)
+    monkeypatch.setattr(PageRequestHandler, "timeout", 0.1)
     with serving(write_run(tmp_path / "run", [])) as server:
         with socket.create_connection((LOOPBACK, server.server_port), timeout=30) as connection:
             connection.sendall(b"GET / HTTP/1.0\r\nHost: loc")

@@ -13,8 +13,8 @@ from mesh_checks import assert_closed, enclosed
 from small_liquids import GRAVITY, scene
 from small_runs import ball, box, run_into, write_run
 from warp_lcp.extras.usd import INSTALL, export_run, usd_suffix
-from warp_lcp.frames.frames import FrameFolder
-from warp_lcp.render.recording import RenderError, Show
+from warp_lcp.frames.frame_folder import FrameFolder
+from warp_lcp.render.recording import RenderError, VisiblePart
 from warp_lcp.simulation import Points, Surface
 
 pytest.importorskip("pxr", reason="export needs usd-core, the extra `usd`")
@@ -88,7 +88,7 @@ def names(stage: Usd.Stage) -> list[str]:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_stage_says_units_axes_and_times(falls, tmp_path, dimension):
-    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.BOTH)
+    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=VisiblePart.BOTH)
     assert UsdGeom.GetStageUpAxis(stage) == "Y"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert (stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()) == (RATE, RATE)
@@ -103,7 +103,7 @@ def test_a_stage_says_units_axes_and_times(falls, tmp_path, dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_particles_are_those_of_the_frames(falls, tmp_path, dimension):
-    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.PARTICLES)
+    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=VisiblePart.PARTICLES)
     assert names(stage) == ["particles"]
     (width,) = get(stage, "particles", "widths", 0.0)
     assert width == pytest.approx(1 / 32, rel=0.1)  # two particles along a side of a cell
@@ -122,7 +122,7 @@ def test_particles_are_those_of_the_frames(falls, tmp_path, dimension):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_velocities_are_those_of_a_fall(falls, tmp_path, dimension, name):
     """Velocities of a fall: equal for all points, those of the last step's middle."""
-    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.BOTH)
+    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=VisiblePart.BOTH)
     for number in range(LAST + 1):
         velocity = get(stage, name, "velocities", number)
         assert len(velocity) == len(get(stage, name, "points", number)) > 50
@@ -137,7 +137,7 @@ def test_velocities_lead_to_the_next_frame(falls, tmp_path):
 
     They are for the shutter of a renderer that interpolates points between frames.
     """
-    stage = exported(falls[3], tmp_path / "fall.usdc", show=Show.PARTICLES)
+    stage = exported(falls[3], tmp_path / "fall.usdc", show=VisiblePart.PARTICLES)
     particles = UsdGeom.PointBased(prim(stage, "particles"))
     for number in range(1, LAST):
         before, after = (
@@ -293,7 +293,7 @@ def test_solids_stand_and_move(dots, tmp_path):
 def test_usd_s_own_validators_find_nothing(falls, tmp_path, dimension):
     validation = pytest.importorskip("pxr.UsdValidation", reason="of a later usd-core")
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
-    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.BOTH)
+    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=VisiblePart.BOTH)
     assert len(validators) > 10
     assert [
         error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)
@@ -352,7 +352,7 @@ def test_frames_without_material_and_without_velocity(dots, tmp_path):
     folder = write_run(
         tmp_path / "run", [[nothing, lost], [ball([0.5, 0.5, 0.5], 0.1), lost]], size=ROOM
     )
-    stage = exported(folder, tmp_path / "run.usdc", show=Show.BOTH)
+    stage = exported(folder, tmp_path / "run.usdc", show=VisiblePart.BOTH)
     assert (
         len(get(stage, "surface", "points", 0))
         == len(get(stage, "surface", "faceVertexIndices", 0))

@@ -9,12 +9,12 @@ from typer.testing import CliRunner
 from small_runs import ball, write_run
 from warp_lcp.cli import commands as cli
 from warp_lcp.extras.viewer import Viewer
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import INSTALL
 
 
-class Clock:
+class ManualClock:
     now = 0.0
 
     def __call__(self) -> float:
@@ -33,7 +33,7 @@ def folder(dots, tmp_path):
 @pytest.fixture
 def viewer(pyvista, folder):
     plotter = pyvista.Plotter(off_screen=True, window_size=[400, 300], lighting="none")
-    viewer = Viewer(Recording(folder), plotter, Clock())
+    viewer = Viewer(Recording(folder), plotter, ManualClock())
     yield viewer
     plotter.close()
 

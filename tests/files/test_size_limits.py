@@ -4,7 +4,7 @@ import pytest
 
 from fuzz.told import limited
 from warp_lcp.files import size_limits as claims
-from warp_lcp.files.size_limits import ClaimError, check_claim, free_host_memory
+from warp_lcp.files.size_limits import SizeLimitError, check_claim, free_host_memory
 
 
 @pytest.fixture(autouse=True)
@@ -31,14 +31,14 @@ def test_sizes_within_the_limits_are_accepted(needed, stored, held):
     ],
 )
 def test_sizes_beyond_the_limits_are_refused(needed, stored, held, message):
-    with pytest.raises(ClaimError, match=message):
+    with pytest.raises(SizeLimitError, match=message):
         check_claim("n", needed, stored=stored, available=held)
 
 
 def test_without_free_memory_figures_the_total_memory_is_the_limit(monkeypatch):
     monkeypatch.setattr(claims, "free_host_memory", lambda: None)
     check_claim("n", 10**30)
-    with pytest.raises(ClaimError, match="the file has 5 bytes"):
+    with pytest.raises(SizeLimitError, match="the file has 5 bytes"):
         check_claim("n", 6, stored=6, available=5)
 
 

@@ -61,7 +61,7 @@ def start(scene: Path, out: Path, *more: str) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-class Fork:
+class ForkedCommand:
     """Command line in a fork of this process.
 
     The fork has imported everything, so that it starts at once. It dies as any other process.
@@ -101,7 +101,7 @@ def call(scene: Path, out: Path, *more: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def wait_until_it_holds(process: subprocess.Popen | Fork, out: Path) -> None:
+def wait_until_it_holds(process: subprocess.Popen | ForkedCommand, out: Path) -> None:
     """Wait until the process holds the folder, or has ended."""
     until = time.monotonic() + LIMIT
     while process.poll() is None and time.monotonic() < until:
@@ -132,7 +132,7 @@ def newest_step(out: Path) -> int:
     )
 
 
-class Before:
+class KilledRunFolder:
     """Contents of a killed run's folder, to compare with its continuation."""
 
     def __init__(self, out: Path) -> None:
@@ -208,7 +208,7 @@ def kill_and_resume(
                 break
             assert process.returncode == -signal.SIGKILL, text
             died += 1
-            before = Before(out)
+            before = KilledRunFolder(out)
         assert results(out) == expected
         assert read_record(out)["steps"] == read_record(uninterrupted)["steps"]
         if died == kills:
@@ -217,7 +217,7 @@ def kill_and_resume(
 
 
 def test_three_kills(tmp_path):
-    steps = kill_and_resume(tmp_path, 3, 4999, Fork, 0.75)
+    steps = kill_and_resume(tmp_path, 3, 4999, ForkedCommand, 0.75)
     assert steps
     assert max(steps) > 0
 

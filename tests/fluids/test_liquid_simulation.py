@@ -8,7 +8,7 @@ from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from warp_lcp.grid.particles import Particles
 from warp_lcp.scene.simulator import Simulator, simulators
-from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, StepFailed
+from warp_lcp.simulation import Cells, HasStages, Points, SimulationFailed, StepFailed
 
 DIMENSIONS = [2, 3]
 
@@ -336,7 +336,7 @@ def test_the_grid_methods_give_the_same_liquid(method: str) -> None:
 
 
 def test_a_step_marks_its_stages() -> None:
-    class Names:
+    class StageNames:
         def __init__(self) -> None:
             self.found: list[str] = []
 
@@ -346,8 +346,8 @@ def test_a_step_marks_its_stages() -> None:
             return nullcontext()
 
     plain, watched = dam(), dam()
-    assert isinstance(watched, Profiled)
-    watched.watch = Names()
+    assert isinstance(watched, HasStages)
+    watched.watch = StageNames()
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
         "diagnostics",

@@ -12,7 +12,7 @@ import pytest
 from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels.launch_graph import LaunchGraph
 
 TABLES: dict[str, dict[str, Any]] = {
@@ -63,7 +63,7 @@ def test_kernels_on_windows_have_the_results_of_kernels_on_all_cells(tables, mon
 def test_cost_of_pressure_and_fragments_scales_with_the_liquid(monkeypatch):
     """Visited cells of passes in a domain eight times as wide."""
     visited = [Counter[str]()]
-    run, take = Window.run, WindowTally.take
+    run, take = Window.run, WindowReduction.take
     # Launches at once, each of which reports the cells that it visits.
     monkeypatch.setattr(
         LaunchGraph, "run", lambda graph, *arguments, variant=None: graph._record(*arguments)
@@ -78,12 +78,12 @@ def test_cost_of_pressure_and_fragments_scales_with_the_liquid(monkeypatch):
         count(passed, window)
         run(window, passed, *structs, **given)
 
-    def tallied(tally: WindowTally, window: Window, *structs: Any, **given: Any) -> None:
+    def tallied(tally: WindowReduction, window: Window, *structs: Any, **given: Any) -> None:
         count(tally, window)
         take(tally, window, *structs, **given)
 
     monkeypatch.setattr(Window, "run", counted)
-    monkeypatch.setattr(WindowTally, "take", tallied)
+    monkeypatch.setattr(WindowReduction, "take", tallied)
     for width in (1.0, 8.0):
         simulation = thrown({}, round(64 * width), width)
         simulation.step(0.001)

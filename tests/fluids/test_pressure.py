@@ -14,7 +14,7 @@ from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 NX, NY = 6, 7
 
 
-class Tank:
+class TiltedTank:
     """Tank in 2-D with liquid in given cells; column i = 0 can be a piston (solid 1)."""
 
     def __init__(
@@ -81,7 +81,7 @@ def test_a_pool_that_falls_onto_the_floor_is_stopped_by_a_positive_pressure(
 
     With the wrong sign x is negative with free-slip walls, zero with separating ones.
     """
-    tank = Tank(liquid(slice(0, 4)), separating=separating)
+    tank = TiltedTank(liquid(slice(0, 4)), separating=separating)
     tank.velocity[1].fill_(-0.5)
     projected = tank.project()
     depth = np.array([4, 3, 2, 1, 0, 0, 0])
@@ -95,7 +95,7 @@ def test_a_pool_that_falls_onto_the_floor_is_stopped_by_a_positive_pressure(
 
 def test_a_block_leaves_the_ceiling_only_where_walls_separate() -> None:
     block = liquid(slice(4, 7))
-    free, stuck = Tank(block), Tank(block, separating=False)
+    free, stuck = TiltedTank(block), TiltedTank(block, separating=False)
     for tank in (free, stuck):
         tank.velocity[1].fill_(-0.5)
     left, held = free.project(), stuck.project()
@@ -110,7 +110,7 @@ def test_a_block_leaves_the_ceiling_only_where_walls_separate() -> None:
 
 
 def test_the_walls_of_a_block_in_the_air_do_not_matter() -> None:
-    tank = Tank(liquid(slice(2, 5), slice(2, 4)))
+    tank = TiltedTank(liquid(slice(2, 5), slice(2, 4)))
     tank.velocity[1].fill_(-0.5)
     tank.velocity[0].fill_(0.25)
     projected = tank.project()
@@ -121,7 +121,7 @@ def test_the_walls_of_a_block_in_the_air_do_not_matter() -> None:
 
 @pytest.mark.parametrize("separating", [True, False])
 def test_a_piston_pushes_as_much_liquid_out_of_the_surface_as_it_sweeps(separating: bool) -> None:
-    tank = Tank(liquid(slice(0, 4), slice(1, None)), separating=separating, piston=0.3)
+    tank = TiltedTank(liquid(slice(0, 4), slice(1, None)), separating=separating, piston=0.3)
     projected = tank.project()
     surface = tank.velocity[1].numpy()[1, 5, 2:-1]
     assert surface.sum() == pytest.approx(4 * 0.3, abs=1e-5)
@@ -133,7 +133,9 @@ def test_a_piston_pushes_as_much_liquid_out_of_the_surface_as_it_sweeps(separati
 
 def test_liquid_separates_from_a_retracting_piston_unless_it_is_free_slip() -> None:
     pool = liquid(slice(0, 4), slice(1, None))
-    free, stuck = (Tank(pool, separating=separating, piston=-0.3) for separating in (True, False))
+    free, stuck = (
+        TiltedTank(pool, separating=separating, piston=-0.3) for separating in (True, False)
+    )
     left, held = free.project(), stuck.project()
     assert left.released == 4
     assert (free.x == 0.0).all()
@@ -144,7 +146,7 @@ def test_liquid_separates_from_a_retracting_piston_unless_it_is_free_slip() -> N
 
 
 def test_a_cell_under_pressure_is_held_whatever_flows_out_of_it() -> None:
-    tank = Tank(liquid(slice(0, 4)))
+    tank = TiltedTank(liquid(slice(0, 4)))
     tank.velocity[1].fill_(-0.5)
     tank.projection.prepare(tank.velocity, 0.01, 0.01)
     result, criteria = tank.projection.solve(1.0)
@@ -157,7 +159,9 @@ def test_a_cell_under_pressure_is_held_whatever_flows_out_of_it() -> None:
 
 def test_a_full_box_with_a_retracting_piston_needs_a_separating_wall() -> None:
     full = liquid(slice(None), slice(1, None))
-    free, stuck = (Tank(full, separating=separating, piston=-0.3) for separating in (True, False))
+    free, stuck = (
+        TiltedTank(full, separating=separating, piston=-0.3) for separating in (True, False)
+    )
     stuck.projection.prepare(stuck.velocity, 0.01, 0.01)
     assert stuck.projection.solve(1.0)[0].status is wl.SolveStatus.INFEASIBLE
     assert free.project().released > 0
@@ -167,15 +171,15 @@ def test_a_full_box_with_a_retracting_piston_needs_a_separating_wall() -> None:
 def test_a_wall_cell_is_judged_by_each_of_its_walls() -> None:
     """Bound of a corner cell with a separating piston beside a free-slip floor."""
     cell = liquid(slice(0, 1), slice(1, 2))
-    tank = Tank(cell, separating=(False, True), piston=-0.3)
+    tank = TiltedTank(cell, separating=(False, True), piston=-0.3)
     assert tank.project().released == 1
-    tank = Tank(cell, separating=False, piston=-0.3)
+    tank = TiltedTank(cell, separating=False, piston=-0.3)
     assert tank.project().released == 0
     assert tank.x[0, 1] == pytest.approx(-0.15, abs=1e-6)
 
 
 def test_the_last_pressure_starts_the_next_solve_whatever_the_time_step() -> None:
-    tank = Tank(liquid(slice(0, 4)), tolerance=1e-6)
+    tank = TiltedTank(liquid(slice(0, 4)), tolerance=1e-6)
     for dt in (0.01, 0.02, 0.005):
         tank.velocity[1].fill_(-50.0 * dt)
         tank.project(dt)
@@ -185,7 +189,7 @@ def test_the_last_pressure_starts_the_next_solve_whatever_the_time_step() -> Non
 
 
 def test_a_solve_leaves_velocity_and_pressure_alone() -> None:
-    tank = Tank(liquid(slice(0, 4)))
+    tank = TiltedTank(liquid(slice(0, 4)))
     tank.velocity[1].fill_(-0.5)
     tank.project()
     pressure, velocity = tank.projection.pressure.numpy().copy(), tank.velocity[1].numpy().copy()
@@ -197,7 +201,7 @@ def test_a_solve_leaves_velocity_and_pressure_alone() -> None:
 
 
 def test_noise_of_a_uniform_fall_is_not_iterated_on() -> None:
-    tank = Tank(liquid(slice(2, 5), slice(2, 4)))
+    tank = TiltedTank(liquid(slice(2, 5), slice(2, 4)))
     rng = np.random.default_rng(12)
     tank.velocity[1].assign(
         (-3.0 * (1 + 6e-8 * rng.normal(size=tank.grid.shape))).astype(np.float32)
@@ -209,6 +213,6 @@ def test_noise_of_a_uniform_fall_is_not_iterated_on() -> None:
 
 
 def test_wall_velocities_of_another_number_of_walls_are_refused() -> None:
-    tank = Tank(liquid(slice(0, 4)))
+    tank = TiltedTank(liquid(slice(0, 4)))
     with pytest.raises(ValueError, match="wall_velocity"):
         WholeCells(tank.grid, tank.boundary.solids, np.zeros((3, 3)), open_sides=0)

@@ -25,7 +25,7 @@ CENTER = np.array([0.513, 0.489, 0.507])
 
 
 @dataclass
-class Field:
+class SmoothField:
     """Smooth field p = q e with q = sign (|x - c|^2 - r^2) and e = exp(a . x).
 
     It is 0 on a sphere, positive in the liquid, and not symmetric.
@@ -125,7 +125,7 @@ def order(errors: dict[int, float]) -> float:
 
 def dirichlet_error(n: int, dimension: int, theta_min: float = THETA_MIN) -> float:
     """Return the largest error of p in a disc or a ball of liquid."""
-    field = Field(CENTER, 0.3718, -1.0)
+    field = SmoothField(CENTER, 0.3718, -1.0)
     x = cell_centers(n, dimension)
     phi = field.distance(x)
     cells = np.where(phi < 0.0, wl.FLUID, wl.AIR)
@@ -150,7 +150,7 @@ Part = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass
-class Disc:
+class DiscWall:
     """Wall whose open region lies within a circle."""
 
     center: np.ndarray
@@ -195,10 +195,10 @@ class Disc:
         return along, along + np.round((end - begin) * n) / n
 
 
-Opening = Callable[[Disc, int, int], Part]
+Opening = Callable[[DiscWall, int, int], Part]
 
 
-def outward_flux(field: Field, n: int, wall: Disc, opening: Opening) -> np.ndarray:
+def outward_flux(field: SmoothField, n: int, wall: DiscWall, opening: Opening) -> np.ndarray:
     """Return -integral of grad p . s over the open part of each cell's faces.
 
     s points outward; shape (n, n). By the divergence theorem it is the source in the open part of
@@ -226,7 +226,7 @@ def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_w
     the wall's flux at many points of the circle.
     """
     n, m = 8, 300
-    wall, field = Disc(CENTER[:2], 0.43), Field(np.array([0.62, 0.4]), 0.2, 1.0)
+    wall, field = DiscWall(CENTER[:2], 0.43), SmoothField(np.array([0.62, 0.4]), 0.2, 1.0)
     x = cell_centers(n * m, 2)
     f = np.where(
         np.hypot(*(x - wall.center).transpose(2, 0, 1)) < wall.radius, field.source(x), 0.0
@@ -238,12 +238,12 @@ def test_the_flux_through_open_faces_is_the_source_and_what_enters_through_the_w
     entering = (field.gradient(points) * normal).sum(axis=-1) * 2 * np.pi * wall.radius / len(angle)
     at = (points * n).astype(int)
     np.add.at(total, (at[:, 1], at[:, 0]), entering)
-    assert outward_flux(field, n, wall, Disc.exact) == pytest.approx(total, abs=2e-5)
+    assert outward_flux(field, n, wall, DiscWall.exact) == pytest.approx(total, abs=2e-5)
     assert np.abs(total).max() > 0.05
 
 
 @dataclass
-class Tank:
+class DiscTank:
     """Solved problem in a disc-shaped tank.
 
     `opening` defines the open parts of faces, `source` the region whose source and wall flux the
@@ -251,13 +251,13 @@ class Tank:
     """
 
     n: int
-    field: Field
-    opening: Opening = Disc.exact
-    source: Opening = Disc.exact
+    field: SmoothField
+    opening: Opening = DiscWall.exact
+    source: Opening = DiscWall.exact
     theta_min: float = THETA_MIN
 
     def __post_init__(self) -> None:
-        wall, n = Disc(CENTER[:2], 0.4377), self.n
+        wall, n = DiscWall(CENTER[:2], 0.4377), self.n
         parts = [self.opening(wall, n, axis) for axis in range(2)]
         self.fractions = [(end - begin) * n for begin, end in parts]
         for axis, face in enumerate(self.fractions):
@@ -288,23 +288,27 @@ class Tank:
         return float(np.sqrt((self.errors**2).mean()))
 
 
-RING = Field(CENTER, 0.1893, 1.0)  # liquid between the wall and a round bubble
-POOL = Field(np.array([0.31, 0.83]), 0.4211, 1.0)  # a round surface that ends on the wall
+RING = SmoothField(CENTER, 0.1893, 1.0)  # liquid between the wall and a round bubble
+POOL = SmoothField(np.array([0.31, 0.83]), 0.4211, 1.0)  # a round surface that ends on the wall
 SIZES = (16, 24, 32, 48, 64, 96, 128)
 
 
-@pytest.mark.parametrize("opening", [Disc.exact, Disc.from_nodes], ids=["exact", "from-nodes"])
+@pytest.mark.parametrize(
+    "opening", [DiscWall.exact, DiscWall.from_nodes], ids=["exact", "from-nodes"]
+)
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
-def test_liquid_in_a_round_tank_converges_with_second_order(field: Field, opening: Opening) -> None:
+def test_liquid_in_a_round_tank_converges_with_second_order(
+    field: SmoothField, opening: Opening
+) -> None:
     """Second-order convergence of liquid in a round tank.
 
     In the largest error over all unknowns, including cells with a sliver of open area.
     """
-    assert order({n: Tank(n, field, opening, opening).error for n in SIZES}) >= SECOND_ORDER
+    assert order({n: DiscTank(n, field, opening, opening).error for n in SIZES}) >= SECOND_ORDER
 
 
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
-def test_level_set_errors_at_a_round_wall_affect_single_cells_only(field: Field) -> None:
+def test_level_set_errors_at_a_round_wall_affect_single_cells_only(field: SmoothField) -> None:
     """Error of fractions from nodes at a round wall.
 
     The source is that of the circle. An edge that the circle cuts twice is closed, so that its cell
@@ -312,24 +316,26 @@ def test_level_set_errors_at_a_round_wall_affect_single_cells_only(field: Field)
     cells with a sliver of open area, is not (1.2 to 1.3).
     """
     assert (
-        order({n: Tank(n, field, Disc.from_nodes, Disc.exact).mean_error for n in SIZES})
+        order(
+            {n: DiscTank(n, field, DiscWall.from_nodes, DiscWall.exact).mean_error for n in SIZES}
+        )
         >= SECOND_ORDER
     )
 
 
 @pytest.mark.parametrize("field", [RING, POOL], ids=["ring", "pool"])
-def test_whole_cells_are_not_of_second_order(field: Field) -> None:
+def test_whole_cells_are_not_of_second_order(field: SmoothField) -> None:
     """Order of whole cells: the negative control.
 
     A surface at the cells' faces is of first order; stairs in place of the wall do not converge.
     """
-    assert order({n: Tank(n, field, theta_min=1.0).error for n in SIZES}) < 1.4
-    assert order({n: Tank(n, field, Disc.whole).error for n in SIZES}) < 0.6
+    assert order({n: DiscTank(n, field, theta_min=1.0).error for n in SIZES}) < 1.4
+    assert order({n: DiscTank(n, field, DiscWall.whole).error for n in SIZES}) < 0.6
 
 
 def test_the_operator_is_the_matrix_assembled_face_by_face() -> None:
     """Operator against a matrix assembled face by face, solved by SciPy."""
-    tank = Tank(24, POOL, Disc.from_nodes, Disc.from_nodes)
+    tank = DiscTank(24, POOL, DiscWall.from_nodes, DiscWall.from_nodes)
     cells, phi, a, rhs, A, p = tank.cells, tank.phi, tank.fractions, tank.rhs, tank.A, tank.p
     number = np.full(cells.shape, -1)
     number[cells == wl.FLUID] = np.arange((cells == wl.FLUID).sum())

@@ -13,7 +13,7 @@ from small_liquids import GRAVITY, advance, box, create, scene
 from small_runs import run_into
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import Measured, SimulationFailed
+from warp_lcp.simulation import HasTables, SimulationFailed
 
 DX = 0.04
 WATER = 1000.0 * GRAVITY
@@ -223,7 +223,7 @@ def test_probes_change_nothing(model: str) -> None:
     states = []
     for given in ([], probes):
         simulation = tank(2, given, pressure={"model": model})
-        assert isinstance(simulation, Measured)
+        assert isinstance(simulation, HasTables)
         assert bool(simulation.tables()) == bool(given)
         advance(simulation, 0.1)
         states.append(simulation.state())

@@ -16,7 +16,7 @@ from warp_lcp.files import size_limits as claims
 from warp_lcp.recorded_problem import FORMAT, cell_counts, files, load
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.problem_folder import ProblemFolder
-from warp_lcp.simulation import Recorded
+from warp_lcp.simulation import HasRecordedProblems
 
 RAMP = box([0.2, -0.2], [0.6, 0.08], rotate=20)  # partly beneath the liquid
 CASES = {
@@ -32,7 +32,7 @@ CASES = {
 
 def record(simulation, folder, steps=3):
     """Step, and return the accepted pressure of every step."""
-    assert isinstance(simulation, Recorded)
+    assert isinstance(simulation, HasRecordedProblems)
     simulation.record = ProblemFolder(folder).write
     pressures = []
     for _ in range(steps):

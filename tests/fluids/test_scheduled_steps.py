@@ -14,7 +14,7 @@ from rich.console import Console
 
 from small_liquids import box, create, scene
 from small_runs import run_into
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.run.stepping import SHARE
 
 FRAMES = 30.0
@@ -52,7 +52,7 @@ def steps(folder: Path) -> np.ndarray:
 
 def test_a_busy_run_has_no_slivers_and_goes_on_with_the_same_steps(tmp_path: Path) -> None:
     model = busy()
-    run_into(model, tmp_path / "through", observer=Lines(Console(quiet=True)))
+    run_into(model, tmp_path / "through", observer=ProgressLines(Console(quiet=True)))
     through = steps(tmp_path / "through")
     lengths, ends = through[:, 1] - through[:, 0], through[:, 1]
     assert lengths[1:].min() > 0.8 * SHARE * 0.012
@@ -66,10 +66,10 @@ def test_a_busy_run_has_no_slivers_and_goes_on_with_the_same_steps(tmp_path: Pat
     run_into(
         model,
         tmp_path / "again",
-        observer=Lines(Console(quiet=True)),
+        observer=ProgressLines(Console(quiet=True)),
         stop=lambda: next(asked) >= len(ends) // 2,
     )
-    run_into(model, tmp_path / "again", observer=Lines(Console(quiet=True)), resume=True)
+    run_into(model, tmp_path / "again", observer=ProgressLines(Console(quiet=True)), resume=True)
     assert np.array_equal(steps(tmp_path / "again"), through)
 
 

@@ -16,7 +16,7 @@ import small_sands
 from default_run import covering
 from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.fluids.wall_drag_kernels import Drag, fill
+from warp_lcp.fluids.wall_drag_kernels import WallDragFields, fill
 from warp_lcp.operators.grid_poisson import AIR, FLUID
 
 DX = 0.05
@@ -93,7 +93,7 @@ def test_a_sheet_slows_down_by_its_law(
 
 @wp.kernel(enable_backward=False, module="tests.wall_drag")
 @no_type_check
-def fill_kernel(D: Drag, out: wp.array3d(dtype=float)):
+def fill_kernel(D: WallDragFields, out: wp.array3d(dtype=float)):
     k, j, i = wp.tid()
     out[k, j, i] = fill(D, k, j, i)
 
@@ -106,7 +106,7 @@ def test_cells_of_liquid_are_half_full_at_least_and_those_of_air_at_most(surface
     surface.
     """
     phi = [-2.0, -0.3, 0.2, 0.5, 2.0]
-    D = Drag()
+    D = WallDragFields()
     D.kind = wp.array([[[FLUID] * 5 + [AIR] * 5]], dtype=wp.int8, device="cpu")
     if surface:
         D.phi = wp.array([[phi + phi]], dtype=wp.float32, device="cpu")

@@ -7,7 +7,7 @@ import meshio
 import numpy as np
 import pytest
 
-from warp_lcp.frames.frames import WAITING, FrameFolder, FrameWriter, frame_bytes
+from warp_lcp.frames.frame_folder import WAITING, FrameFolder, FrameWriter, frame_bytes
 from warp_lcp.frames.vtu import read_vtu, write_vtu
 from warp_lcp.simulation import Cells, Points, Surface
 

@@ -18,13 +18,13 @@ import warp_lcp as wl
 from default_run import covering
 from small_runs import ball, run_into
 from warp_lcp.frames import meshio_format
-from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, frame_bytes
+from warp_lcp.frames.frame_folder import FRAME_FILE, FrameFolder, frame_bytes
 from warp_lcp.frames.meshio_format import (
     MODULES,
     SUFFIXES,
     WRITTEN_ONLY,
-    Dress,
     FrameFormat,
+    MeshConversion,
     from_meshio,
     holds,
     kind_of,
@@ -33,11 +33,11 @@ from warp_lcp.frames.meshio_format import (
     write_meshio,
 )
 from warp_lcp.frames.vti import write_vti
-from warp_lcp.frames.vtu import Mesh, mesh_of, read_vtu, write_vtu
+from warp_lcp.frames.vtu import VtuMesh, mesh_of, read_vtu, write_vtu
 from warp_lcp.render.recording import Color, Recording, RenderError
-from warp_lcp.render.render import Looks, render_run
+from warp_lcp.render.render import ImageStyle, render_run
 from warp_lcp.run.check import check_ranks, check_scene
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import Cells, Points, Surface, Volume
@@ -83,7 +83,7 @@ def without(part):
     return Cells(part.name, part.index[:0], part.spacing, part.dimension, none)
 
 
-def same(found: Mesh, expected: Mesh, *, bare: bool) -> None:
+def same(found: VtuMesh, expected: VtuMesh, *, bare: bool) -> None:
     np.testing.assert_allclose(found.points, expected.points, rtol=1e-6, atol=1e-7)
     np.testing.assert_array_equal(found.corners, expected.corners)
     if bare:
@@ -115,8 +115,8 @@ def test_supported_data_round_trip_in_every_format(tmp_path, name, part):
     write_meshio(file, source_part, name)
     assert list(tmp_path.iterdir()) == [file]
     if name in WHOLE:
-        assert held.dress is not Dress.BARE
-    bare = held.dress is Dress.BARE
+        assert held.dress is not MeshConversion.BARE
+    bare = held.dress is MeshConversion.BARE
     found = from_meshio(getattr(meshio, MODULES.get(name, name)).read(str(file)))
     if name in WRITTEN_ONLY:
         with pytest.raises(ValueError, match="are written for other programs"):
@@ -295,8 +295,8 @@ def test_the_bytes_of_a_frame_are_estimated(tmp_path, name):
 # ---- runs
 
 
-def quiet() -> Lines:
-    return Lines(Console(quiet=True))
+def quiet() -> ProgressLines:
+    return ProgressLines(Console(quiet=True))
 
 
 @pytest.mark.parametrize("name", ["xdmf", "vtk", "gmsh"])
@@ -328,7 +328,7 @@ def test_a_run_in_another_format_goes_on_and_is_drawn(scene_file, tmp_path, name
     for number in one.numbers:
         for first, second in zip(one.read(number), two.read(number), strict=True):
             np.testing.assert_allclose(second, first, rtol=1e-6, atol=1e-9)
-    assert len(list(render_run(other, looks=Looks(cut=True, color=Color.SPEED)))) == 5
+    assert len(list(render_run(other, looks=ImageStyle(cut=True, color=Color.SPEED)))) == 5
     run_into(scene, other, force=True)  # its files are the run's
     (other / "frames" / f"grid_000001.{SUFFIXES[name]}").unlink()
     record = run_into(
@@ -409,8 +409,8 @@ def test_fields_unsupported_by_a_format_are_reported(scene_file, tmp_path):
     with pytest.raises(
         RenderError, match="the frames have no velocity, which --color speed needs; choose plain"
     ):
-        list(render_run(tmp_path / "out", looks=Looks(cut=True, color=Color.SPEED)))
-    assert list(render_run(tmp_path / "out", looks=Looks(cut=True, color=Color.PLAIN)))
+        list(render_run(tmp_path / "out", looks=ImageStyle(cut=True, color=Color.SPEED)))
+    assert list(render_run(tmp_path / "out", looks=ImageStyle(cut=True, color=Color.PLAIN)))
 
 
 def test_the_surface_of_a_liquid_as_stl(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.frames.frames import FrameFolder, frame_bytes
+from warp_lcp.frames.frame_folder import FrameFolder, frame_bytes
 from warp_lcp.frames.nvdb import name_key, write_nvdb
 from warp_lcp.simulation import Volume
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from warp_lcp.distributed.collective import Collective
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.frames.pieces import describe, one_grid, piece_files, write_whole
-from warp_lcp.frames.vtu import Mesh
+from warp_lcp.frames.vtu import VtuMesh
 from warp_lcp.render import recording
 from warp_lcp.render.recording import Color, Recording, RenderError
 from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
@@ -80,13 +80,13 @@ def write(folder: Path, grid_format: str, frames: int = 1) -> None:
     for index in range(frames):
         found = []
         for rank, box in enumerate(BOXES):
-            collective = Collective.of_one()
+            collective = Collective.for_one_process()
             collective.ranks.comm.rank = rank  # other data of the ranks are not used
             mine = RankFrames(FrameFolder(folder, grid_format), collective)
             mine.write(index, 0.5 * index, piece(box))
             found.append(mine.describe(piece(box)))
         if index == 0:
-            first = RankFrames(FrameFolder(folder, grid_format), Collective.of_one())
+            first = RankFrames(FrameFolder(folder, grid_format), Collective.for_one_process())
         first.publish(index, 0.5 * index, found)
 
 
@@ -244,7 +244,7 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
 
 
 def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path):
-    collective = Collective.of_one()
+    collective = Collective.for_one_process()
     collective.ranks.comm.rank = 1  # the first rank writes elsewhere
     folder = RunFolder(tmp_path / "out", load_scene(scene_file), collective)
     with pytest.raises(
@@ -263,7 +263,7 @@ def test_a_file_that_is_no_index_is_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a readable frame: not XML"):
         piece_files(tmp_path / "particles_000001.pvtu")
     with pytest.raises(RenderError, match="is not a readable frame"):
-        recording._read(tmp_path / "particles_000001.pvtu", Mesh)
+        recording._read(tmp_path / "particles_000001.pvtu", VtuMesh)
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_a_frame_names_pieces_of_its_own_alone(tmp_path, source):
         match=r"particles_000001\.pvtu: is not a readable frame: names '.*': a piece is "
         r"rank_0000/particles",
     ):
-        recording._read(whole, Mesh)
+        recording._read(whole, VtuMesh)
 
 
 def whole_points() -> Points:

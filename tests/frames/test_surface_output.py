@@ -11,7 +11,7 @@ import warp as wp
 import small_liquids
 import small_sands
 from mesh_checks import assert_closed, enclosed
-from warp_lcp.frames.frames import FrameFolder, frame_bytes
+from warp_lcp.frames.frame_folder import FrameFolder, frame_bytes
 from warp_lcp.frames.ply import write_ply
 from warp_lcp.material import particle_frames
 from warp_lcp.simulation import Points, Surface

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_lcp.frames.frames import FrameFolder, frame_bytes
+from warp_lcp.frames.frame_folder import FrameFolder, frame_bytes
 from warp_lcp.frames.vti import read_vti, write_vti
 from warp_lcp.simulation import Cells
 

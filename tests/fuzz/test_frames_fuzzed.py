@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from mutated import mutated
 from told import costly, limited
 
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.frames.pieces import describe, write_whole
-from warp_lcp.render.recording import Color, Recording, RenderError, Show
+from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import Cells, Part, Points, Surface
 
@@ -75,7 +75,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def recordings(folder: Path) -> list[Recording]:
     """Return all recordings of the run."""
-    chosen = ((Color.PRESSURE, Show.BOTH, True), (Color.SPEED, Show.BOTH, False))
+    chosen = ((Color.PRESSURE, VisiblePart.BOTH, True), (Color.SPEED, VisiblePart.BOTH, False))
     return [Recording(folder, color, show, cells=cells) for color, show, cells in chosen]
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_lcp.gallery.contact_scenes import box, gear
 from warp_lcp.gallery.rigid_world import FIXED, GROUND, World
-from warp_lcp.grid.solids import Sphere
+from warp_lcp.grid.signed_distance import Sphere
 from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 from warp_lcp.rigid.obstacles import Obstacle
 

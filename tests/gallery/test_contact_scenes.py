@@ -17,7 +17,7 @@ from warp_lcp.gallery.contact_scenes import (
     wall,
 )
 from warp_lcp.gallery.rigid_world import World
-from warp_lcp.grid.solids import Sphere
+from warp_lcp.grid.signed_distance import Sphere
 from warp_lcp.rigid.contact_models import BoxedModel, StewartTrinkleModel
 
 DT = 0.01

@@ -20,7 +20,7 @@ from warp_lcp.gallery.contact_scenes import (
 )
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import World
-from warp_lcp.grid.solids import Sphere
+from warp_lcp.grid.signed_distance import Sphere
 from warp_lcp.rigid.contact_models import StewartTrinkleModel
 from warp_lcp.rigid.joints import WORLD, Joint
 

@@ -12,7 +12,7 @@ import warp_lcp as wl
 from oracle import assemble, lemke, natural_residual
 from warp_lcp.gallery import (
     FAMILIES,
-    Plant,
+    PlantedSolution,
     Problem,
     contact,
     definite,
@@ -25,12 +25,12 @@ from warp_lcp.gallery import (
 )
 
 PLANTS = [
-    Plant(),
-    Plant(active=0.0),
-    Plant(active=1.0),
-    Plant(weak=0.5),
-    Plant(boxed=True, mixed=0.3, active=0.6),
-    Plant(size=1e-5),
+    PlantedSolution(),
+    PlantedSolution(active=0.0),
+    PlantedSolution(active=1.0),
+    PlantedSolution(weak=0.5),
+    PlantedSolution(boxed=True, mixed=0.3, active=0.6),
+    PlantedSolution(size=1e-5),
 ]
 
 
@@ -178,8 +178,8 @@ def test_newton_cycles_on_the_period_three_matrix():
 
 def test_arguments_out_of_range_are_named():
     for wrong, name in [
-        (lambda: Plant(active=1.5), "active"),
-        (lambda: Plant(size=0.0), "size"),
+        (lambda: PlantedSolution(active=1.5), "active"),
+        (lambda: PlantedSolution(size=0.0), "size"),
         (lambda: contact(3, directions=3), "directions"),
         (lambda: contact(0), "contacts"),
         (lambda: definite(0), r"A has shape \(0, 0\)"),
@@ -190,7 +190,11 @@ def test_arguments_out_of_range_are_named():
         (lambda: poisson((3, 3), coefficients="odd"), "coefficients"),
         (
             lambda: planted(
-                np.eye(2), np.random.default_rng(5), Plant(), name="x", facts=frozenset({"lucky"})
+                np.eye(2),
+                np.random.default_rng(5),
+                PlantedSolution(),
+                name="x",
+                facts=frozenset({"lucky"}),
             ),
             "facts",
         ),

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from warp_lcp.gallery.contact_scenes import about, box, gear
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import FIXED, World
-from warp_lcp.grid.solids import Sphere
+from warp_lcp.grid.signed_distance import Sphere
 
 
 def sampled_inertia(half, mass, n=60):

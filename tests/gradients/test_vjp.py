@@ -365,7 +365,7 @@ def test_large_sparse_matrices_by_their_own_methods(symmetric):
     assert np.allclose(found.lower.numpy(), at_lower, atol=1e-8)
 
 
-class Products:
+class ProductOperator:
     """Operator with products alone."""
 
     def __init__(self, matrix, symmetric):
@@ -386,7 +386,9 @@ class Products:
 def test_operators_of_a_users_own(symmetric):
     A, rng = random_matrix(20, 61, symmetric)
     data = {"b": 2 * rng.standard_normal(20), "lower": -rng.random(20), "upper": 0.4}
-    gradients = check(lambda **data: wl.LCP(Products(A.toarray(), symmetric), **data), data, 62)
+    gradients = check(
+        lambda **data: wl.LCP(ProductOperator(A.toarray(), symmetric), **data), data, 62
+    )
     assert gradients.coefficients == {}
 
 

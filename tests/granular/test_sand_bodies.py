@@ -258,7 +258,7 @@ def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.Mo
     assert np.array_equal(simulation.bodies.state()["bodies"], before)
 
 
-class Misses:
+class UnconvergedSolve:
     """Replacement of a solve with stresses that leave a residual."""
 
     def __init__(self, stress: Stress, residual: float) -> None:
@@ -295,7 +295,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
     for simulation in twins:
         simulation.step(0.004)
     with monkeypatch.context() as patch:
-        patch.setattr(twins[0], "solve_stress", Misses(twins[0].stress, 1.5 * FAR))
+        patch.setattr(twins[0], "solve_stress", UnconvergedSolve(twins[0].stress, 1.5 * FAR))
         with pytest.raises(
             StepFailed,
             match=r"STAGNATED after 310 iterations at a residual of 1.50e\+00 rho g dx .*may "
@@ -307,7 +307,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(
     first, second = (simulation.state() for simulation in twins)
     for name, value in first.items():
         assert np.array_equal(value, second[name]), name
-    monkeypatch.setattr(twins[0], "solve_stress", Misses(twins[0].stress, 0.9 * FAR))
+    monkeypatch.setattr(twins[0], "solve_stress", UnconvergedSolve(twins[0].stress, 0.9 * FAR))
     assert twins[0].step(0.001)["solve_status"] == "STAGNATED"
 
 

@@ -12,9 +12,9 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -23,7 +23,7 @@ SCALE = 9.81 * DT
 
 
 @dataclass
-class Case:
+class BlocksInSand:
     """Blocks in sand, some of them bodies."""
 
     stress: Stress
@@ -67,7 +67,7 @@ def make(
     depth: int,
     sand: tuple[int, int] | None = None,
     friction: float = FRICTION,
-) -> Case:
+) -> BlocksInSand:
     """Return sand of a depth [cells] around blocks of a density ratio.
 
     The blocks are fixed if the ratio is None.
@@ -120,7 +120,7 @@ def make(
                 for m, i in zip(masses, inertias, strict=True)
             ]
         )
-    case = Case(
+    case = BlocksInSand(
         Stress(packing, walls, bodies=bodies), packing, bodies, np.array(centers), np.array(masses)
     )
     if bodies is not None:
@@ -139,7 +139,7 @@ def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
     return place * grid.spacing
 
 
-def beside_bodies(case: Case, axis: int) -> np.ndarray:
+def beside_bodies(case: BlocksInSand, axis: int) -> np.ndarray:
     """Return which faces of an axis belong to bodies, shape of the grid's fields."""
     assert case.bodies is not None and case.bodies.faces is not None
     found, faces = np.zeros(case.packing.grid.size, dtype=bool), case.bodies.faces

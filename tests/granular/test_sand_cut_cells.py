@@ -17,14 +17,14 @@ from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.granular.solids import SandSolids, SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient
+from warp_lcp.granular.wall_friction import SandSolids, SandWalls
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.solids import Plane
+from warp_lcp.grid.signed_distance import Plane
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
-from warp_lcp.material.particle_assembly import Parts
+from warp_lcp.material.particle_assembly import GridComponents
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, DX, G = 0.01, 0.1, 9.81
@@ -35,7 +35,7 @@ TILTS = {
 CASES = [(dimension, number) for dimension, tilts in TILTS.items() for number in range(len(tilts))]
 
 
-class Case:
+class SandBesidePlane:
     """Grid full of sand on one side of a plane, gravity toward the plane."""
 
     def __init__(
@@ -105,7 +105,7 @@ def test_openings_are_those_of_the_plane() -> None:
 
     Volumes and walls against a count of points of the true half space.
     """
-    case = Case(2, TILTS[2][0])
+    case = SandBesidePlane(2, TILTS[2][0])
     volume, points = case.walls.volume.numpy()[1], (np.arange(200) + 0.5) / 200
     for j in range(1, case.grid.counts[1] + 1):
         for i in range(1, case.grid.counts[0] + 1):
@@ -128,7 +128,7 @@ def test_forces_are_the_adjoint_of_what_they_work_on(dimension: int, number: int
     For any stresses and any velocity v: sum of mass v (u - u*) is minus the power of the stresses
     in v, written out independently.
     """
-    case = Case(dimension, TILTS[dimension][number])
+    case = SandBesidePlane(dimension, TILTS[dimension][number])
     shape, random = case.grid.shape, case.random
     case.begin([random.normal(size=shape) for _ in range(dimension)], np.zeros(3))
     stress, p = case.stress, case.packing
@@ -172,7 +172,7 @@ def test_sliding_along_the_wall_strains_nothing(dimension: int, number: int) -> 
 
     Pressure and friction vanish, except the wall's: a smooth wall lets sand pass.
     """
-    case = Case(dimension, TILTS[dimension][number], mu=0.0)
+    case = SandBesidePlane(dimension, TILTS[dimension][number], mu=0.0)
     along_wall = np.cross(case.normal, [0.3, 0.4, 1.0] if dimension == 3 else [0.0, 0.0, 1.0])
     case.begin([np.full(case.grid.shape, u) for u in along_wall[:dimension]], np.zeros(3))
     case.stress.residual()
@@ -203,7 +203,7 @@ def test_the_wall_bears_what_the_sand_loses(dimension: int) -> None:
     A stiff block, away from the domain's walls, slides on a plane. Its momentum goes into the wall,
     by Coulomb's law in every cell.
     """
-    case = Case(dimension, TILTS[dimension][0], mu=0.2, cells=9)
+    case = SandBesidePlane(dimension, TILTS[dimension][0], mu=0.2, cells=9)
     gravity = np.array([0.0, -G, 0.0])
     filled = np.zeros(case.grid.shape)
     filled[(slice(1, -1) if dimension == 2 else slice(3, -3)), 1:-2, 3:-3] = 1.0
@@ -255,7 +255,7 @@ def test_a_liquid_at_rest_presses_by_its_depth() -> None:
     Without friction the pressure is that of the depth in every cell that a plane cuts, however
     small its open part is.
     """
-    case = Case(2, TILTS[2][0], mu=0.0, k=0.0, cells=9)
+    case = SandBesidePlane(2, TILTS[2][0], mu=0.0, k=0.0, cells=9)
     gravity = np.array([0.0, -G, 0.0])
     case.begin([np.full(case.grid.shape, g * DT) for g in gravity[:2]], gravity)
     case.solve(1e-6)
@@ -314,7 +314,10 @@ def whole(simulation: SandSimulation) -> SandSimulation:
         simulation.grid, simulation.boundary.cut.solids, simulation.boundary, scene.wall_frictions()
     )
     return SandSimulation(
-        scene, simulation.grid, Parts(simulation.boundary, solids=solids), simulation.particles
+        scene,
+        simulation.grid,
+        GridComponents(simulation.boundary, solids=solids),
+        simulation.particles,
     )
 
 

@@ -11,9 +11,9 @@ from test_sand_stress import Case, make, velocity
 from small_sands import advance, box, create, scene
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_kernels import DAMPED
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

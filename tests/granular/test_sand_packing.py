@@ -10,8 +10,8 @@ import pytest
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls, wall_faces
-from warp_lcp.grid.part import GridPart
+from warp_lcp.granular.wall_friction import SandWalls, wall_faces
+from warp_lcp.grid.grid_part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -184,7 +184,7 @@ def test_wall_faces_lie_between_open_cells_and_solids(dimension: int) -> None:
     assert (np.diff(cells) >= 0).all()  # so that a cell's faces belong to one thread, in one order
 
 
-class SomeCells(GridPart):
+class OwnedCells(GridPart):
     """Process that owns some of the cells."""
 
     def __init__(self, grid: StaggeredGrid, cells: Window) -> None:
@@ -209,7 +209,7 @@ def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
         for host, kind in ((base, wp.int8), (capacity, wp.float32))
     ]
     counted = Window((1, 2, 2), (grid.shape[0] - 1, 5, 6), grid.device)
-    object.__setattr__(grid, "part", SomeCells(grid, counted))
+    object.__setattr__(grid, "part", OwnedCells(grid, counted))
     packing = Packing(grid, *arrays)
     index = np.full(grid.shape, -1, dtype=np.int32)
     index[0], index[-1], index[:, 0], index[:, -1], index[..., 0], index[..., -1] = [0] * 6

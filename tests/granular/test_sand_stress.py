@@ -13,8 +13,8 @@ import scipy.optimize
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -33,7 +33,7 @@ def step_along(axis: int) -> np.ndarray:
 
 
 @dataclass
-class Case:
+class RandomSand:
     """Random sand in a small domain with a solid: an admissible stress, and its parts."""
 
     stress: Stress
@@ -62,7 +62,7 @@ def make(
     box: bool = False,
     gain: float = 0.0,
     halfway: float = 0.0,
-) -> Case:
+) -> RandomSand:
     """Return a case with empty, loose and dense cells.
 
     Some touch walls and a solid of two cells.
@@ -101,14 +101,14 @@ def make(
     stress.kick_dt = DT
     bound = YieldSet(0.5, cohesion, tension, gain, halfway)
     stress.begin(bound, GRAVITY, DT, DT)
-    return Case(stress, packing, bound, index)
+    return RandomSand(stress, packing, bound, index)
 
 
 def at(cell: tuple[int, ...], *steps: np.ndarray) -> tuple[int, ...]:
     return tuple(np.add(cell, np.sum(steps, axis=0, dtype=int)) if steps else cell)
 
 
-def interior(case: Case) -> list[tuple[int, ...]]:
+def interior(case: RandomSand) -> list[tuple[int, ...]]:
     nx, ny, nz = case.packing.grid.counts
     return list(itertools.product(range(1, nz + 1), range(1, ny + 1), range(1, nx + 1)))
 
@@ -126,7 +126,7 @@ def edge_of(cell: tuple[int, ...], shear: int, copy: int) -> tuple[int, ...]:
     return at(cell, (copy & 1) * step_along(alpha), (copy >> 1) * step_along(beta))
 
 
-def edge_stress(case: Case, shear: int) -> np.ndarray:
+def edge_stress(case: RandomSand, shear: int) -> np.ndarray:
     """Return the weighted sum of the copies on each edge."""
     out, now, share = np.zeros(case.index.shape), case.now, np.abs(case.field("share")[shear])
     for cell in interior(case):
@@ -136,7 +136,7 @@ def edge_stress(case: Case, shear: int) -> np.ndarray:
     return out
 
 
-def total_stress(case: Case, axis: int) -> np.ndarray:
+def total_stress(case: RandomSand, axis: int) -> np.ndarray:
     """Return sigma_aa = -x + s_aa of the cells."""
     now = case.now
     if case.dimension == 3:
@@ -144,7 +144,7 @@ def total_stress(case: Case, axis: int) -> np.ndarray:
     return np.asarray((now[1] if axis == 0 else -now[1]) - now[0])
 
 
-def velocity(case: Case) -> list[np.ndarray]:
+def velocity(case: RandomSand) -> list[np.ndarray]:
     """Return u = u* + div(sigma) / m by face.
 
     sigma_aa acts across the face, and the shears on the edges around it.
@@ -263,7 +263,7 @@ def growth(radius: float, gain: float, half: float, soft: float) -> Growth:
 
 
 def cell_move(
-    case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bool = False
+    case: RandomSand, u: list[np.ndarray], cell: tuple[int, ...], *, box: bool = False
 ) -> tuple[float, float]:
     """Return the squared natural residual of pressure and friction of a cell."""
     dimension, now, p = case.dimension, case.now, case.packing
@@ -334,7 +334,12 @@ def cell_move(
 
 
 def wall_move(
-    case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int, side: int, friction: float
+    case: RandomSand,
+    u: list[np.ndarray],
+    cell: tuple[int, ...],
+    axis: int,
+    side: int,
+    friction: float,
 ) -> float:
     """Return the squared natural residual of friction on a face of a solid.
 

@@ -13,10 +13,10 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import SandWalls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_device_iteration import StressDeviceIteration
 from warp_lcp.granular.stress_methods import HeavyBallProjectedGradient, MomentumWorkspace
+from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -26,7 +26,7 @@ emulated = pytest.mark.skipif(
 )
 
 
-class Twin:
+class RepeatedSolves:
     """Problem of random sand, and repeated solves from the same stresses.
 
     Args:
@@ -151,7 +151,7 @@ def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch
     The same stresses, momenta, records and ends, bit for bit, of solves one after another.
     """
     rng = np.random.default_rng(7300 + seed)
-    twin, method = Twin(rng), drawn_method(rng)
+    twin, method = RepeatedSolves(rng), drawn_method(rng)
     host, device = workspaces(twin.stress, method, monkeypatch)
     for _ in range(6):
         stopping = drawn_criteria(rng)
@@ -167,7 +167,7 @@ def test_non_finite_values_end_host_and_device_solves_alike(
     wrong: float, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(7400)
-    twin, method = Twin(rng), HeavyBallProjectedGradient()
+    twin, method = RepeatedSolves(rng), HeavyBallProjectedGradient()
     host, device = workspaces(twin.stress, method, monkeypatch)
     at = np.flatnonzero(twin.packing.flags.numpy())[0]
     if where == "stress":
@@ -189,7 +189,7 @@ def test_a_deadline_and_a_callback_leave_each_step_to_the_host(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(7500)
-    twin, method = Twin(rng), HeavyBallProjectedGradient(least=0, cold=0)
+    twin, method = RepeatedSolves(rng), HeavyBallProjectedGradient(least=0, cold=0)
     host, device = workspaces(twin.stress, method, monkeypatch)
     stopping = wl.StoppingCriteria(rtol=0.0, atol=1e-12, max_iterations=10**6, max_seconds=1e-3)
     result = twin.solve(device, method, stopping=stopping)
@@ -213,7 +213,7 @@ def test_a_deadline_and_a_callback_leave_each_step_to_the_host(
 
 def test_walls_that_change_have_loops_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(7600)
-    twin, method = Twin(rng), HeavyBallProjectedGradient(least=20, cold=20)
+    twin, method = RepeatedSolves(rng), HeavyBallProjectedGradient(least=20, cold=20)
     host, device = workspaces(twin.stress, method, monkeypatch)
     index = np.zeros(twin.grid.shape, dtype=np.int32)
     index[1:-1, 1:-1, 1:-1] = -1
@@ -229,7 +229,7 @@ def test_a_solve_is_read_once() -> None:
     from benchmarks.emulated_cuda import meter
 
     rng = np.random.default_rng(7700)
-    twin, method = Twin(rng), HeavyBallProjectedGradient()
+    twin, method = RepeatedSolves(rng), HeavyBallProjectedGradient()
     work, counts = method.init(twin.stress), []
     stopping = wl.StoppingCriteria(rtol=0.0, atol=1e-2 * SCALE, max_iterations=800)
     for _ in range(4):

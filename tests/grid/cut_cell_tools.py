@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.motion import Rotation, Translation
-from warp_lcp.grid.solids import Box, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 
@@ -27,7 +27,7 @@ DIRECTIONS = {
 
 
 @dataclass(frozen=True)
-class Function:
+class FunctionSolid:
     """Solid whose distance is any function of points, shape (m, 3)."""
 
     value: Any
@@ -40,7 +40,7 @@ class Function:
 
     def moved(self, pose):
         inverse = pose.inverse()
-        return Function(lambda points: self.value(inverse.apply(points)))
+        return FunctionSolid(lambda points: self.value(inverse.apply(points)))
 
 
 def placed(geometry, *, separating=True, name="solid[0]", motion=None):

@@ -7,7 +7,7 @@ from cut_cell_tools import (
     DIRECTIONS,
     MOVING,
     SPACING,
-    Function,
+    FunctionSolid,
     area_of,
     clip,
     cut_cells,
@@ -22,7 +22,7 @@ from cut_cell_tools import (
 import warp_lcp as wl
 from warp_lcp.grid import node_distance, staggered
 from warp_lcp.grid.node_distance_kernels import FAR
-from warp_lcp.grid.solids import Box, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.voxelize import voxelize
 
 
@@ -140,7 +140,7 @@ def test_the_mean_decides_saddles(dimension, value):
     """
     grid = grid_of(dimension, (4, 4, 4), 1.0)
     if dimension == 2:
-        saddle = Function(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value)
+        saddle = FunctionSolid(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value)
         cut = cut_cells(grid, saddle)
         # d at the corners of cell (2, 2): 1/4 + value and -1/4 + value; an edge is open on one
         # side.
@@ -148,7 +148,7 @@ def test_the_mean_decides_saddles(dimension, value):
             cut.open[0].numpy()[1, 2, 2:4], 0.5 + 2.0 * value * np.ones(2), atol=1e-6
         )
         return
-    cut = cut_cells(grid, Function(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value))
+    cut = cut_cells(grid, FunctionSolid(lambda p: (p[:, 0] - 1.5) * (p[:, 1] - 1.5) + value))
     part = 0.5 + 2.0 * abs(value)
     expected = 1.0 - (1.0 - part) ** 2 if value > 0.0 else (1.0 - part) ** 2
     assert cut.open[2].numpy()[3, 2, 2] == pytest.approx(expected, abs=1e-6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_triangle_mesh import CUBE, CUBE_TRIANGLES, distances, icosphere
 
-from warp_lcp.grid.solids import TriangleMesh
+from warp_lcp.grid.signed_distance import TriangleMesh
 from warp_lcp.grid.triangle_mesh import ClosedSurface, builtin_mesh, close_surface, weld
 from warp_lcp.grid.voxelize import repair_notes
 from warp_lcp.rigid.mass_properties import mass_properties

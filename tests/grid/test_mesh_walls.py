@@ -9,9 +9,9 @@ from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.mesh_walls import OVERLAP
 from warp_lcp.grid.motion import Translation
 from warp_lcp.grid.particles import lattice
-from warp_lcp.grid.solids import Box, Geometry, Placement, Plane, Sphere
+from warp_lcp.grid.signed_distance import Box, Geometry, Placement, Plane, Sphere
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
+from warp_lcp.grid.surface_mesh import SurfaceMesh, SurfaceObstacles
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.boundary import CutBoundary
 
@@ -87,7 +87,7 @@ def test_a_surface_ends_at_the_true_wall(kind, dimension, seed):
         x[distance(solid, x) > 1e-3].astype(np.float32), dtype=wp.vec3, device="cpu"
     )
     mesh = SurfaceMesh(
-        grid, per_axis=2, obstacles=Obstacles(cut.base, cut.distance, False, lambda: [solid])
+        grid, per_axis=2, obstacles=SurfaceObstacles(cut.base, cut.distance, False, lambda: [solid])
     ).find(particles)
     points, corners = mesh.points.numpy().astype(np.float64), mesh.corners.numpy()
     assert_closed(corners)
@@ -146,7 +146,7 @@ def test_no_point_leaves_the_domain_where_a_solid_ends_at_its_corner():
         x[distance(solid, x) > 1e-3].astype(np.float32), dtype=wp.vec3, device="cpu"
     )
     mesh = SurfaceMesh(
-        grid, per_axis=2, obstacles=Obstacles(cut.base, cut.distance, False, lambda: [solid])
+        grid, per_axis=2, obstacles=SurfaceObstacles(cut.base, cut.distance, False, lambda: [solid])
     ).find(particles)
     points = mesh.points.numpy()
     assert points.min() >= 0.0

@@ -23,7 +23,7 @@ from warp_lcp.grid.motion import (
     Translation,
     kinks,
 )
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
 RNG = np.random.default_rng(3917)

@@ -6,7 +6,7 @@ from cut_cell_tools import MOVING, cut_cells, fields_of, grid_of, placed
 
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.motion import Rotation, Translation
-from warp_lcp.grid.solids import Box, Plane, Sphere
+from warp_lcp.grid.signed_distance import Box, Plane, Sphere
 
 
 def open_volume(grid, normal, offset, cell):

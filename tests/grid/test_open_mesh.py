@@ -75,7 +75,7 @@ def test_faces_beside_a_fold_keep_their_distance():
 
 
 def test_a_wall_has_the_thickness_of_the_scene_whatever_its_scale(tmp_path):
-    from warp_lcp.grid.solids import Placement, TriangleMesh
+    from warp_lcp.grid.signed_distance import Placement, TriangleMesh
 
     vertices, triangles = patch(lambda x, _y: 0.0 * x)
     lines = [f"v {x} {y} {z}" for x, y, z in vertices]

@@ -7,7 +7,15 @@ from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, ShapeTable, nodes_near
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh, Union
+from warp_lcp.grid.signed_distance import (
+    Box,
+    Capsule,
+    Placement,
+    Plane,
+    Sphere,
+    TriangleMesh,
+    Union,
+)
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
 

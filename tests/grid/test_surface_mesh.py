@@ -14,9 +14,9 @@ from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.particles import Particles, lattice
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import (
-    Interior,
-    Obstacles,
+    FilledInterior,
     SurfaceMesh,
+    SurfaceObstacles,
     faces_from_particles,
     sample,
 )
@@ -163,7 +163,7 @@ def test_a_pool_ends_at_a_solid_that_cuts_cells(moves):
     x = fill(DEEP, lambda p: (p[:, 1] < 14.0) & (cylinder(p) > 0.0))
     far = wp.full(DEEP.shape, 10.0, dtype=wp.float32, device="cpu")
     distance = far if moves else node_distances(DEEP, cylinder)
-    obstacles = Obstacles(wp.array(base_of(DEEP), device="cpu"), distance, moves)
+    obstacles = SurfaceObstacles(wp.array(base_of(DEEP), device="cpu"), distance, moves)
     mesher = SurfaceMesh(DEEP, per_axis=2, obstacles=obstacles)
     if moves:
         mesher.find(on_device(x))
@@ -187,7 +187,7 @@ def test_a_pool_ends_at_whole_solid_cells():
     base[1, 1:11, 9:17] = SOLID  # cells (8..15, 0..9)
     x = fill(FLAT, lambda p: (p[:, 1] < 20.0) & ~((p[:, 0] >= 8) & (p[:, 0] < 16) & (p[:, 1] < 10)))
     points, corners = surface_of(
-        FLAT, x, obstacles=Obstacles(wp.array(base, device="cpu"), None, False)
+        FLAT, x, obstacles=SurfaceObstacles(wp.array(base, device="cpu"), None, False)
     )
     assert enclosed(points, corners) == pytest.approx(32.0 * 20.0 - 80.0, rel=0.003)
     beside = points[
@@ -200,7 +200,7 @@ def test_a_solid_in_air_changes_nothing():
     x = fill(FLAT, lambda p: p[:, 1] < 8.0)
     high = node_distances(FLAT, lambda p: np.hypot(p[..., 0] - 16.0, p[..., 1] - 25.0) - 4.0)
     with_it = surface_of(
-        FLAT, x, obstacles=Obstacles(wp.array(base_of(FLAT), device="cpu"), high, False)
+        FLAT, x, obstacles=SurfaceObstacles(wp.array(base_of(FLAT), device="cpu"), high, False)
     )
     without = surface_of(FLAT, x)
     assert with_it[0] == pytest.approx(without[0], abs=2e-4)
@@ -214,7 +214,9 @@ def test_an_interior_without_particles_is_full():
     whole = fill(DEEP, lambda p: deep(p) > 0.0)
     band = fill(DEEP, lambda p: (deep(p) > 0.0) & (deep(p) < 4.0))
     depth = wp.array((14.5 - np.indices(DEEP.shape)[1]).clip(0.0).astype(np.float32), device="cpu")
-    found = surface_of(DEEP, band, Interior(depth, 2.0, wp.array(base_of(DEEP), device="cpu")))
+    found = surface_of(
+        DEEP, band, FilledInterior(depth, 2.0, wp.array(base_of(DEEP), device="cpu"))
+    )
     expected = surface_of(DEEP, whole)
     assert enclosed(*found) == pytest.approx(enclosed(*expected), rel=1e-3)
     assert pieces(*found) == 1

@@ -8,7 +8,15 @@ import warp as wp
 from scipy.spatial.transform import Rotation as Rotation3
 
 from warp_lcp.grid.motion import Rotation, Sinusoid
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh, Union
+from warp_lcp.grid.signed_distance import (
+    Box,
+    Capsule,
+    Placement,
+    Plane,
+    Sphere,
+    TriangleMesh,
+    Union,
+)
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.thin_walls import ThinWalls, fills_cells, is_thin
 from warp_lcp.grid.triangle_mesh import close_surface

@@ -23,7 +23,7 @@ GRIDS = {"2d": StaggeredGrid((9, 7, 1), 0.125, 2), "3d": StaggeredGrid((8, 7, 6)
 
 
 @dataclass
-class Cloud:
+class TransferCloud:
     """Particles away from the walls, and the target fields of their transfers."""
 
     grid: StaggeredGrid
@@ -46,7 +46,7 @@ class Cloud:
 
 def cloud(
     grid: StaggeredGrid, real: str, *, affine: bool, n: int = 300, random_seed: int = 4711
-) -> Cloud:
+) -> TransferCloud:
     scalar, vector, numpy_type, _ = REALS[real]
     rng = np.random.default_rng(random_seed)
     size = np.array(grid.counts) * grid.spacing
@@ -59,7 +59,7 @@ def cloud(
         return wp.array(values.astype(numpy_type), dtype=vector, device="cpu")
 
     gradients = [vectors(rng.normal(size=(n, 3))) for _ in range(grid.dimension)] if affine else []
-    return Cloud(
+    return TransferCloud(
         grid,
         vectors(position),
         vectors(rng.normal(size=(n, 3)) + 0.4),
@@ -80,11 +80,11 @@ def node_points(grid: StaggeredGrid, axis: int) -> np.ndarray:
     return points
 
 
-def momentum(c: Cloud) -> np.ndarray:
+def momentum(c: TransferCloud) -> np.ndarray:
     return c.velocity.numpy().astype(np.float64).sum(axis=0)
 
 
-def angular_momentum(c: Cloud) -> np.ndarray:
+def angular_momentum(c: TransferCloud) -> np.ndarray:
     """Return the angular momentum: a sum over particles and components.
 
     The affine part contributes f (1 - f) dx^2 along each axis.
@@ -103,7 +103,7 @@ def angular_momentum(c: Cloud) -> np.ndarray:
     return total
 
 
-def grid_momenta(c: Cloud) -> tuple[np.ndarray, np.ndarray]:
+def grid_momenta(c: TransferCloud) -> tuple[np.ndarray, np.ndarray]:
     linear, angular = np.zeros(3), np.zeros(3)
     for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
         p = field.numpy().astype(np.float64) * weight.numpy().astype(np.float64)

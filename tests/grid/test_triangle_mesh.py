@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 from grid_fields import distances
-from warp_lcp.grid.solids import Placement, TriangleMesh
+from warp_lcp.grid.signed_distance import Placement, TriangleMesh
 from warp_lcp.grid.triangle_mesh import (
     ClosedSurface,
     builtin_mesh,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from warp_lcp.grid import node_distance
 from warp_lcp.grid import voxelize as voxelize_module
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize

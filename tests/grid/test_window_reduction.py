@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.fluids.pressure import COUNT
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.material.density_correction import CROWD
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
@@ -23,9 +23,9 @@ def test_windows_are_added_up(counts: tuple[int, int, int]) -> None:
     fields = {"base": base, "density": density, "capacity": capacity}
     arrays = {name: wp.array(field, device=grid.device) for name, field in fields.items()}
     crowd, all, count = (
-        WindowTally(CROWD, grid),
-        WindowTally(CROWD, grid, grid.domain),
-        WindowTally(COUNT, grid),
+        WindowReduction(CROWD, grid),
+        WindowReduction(CROWD, grid, grid.domain),
+        WindowReduction(COUNT, grid),
     )
     for _ in range(6):
         corners = np.sort(rng.integers(1, np.array(counts) + 1, (2, 3)), axis=0)

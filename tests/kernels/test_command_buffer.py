@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.deadline import Deadline, TimeIsUp
+from warp_lcp.deadline import Deadline, DeadlineReached
 from warp_lcp.kernels import thread_pool as team
 from warp_lcp.kernels.launch_graph import CommandBuffer, Conditional, loops_on_device, perform
 from warp_lcp.kernels.vectors import ADD, Reduction, rows_of
@@ -13,7 +13,7 @@ from warp_lcp.kernels.vectors import ADD, Reduction, rows_of
 DEVICE = wp.get_device("cpu")
 
 
-class Others:
+class ThreefoldRanks:
     """Communicator whose other ranks have three times this rank's values."""
 
     def sum(self, values):
@@ -39,7 +39,7 @@ def test_a_task_runs_between_the_launches_around_it_each_time():
 def test_sums_are_of_all_parts():
     a = wp.array([1.0, 2.0, 3.0], dtype=wp.float64, device=DEVICE)
     scalars = wp.full(3, 7.0, dtype=wp.float64, device=DEVICE)
-    Reduction(3, DEVICE, scalars, comm=Others()).dot(a, a, 1)
+    Reduction(3, DEVICE, scalars, comm=ThreefoldRanks()).dot(a, a, 1)
     assert scalars.numpy().tolist() == [7.0, 56.0, 7.0]
 
 
@@ -125,7 +125,7 @@ def test_a_loop_ends_with_the_deadline(threads):
     left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
     program, a, _ = counting(left, odd)
     left.fill_(2_000_000_000)
-    with Deadline(0.05), pytest.raises(TimeIsUp):
+    with Deadline(0.05), pytest.raises(DeadlineReached):
         program.run_while(left)
     done = a.numpy()[0]
     assert 0 < done < 1e9

@@ -12,9 +12,9 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, cell_kernel, list_kernel
 from warp_lcp.grid.staggered import CLEAR, Window, _RangeMemory
 from warp_lcp.kernels import Rows
-from warp_lcp.kernels.device_graph import DeviceGraph, NotRecordable
+from warp_lcp.kernels.device_graph import DeviceGraph, NotRecordableError
 from warp_lcp.kernels.launch_graph import DeviceCopy
-from warp_lcp.kernels.memory import DeviceRows, Scalar, Slot
+from warp_lcp.kernels.recorded_arguments import DeviceRows, Scalar, Slot
 
 DEVICE = wp.get_device("cpu")
 SHAPE = (4, 6, 9)
@@ -127,7 +127,7 @@ def test_a_list_may_be_replaced_and_grow():
 def test_unsupported_launches_are_refused_in_a_graph():
     program, array = DeviceGraph(DEVICE), wp.zeros(3, dtype=wp.float32, device=DEVICE)
     Slot().point_to(array)
-    with pytest.raises(NotRecordable, match="replaced"):
+    with pytest.raises(NotRecordableError, match="replaced"):
         program.record(DeviceCopy(array, None))
-    with pytest.raises(NotRecordable, match="host"):
+    with pytest.raises(NotRecordableError, match="host"):
         program.record(lambda: None)

@@ -19,8 +19,8 @@ from warp_lcp.kernels import joined_graphs as module
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.joined_graphs import joined
 from warp_lcp.kernels.launch_graph import LaunchGraph, launch
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 emulated = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
@@ -45,7 +45,7 @@ def add_kernel(x: wp.array(dtype=wp.float64), more: wp.array(dtype=wp.float64)):
     x[i] += more[i]
 
 
-class Chain:
+class StretchChain:
     """Stretches x = factor x + shift on the device, with the same on the host.
 
     Args:
@@ -72,9 +72,9 @@ class Chain:
 
 
 @pytest.fixture
-def chain(monkeypatch: pytest.MonkeyPatch) -> Iterator[Chain]:
+def chain(monkeypatch: pytest.MonkeyPatch) -> Iterator[StretchChain]:
     monkeypatch.setattr(LaunchGraph, "on_device", True)
-    made = Chain([2.0, -3.0, 0.5, 1.5])
+    made = StretchChain([2.0, -3.0, 0.5, 1.5])
     for i in range(4):  # the first run loads kernels
         made.take(i, 1.0)
     assert made.reading.numpy().tolist() == made.expected.tolist()
@@ -95,7 +95,7 @@ def calls_of(step: Callable[[], None]) -> int:
 
 
 @emulated
-def test_arrays_of_the_host_are_sent_in_order(chain: Chain) -> None:
+def test_arrays_of_the_host_are_sent_in_order(chain: StretchChain) -> None:
     """Host arrays, sent in order.
 
     A stretch reads what was sent last before it, also where the same array is sent several times in
@@ -138,7 +138,7 @@ def test_arrays_of_the_host_are_sent_in_order(chain: Chain) -> None:
 
 
 @emulated
-def test_stretches_between_readbacks_are_two_launches(chain: Chain) -> None:
+def test_stretches_between_readbacks_are_two_launches(chain: StretchChain) -> None:
     def step() -> None:
         with joined(DEVICE):
             for i in (0, 1, 2, 3):
@@ -155,7 +155,7 @@ def test_stretches_between_readbacks_are_two_launches(chain: Chain) -> None:
 
 
 @emulated
-def test_a_stretch_that_comes_again_reads_its_numbers_of_each_run(chain: Chain) -> None:
+def test_a_stretch_that_comes_again_reads_its_numbers_of_each_run(chain: StretchChain) -> None:
     def step() -> None:
         with joined(DEVICE):
             for shift in (1.0, 2.0, 4.0):
@@ -169,7 +169,7 @@ def test_a_stretch_that_comes_again_reads_its_numbers_of_each_run(chain: Chain) 
 
 @emulated
 @pytest.mark.parametrize("seed", range(8))
-def test_calls_of_warp_between_stretches_keep_their_places(chain: Chain, seed: int) -> None:
+def test_calls_of_warp_between_stretches_keep_their_places(chain: StretchChain, seed: int) -> None:
     rng = np.random.default_rng(700 + seed)
     other = wp.zeros(3, dtype=wp.float64, device=DEVICE)
     recorded = wp.launch(affine_kernel, 3, [chain.x, 0.25, 3.0], device=DEVICE, record_cmd=True)
@@ -216,7 +216,7 @@ def test_calls_of_warp_between_stretches_keep_their_places(chain: Chain, seed: i
 
 
 @emulated
-def test_an_error_leaves_nothing_that_waits(chain: Chain) -> None:
+def test_an_error_leaves_nothing_that_waits(chain: StretchChain) -> None:
     for _ in range(3):
         with pytest.raises(RuntimeError, match="within"), joined(DEVICE):
             chain.take(0, 1.0)
@@ -230,7 +230,7 @@ def test_an_error_leaves_nothing_that_waits(chain: Chain) -> None:
 def test_graphs_go_with_their_stretches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LaunchGraph, "on_device", True)
     module._sequences.clear()
-    chain: Any = Chain([2.0, 3.0, 4.0])
+    chain: Any = StretchChain([2.0, 3.0, 4.0])
     for _ in range(4):
         with joined(DEVICE):
             for i in range(3):

@@ -15,7 +15,7 @@ from warp_lcp.fluids.pressure import COUNT
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels.launch_graph import (
     CommandBuffer,
     LaunchGraph,
@@ -24,7 +24,7 @@ from warp_lcp.kernels.launch_graph import (
     is_recording,
     recording,
 )
-from warp_lcp.kernels.memory import Scalar, scaled
+from warp_lcp.kernels.recorded_arguments import Scalar, scaled
 from warp_lcp.material.density_correction import CROWD
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
@@ -83,7 +83,7 @@ def test_a_recorded_window_is_that_of_the_run(threads, sparse):
     weight = wp.array(rng.uniform(0.0, 1.0, GRID.shape).astype(np.float32))
     kind = wp.array(rng.choice(np.array([AIR, FLUID, SOLID], dtype=np.int8), GRID.shape))
     field, other, change, active = GRID.field(), GRID.field(), Scalar(), ActiveWindow(GRID.domain)
-    recorded, direct = WindowTally(COUNT, GRID), WindowTally(COUNT, GRID)
+    recorded, direct = WindowReduction(COUNT, GRID), WindowReduction(COUNT, GRID)
 
     def launch() -> None:
         active.clear(field)
@@ -275,7 +275,7 @@ def test_rows_are_added_up_pairwise(counts):
         for name in ("density", "capacity")
     }
     fields = {name: wp.array(values) for name, values in host.items()}
-    tally, all_cells = WindowTally(CROWD, grid), WindowTally(CROWD, grid, grid.domain)
+    tally, all_cells = WindowReduction(CROWD, grid), WindowReduction(CROWD, grid, grid.domain)
     for _ in range(4):
         corners = np.sort(rng.integers(1, np.array(counts) + 1, (2, 3)), axis=0)
         box = grid.window(corners[0], corners[1])

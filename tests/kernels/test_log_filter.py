@@ -25,7 +25,7 @@ BANNER = 'Warp 1.19.0 initialized:\n   Devices:\n     "cpu" : "x86_64"'
 MODULE = "Module {} 0f1e2d3 load on device '{}' took 12.34 ms  ({})"
 
 
-class Said:
+class MessageLog:
     """Logger that stores messages."""
 
     def __init__(self) -> None:
@@ -37,8 +37,8 @@ class Said:
     debug = info = warning = error = say
 
 
-def messages() -> tuple[KernelMessages, Said, io.StringIO]:
-    said, stream = Said(), io.StringIO()
+def messages() -> tuple[KernelMessages, MessageLog, io.StringIO]:
+    said, stream = MessageLog(), io.StringIO()
     return KernelMessages(said, stream), said, stream
 
 
@@ -119,7 +119,7 @@ def test_at_debug_level_all_messages_pass() -> None:
 
 
 def test_a_logger_that_a_program_has_set_stays() -> None:
-    mine = Said()
+    mine = MessageLog()
     with wp.ScopedLogger(mine):
         install_log_filter()
         assert wp.get_logger() is mine

@@ -69,7 +69,7 @@ def test_elements_lie_side_by_side_on_the_rows_device(double):
 
 
 @dataclass(frozen=True, slots=True)
-class Fields:
+class ManyFields:
     """More fields than a kernel takes: arrays of any length."""
 
     x: Any
@@ -78,7 +78,7 @@ class Fields:
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class SingleField:
     """Single field."""
 
     y: Any
@@ -86,24 +86,24 @@ class Target:
 
 def test_a_kernel_takes_the_members_of_structs_that_it_declares(double):
     x, y, z, rows = array(np.arange(10.0)), zeros(10), zeros(10), Rows.flat(10, CPU)
-    double.bind(rows, Fields(x, y)).launch()
+    double.bind(rows, ManyFields(x, y)).launch()
     np.testing.assert_array_equal(y.numpy(), 2 * np.arange(10))
-    double.bind(rows, Fields(x, y), y=z, x=y).launch()  # keywords override members
+    double.bind(rows, ManyFields(x, y), y=z, x=y).launch()  # keywords override members
     np.testing.assert_array_equal(z.numpy(), 4 * np.arange(10))
-    double.bind(rows, Target(z), x=x).launch()
+    double.bind(rows, SingleField(z), x=x).launch()
     np.testing.assert_array_equal(z.numpy(), y.numpy())
     with pytest.raises(TypeError, match=r"misuse\.double: missing \['x'\] in Target, unknown \[\]"):
-        double.bind(rows, Target(z))
+        double.bind(rows, SingleField(z))
     with pytest.raises(TypeError, match=r"misuse\.double: missing \[\], unknown \['other'\]"):
-        double.bind(rows, Fields(x, y), other=0)
+        double.bind(rows, ManyFields(x, y), other=0)
     with pytest.raises(
         TypeError, match=r"misuse\.double: Fields, Target: two of them have \['y'\]"
     ):
-        double.bind(rows, Fields(x, y), Target(z))
+        double.bind(rows, ManyFields(x, y), SingleField(z))
     with pytest.raises(TypeError, match=r"misuse\.double: dict is not a dataclass"):
         double.bind(rows, {"x": x, "y": y})
     with pytest.raises(ValueError, match=r"misuse\.double: y has 9 elements, not 10"):
-        double.bind(rows, Fields(x, zeros(9)))
+        double.bind(rows, ManyFields(x, zeros(9)))
 
 
 @pytest.mark.parametrize(

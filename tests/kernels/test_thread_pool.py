@@ -363,7 +363,7 @@ def test_threads_have_no_data_races(control, tmp_path):
 
 
 @wp.struct
-class Mixed:
+class MixedStruct:
     """Struct of several sizes, with a gap between members."""
 
     flag: wp.bool
@@ -373,7 +373,7 @@ class Mixed:
 
 
 @wp.struct
-class Small:
+class SmallStruct:
     """Struct of four-byte members, aligned accordingly."""
 
     count: int
@@ -386,13 +386,13 @@ def packing_kernel(
     flag: wp.bool,
     a: wp.array(dtype=wp.float32),
     n: int,
-    small: Small,
+    small: SmallStruct,
     b: wp.array3d(dtype=wp.uint8),
     x: wp.float64,
     place: wp.vec3i,
     y: float,
     many: wp.int64,
-    m: Mixed,
+    m: MixedStruct,
     point: wp.vec2d,
     turn: wp.mat22,
     c: wp.array2d(dtype=wp.vec2i),
@@ -407,7 +407,7 @@ def drawn_arguments(rng):
 
     They are arrays, some of them strided or empty, vectors, a struct, and numbers.
     """
-    m, small, sizes = Mixed(), Small(), rng.integers(0, 6, 7)
+    m, small, sizes = MixedStruct(), SmallStruct(), rng.integers(0, 6, 7)
     small.count, small.weight, small.place = (
         int(rng.integers(9)),
         rng.standard_normal(),
@@ -458,7 +458,7 @@ def test_arguments_are_packed_as_warp_packs_them():
     others = {
         1: inputs[4],
         2: 1 << 31,
-        3: Mixed(),
+        3: MixedStruct(),
         4: inputs[1],
         6: (1, 2, 3),
         9: wp.vec3i(),

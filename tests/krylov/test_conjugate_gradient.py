@@ -25,12 +25,12 @@ from warp_lcp.krylov.conjugate_gradient import (
     end_kernel,
 )
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.reduced.active_set_kernels import DIVIDE
+from warp_lcp.subproblems.active_set_kernels import DIVIDE
 
 SHAPE = (5, 6, 7)
 
 
-class Jacobi:
+class JacobiPreconditioner:
     """Preconditioner z = r / d, as a program or launch by launch."""
 
     def __init__(self, A, recorded):
@@ -83,7 +83,7 @@ def krylov(request, cells, device, monkeypatch):
         monkeypatch.setattr(team.STATE, "team", None)
         monkeypatch.setattr(team, "_entry", lambda: None)
     A = GridPoisson(cells, device=device, dtype=wp.float64)
-    preconditioner = Jacobi(A, recorded=request.param != "launches")
+    preconditioner = JacobiPreconditioner(A, recorded=request.param != "launches")
     krylov = ConjugateGradient(A.stencil.product, preconditioner)
     if request.param == "device loop":
         set_right_side(preconditioner, np.ones(SHAPE) * (cells == wl.FLUID))
@@ -170,7 +170,7 @@ def test_a_device_loop_is_captured_once(cells, device, monkeypatch):
     monkeypatch.setattr(team.STATE, "team", None)
     monkeypatch.setattr(team, "_entry", lambda: None)
     A = GridPoisson(cells, device=device, dtype=wp.float64)
-    preconditioner = Jacobi(A, recorded=True)
+    preconditioner = JacobiPreconditioner(A, recorded=True)
     krylov = ConjugateGradient(A.stencil.product, preconditioner)
     for _ in range(3):
         set_right_side(preconditioner, 1.0 * (cells == wl.FLUID))

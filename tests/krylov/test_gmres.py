@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.krylov import GMRES
 
 
-class Scaling:
+class ScalingPreconditioner:
     """Preconditioner z = s r, on the host."""
 
     def __init__(self, s, real, device):
@@ -36,7 +36,7 @@ def convection_diffusion(m, peclet):
 def make(matrix, device, real=wp.float64, scale=None, **options):
     n = matrix.shape[0]
     A = wl.SparseOperator(matrix, device=device)
-    M = Scaling(np.ones(n) if scale is None else scale, real, device)
+    M = ScalingPreconditioner(np.ones(n) if scale is None else scale, real, device)
     return GMRES(A.product, M, **options), M
 
 

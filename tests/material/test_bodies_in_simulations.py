@@ -11,7 +11,7 @@ import pytest
 
 from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidScene
-from warp_lcp.frames.frames import write_vtu
+from warp_lcp.frames.frame_folder import write_vtu
 from warp_lcp.granular import SIMULATOR as GRANULAR
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.rigid.bodies import RigidBodies

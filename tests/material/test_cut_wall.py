@@ -34,7 +34,7 @@ def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
     return points(grid, [0.0 if d == axis else 0.5 for d in range(3)])
 
 
-class Slope:
+class SlopedWall:
     """Liquid or air over a plane.
 
     By default every open face has been projected to one velocity.
@@ -198,7 +198,7 @@ SLOPES = [
 IDS = ["30 degrees", "flat", "ceiling", "along diagonals", "3d"]
 
 
-def expected(slope: Slope, velocity: tuple[float, ...], removes: bool) -> np.ndarray:
+def expected(slope: SlopedWall, velocity: tuple[float, ...], removes: bool) -> np.ndarray:
     u = np.array([*velocity, 0.0][:3])
     return u - (u @ slope.normal) * slope.normal * removes
 
@@ -230,7 +230,7 @@ def test_closed_faces_along_a_slope(
     Tangential flow stays whole. Outflow is held back only where the wall holds; inflow is stopped
     everywhere.
     """
-    slope = Slope(grid, normal, kind, contact)
+    slope = SlopedWall(grid, normal, kind, contact)
     slope.separating[1] = separating
     tangent = np.array([slope.normal[1], -slope.normal[0], 0.0])
     velocity = tuple(0.8 * tangent + 0.3 * towards * slope.normal)[: grid.dimension]
@@ -249,7 +249,7 @@ def test_closed_faces_take_the_normal_velocity_of_a_wall_that_moves(towards: flo
 
     Held liquid follows a wall in both directions, and has nothing of its tangential velocity.
     """
-    slope = Slope(*SLOPES[-1])
+    slope = SlopedWall(*SLOPES[-1])
     wall = np.array([0.4, -0.2, 0.7]) + 2.0 * towards * slope.normal
     slope.move(wall)
     velocity = np.array([0.3, 0.5, -0.6])
@@ -260,7 +260,7 @@ def test_closed_faces_take_the_normal_velocity_of_a_wall_that_moves(towards: flo
 
 def test_released_liquid_is_pushed_by_a_wall_that_overtakes_it() -> None:
     for speed, holds in ((0.2, True), (-0.2, False)):
-        slope = Slope(*SLOPES[0], contact=RELEASED)
+        slope = SlopedWall(*SLOPES[0], contact=RELEASED)
         wall = 0.5 * slope.normal
         slope.move(wall)
         velocity = (0.5 - speed) * slope.normal + np.array([slope.normal[1], -slope.normal[0], 0.0])
@@ -276,7 +276,7 @@ def test_separation_at_a_sliver_depends_on_the_sliver_itself(contact: int, speed
     The wall cell under a ceiling is open for a fifth, and the cell below it touches no wall:
     nothing may hang from that one.
     """
-    slope = Slope(FLAT, (0.0, -1.0, 0.0), contact=contact, shift=-0.2)
+    slope = SlopedWall(FLAT, (0.0, -1.0, 0.0), contact=contact, shift=-0.2)
     row = FLAT.counts[1] // 2 + 1  # of the wall cells
     assert slope.open[0][1, row, 9] == pytest.approx(0.2, abs=0.02)
     assert slope.contact[1, row, 9] == contact
@@ -364,7 +364,7 @@ def test_a_box_is_treated_as_one_of_whole_cells(
 
 
 def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
-    slope = Slope(FLAT, (0.0, 1.0, 0.0), kind=AIR)
+    slope = SlopedWall(FLAT, (0.0, 1.0, 0.0), kind=AIR)
     cut, marks = slope.cut(), FLAT.faces(wp.int8)
     fields, weights = FLAT.faces(), FLAT.faces()
     floor = int(slope.at[1]) + 1  # row of the plane's closed faces
@@ -393,7 +393,7 @@ def test_liquid_at_rest_at_a_cut_wall_does_not_follow_liquid_that_leaves(
     Liquid leaves the plane at 3 m/s; material on closed faces leaves it at 0.06 m/s, and none of
     them lies in another cell.
     """
-    slope = Slope(grid, normal, contact=contact)
+    slope = SlopedWall(grid, normal, contact=contact)
     away = slope.normal[: grid.dimension]
     weights = [np.where(fraction == 0, 1.0, 0.0) for fraction in slope.open]
     fields = slope.extend(tuple(3.0 * away), closed=tuple(0.06 * away), weights=weights)
@@ -409,7 +409,7 @@ def test_liquid_at_rest_at_a_cut_wall_does_not_follow_liquid_that_leaves(
 
 
 def test_deep_faces_are_left_alone() -> None:
-    slope = Slope(FLAT, (0.0, 1.0, 0.0))
+    slope = SlopedWall(FLAT, (0.0, 1.0, 0.0))
     fields = slope.extend((0.4, -0.5), layers=6)
     floor = int(slope.at[1]) + 1
     assert fields[1][1, floor, 5:-5] == pytest.approx(0.0, abs=1e-6)

@@ -15,7 +15,7 @@ import warp_lcp as wl
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.particle_assembly import (
-    Parts,
+    GridComponents,
     make_boundary,
     make_outlets,
     make_particles,
@@ -25,7 +25,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.shapes import BoxTable, MaterialProperties
-from warp_lcp.simulation import Profiled, Recorded, Resampled, SimulationFailed
+from warp_lcp.simulation import HasRecordedProblems, HasResampling, HasStages, SimulationFailed
 
 GRAVITY = 9.81
 BLOCK = {"shape": "box", "min": [0.25, 0.5], "max": [0.75, 0.75], "velocity": [0.5, 0.0]}
@@ -100,7 +100,7 @@ def make(resolution: int = 16, **tables: Any) -> Dust:
     return Dust(
         scene,
         grid=grid,
-        parts=Parts(boundary, sources),
+        parts=GridComponents(boundary, sources),
         particles=particles,
         outlets=outlets,
         notes=notes,
@@ -137,9 +137,11 @@ def test_material_falls_freely() -> None:
 
 def test_the_simulation_implements_the_driver_protocol() -> None:
     simulation = make()
-    assert isinstance(simulation, Profiled)
-    assert isinstance(simulation, Resampled)
-    assert not isinstance(simulation, Recorded)  # it solves nothing that could be recorded
+    assert isinstance(simulation, HasStages)
+    assert isinstance(simulation, HasResampling)
+    assert not isinstance(
+        simulation, HasRecordedProblems
+    )  # it solves nothing that could be recorded
     assert simulation.points().fields["speed"] == pytest.approx(np.full(128, 0.5))
     assert simulation.notes() == ["128 particles, 16 x 16 cells of 0.0625 m"]
 

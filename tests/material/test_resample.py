@@ -16,7 +16,7 @@ from small_liquids import advance, box, create, scene
 from small_runs import run_into
 from warp_lcp.material.resample import resampled
 from warp_lcp.run.folder import OutputError
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 
 BALL = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.15}
@@ -128,7 +128,7 @@ SHORT = ["domain.resolution=24", "time.duration=0.3", "output.checkpoint_every=5
 def go(out: Path, *overrides: str, resume: bool = False, steps: int = 10**6) -> Any:
     left = iter(range(steps, -1, -1))
     scene = load_scene("dam-break-2d", [*SHORT, *overrides])
-    observer = Lines(Console(quiet=True))
+    observer = ProgressLines(Console(quiet=True))
     return run_into(scene, out, observer=observer, resume=resume, stop=lambda: next(left) <= 1)
 
 

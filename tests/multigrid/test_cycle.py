@@ -27,7 +27,7 @@ OMEGAS = 1 / (1.25 + 0.75 * np.cos(np.pi / 4)), 1 / (1.25 - 0.75 * np.cos(np.pi 
 
 
 @dataclass
-class Plain:
+class ReferenceConvexCycle:
     """Plain cycle for the minimum of x'Ax/2 - b'x over lower <= x <= upper.
 
     On dense levels; rows without a diagonal are no unknowns.
@@ -120,14 +120,16 @@ def test_a_grids_cycle_is_the_plain_loop(shape, gamma, bounded, together, device
         target.assign(stored)
     (hierarchy.monotone_cycle if bounded else hierarchy.cycle).run()
     sides = (-gaps[0], gaps[1]) if bounded else (np.full(b.size, -np.inf), np.full(b.size, np.inf))
-    expected = Plain(matrices, prolongations, gamma).cycle(np.zeros(b.size), b, *sides)
+    expected = ReferenceConvexCycle(matrices, prolongations, gamma).cycle(
+        np.zeros(b.size), b, *sides
+    )
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(
         finest.x.numpy()[inner], expected, rtol=0, atol=1e-12 * np.abs(expected).max()
     )
 
 
-class PlainRows(Plain):
+class ReferenceRowCycle(ReferenceConvexCycle):
     """Plain cycle with sweeps over the rows' l1 norms."""
 
     def scale(self, A):
@@ -153,7 +155,7 @@ def test_an_algebraic_cycle_is_the_plain_loop(gamma, device):
     b, free = np.random.default_rng(gamma).standard_normal(n * n), np.full(n * n, np.inf)
     hierarchy.r.assign(b)
     hierarchy.apply()
-    expected = PlainRows(matrices, prolongations, gamma, 1.0, settings.weights).cycle(
+    expected = ReferenceRowCycle(matrices, prolongations, gamma, 1.0, settings.weights).cycle(
         np.zeros(n * n), b, -free, free
     )
     np.testing.assert_allclose(
@@ -167,7 +169,7 @@ def dense(matrix):
     return scipy.sparse.csr_array(tuple(parts), shape=matrix.shape).toarray()
 
 
-class PlainAggregates(Plain):
+class ReferenceAggregateCycle(ReferenceConvexCycle):
     """Plain cycle on aggregates.
 
     One forward Gauss-Seidel sweep on the way down, and one backward on the way up; the coarsest
@@ -227,12 +229,12 @@ def test_a_cycle_on_aggregates_is_the_plain_loop():
     x = 0.5 * upper
     found = wp.array(x, dtype=wp.float64, device="cpu")
     cycles.cycle(found, *(wp.array(v, dtype=wp.float64, device="cpu") for v in (b, lower, upper)))
-    plain = PlainAggregates(matrices, prolongations, 3, 1.4)
+    plain = ReferenceAggregateCycle(matrices, prolongations, 3, 1.4)
     np.testing.assert_allclose(found.numpy(), plain.cycle(x, -b, lower, upper), rtol=0, atol=1e-12)
 
 
 @dataclass
-class Named:
+class WordLevel:
     """Level whose stages are words."""
 
     name: str
@@ -266,7 +268,7 @@ def test_stages_come_in_the_order_of_the_algorithm():
 
     A level is visited from 0 first, then from the result of the last visit.
     """
-    levels = {gamma: [Named(name, gamma) for name in "abc"] for gamma in (1, 2)}
+    levels = {gamma: [WordLevel(name, gamma) for name in "abc"] for gamma in (1, 2)}
     assert list(Cycle(levels[1], levels[1][-1].solve).stages()) == V
     assert list(Cycle(levels[2], levels[2][-1].solve, projected=True).stages()) == W
 
@@ -276,7 +278,7 @@ def test_a_gathered_levels_cycle_is_that_of_the_whole():
 
     Its visits are the whole's, between one gather and one scatter.
     """
-    levels = [Named(name, 2) for name in "abc"]
+    levels = [WordLevel(name, 2) for name in "abc"]
     whole = Cycle(levels[1:], levels[-1].solve, projected=True)
     gathered = GatheredLevel(
         whole=lambda projected: whole,

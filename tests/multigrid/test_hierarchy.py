@@ -182,14 +182,14 @@ def test_conjugate_gradients_solve_the_masked_system(device):
     free = rng.random(cells.shape) < 0.7
     _, hierarchy = masked_hierarchy(cells, free, (False,) * 3, device)
 
-    class Cycle:
+    class ReferenceCycle:
         r, z = hierarchy.finest.b, hierarchy.finest.x
         program = hierarchy.cycle
 
         def apply(self):
             self.program.run()
 
-    krylov = ConjugateGradient(hierarchy.finest.stencil.product, Cycle())
+    krylov = ConjugateGradient(hierarchy.finest.stencil.product, ReferenceCycle())
     p = (free & (cells == wl.FLUID)).ravel()
     b = rng.standard_normal(cells.size) * p
     for _ in range(2):  # the second solve replays the captured iteration

@@ -96,7 +96,7 @@ def test_restricted_residuals_are_those_of_a_loop(shape, kind, fused, device):
         stages = fine.descend(coarse, projected=False, from_zero=False)
         assert ([type(stage) for stage in stages] == [Leg]) == fine.fuses  # as on all CPUs
     else:
-        stages = (fine.restricting(coarse),)
+        stages = (fine.restrict_kernel(coarse),)
     for stage in stages:
         stage.launch()
     x, b = (inner(fine, field).reshape(shape) for field in (fine.x, fine.b))
@@ -130,7 +130,7 @@ def test_coarser_levels_restrict_with_the_weights_of_each_row(symmetric, device)
     for field in (fine.x, fine.b):
         values = rng.standard_normal(counts) * (d != 0)
         field.assign(np.pad(values, 1).ravel())
-    fine.restricting(coarse).launch()
+    fine.restrict_kernel(coarse).launch()
     x, b = inner(fine, fine.x), inner(fine, fine.b)
     level_cells = np.where(d != 0, wl.FLUID, wl.AIR)
     expected = sums_by_loop(

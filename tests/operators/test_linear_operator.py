@@ -16,7 +16,7 @@ from scipy.sparse.linalg import LinearOperator as Linear
 import warp_lcp as wl
 from default_run import covering
 from oracle import boxed, lemke
-from warp_lcp.problem.protocol import families, takes
+from warp_lcp.problem.operator_protocol import families, takes
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=20_000, patience=5000)
 N = 8
@@ -41,11 +41,11 @@ def given(A, kind):
         ),
         "said": lambda: wl.LinearOperator(linear, symmetric=bool((A == A.T).all())),
         "product": lambda: wl.LinearOperator(scipy.sparse.csr_array(A)),
-        "own": lambda: Own(A),
+        "own": lambda: UserOperator(A),
     }[kind]()
 
 
-class Own(wl.Operator):
+class UserOperator(wl.Operator):
     def __init__(self, A):
         self._A, self.shape, self.device, self.symmetric = (
             A,
@@ -134,7 +134,10 @@ def test_sizes_stand_for_a_diagonal_that_is_not_given():
     n = 200
     D = scipy.sparse.diags_array(np.geomspace(1e-3, 1e3, n))
     A = D @ scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)) @ D
-    for operator in (wl.LinearOperator(aslinearoperator(A), symmetric=True), Own(A.toarray())):
+    for operator in (
+        wl.LinearOperator(aslinearoperator(A), symmetric=True),
+        UserOperator(A.toarray()),
+    ):
         ratio = operator.diagonal().numpy() / A.diagonal()
         assert ratio.min() > 0.3
         assert ratio.max() < 10.0
@@ -234,11 +237,11 @@ def test_invalid_operators_are_refused(make, message):
 
 
 def test_operators_without_a_product_cannot_be_made():
-    class Empty(wl.Operator):
+    class OperatorWithoutProduct(wl.Operator):
         shape = (3,)
 
     with pytest.raises(TypeError, match="apply"):
-        Empty()
+        OperatorWithoutProduct()
 
 
 def test_non_finite_products_are_reported():

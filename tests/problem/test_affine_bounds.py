@@ -13,7 +13,7 @@ import warp as wp
 
 import warp_lcp as wl
 from default_run import covering
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.nncg import NNCG
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi

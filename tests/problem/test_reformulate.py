@@ -7,7 +7,7 @@ import scipy.sparse
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual
-from warp_lcp.gallery import Plant, banded, definite, skewed
+from warp_lcp.gallery import PlantedSolution, banded, definite, skewed
 from warp_lcp.problem import reformulate as form
 
 TIGHT = wl.StoppingCriteria(rtol=1e-11)
@@ -212,7 +212,7 @@ def test_root_forms_vanish_at_solutions_alone(seed):
 
 
 def test_a_chain_of_forms_ends_where_it_began():
-    p = banded(12, plant=Plant(boxed=True, active=0.5), seed=9)
+    p = banded(12, plant=PlantedSolution(boxed=True, active=0.5), seed=9)
     q = p.dense()
     program = form.boxed_to_quadratic_program(q.A, q.b, q.lower, q.upper)
     box = form.quadratic_program_to_boxed(program, device="cpu")

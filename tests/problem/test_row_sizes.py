@@ -9,7 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.solvers.registry import METHODS
 

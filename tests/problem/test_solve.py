@@ -27,7 +27,7 @@ def method(request):
     return request.param
 
 
-class Ring:
+class PeriodicOperator:
     """User-defined operator: periodic second differences plus a shift, in NumPy."""
 
     symmetric = True
@@ -191,7 +191,7 @@ def test_the_workspace_s_own_iterate_may_be_the_guess(method):
 
 def test_own_operator_through_the_protocol():
     rng = np.random.default_rng(19)
-    n, A = 40, Ring(40)
+    n, A = 40, PeriodicOperator(40)
     dense = np.array(
         [A.apply(wp.array(e, dtype=wp.float64, device="cpu")).numpy() for e in np.eye(n)]
     )
@@ -222,7 +222,7 @@ def test_the_default_method_is_the_fastest_suitable():
 
 def test_methods_refuse_unsupported_problems():
     with pytest.raises(ValueError, match="ProjectedSOR needs an operator with a sweep"):
-        wl.solve(wl.LCP(Ring(5), -np.ones(5)), wl.ProjectedSOR())
+        wl.solve(wl.LCP(PeriodicOperator(5), -np.ones(5)), wl.ProjectedSOR())
     zero = wl.DenseOperator(np.array([[0.0, 1.0], [1.0, 1.0]]), device="cpu")
     with pytest.raises(ValueError, match="zero on the diagonal"):
         wl.solve(wl.LCP(zero, np.array([-1.0, 1.0])), wl.ProjectedSOR())

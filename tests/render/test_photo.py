@@ -31,15 +31,15 @@ from warp_lcp.render.photo.photo import (
 )
 from warp_lcp.render.photo.photo_scene import (
     ABSORPTION,
-    Finish,
     PhotoScenes,
+    SurfaceFinish,
     grain_colors,
     linear_color,
     liquid_absorption,
     particle_surface,
     rigid_pose,
 )
-from warp_lcp.render.recording import Recording, RenderError, Show
+from warp_lcp.render.recording import Recording, RenderError, VisiblePart
 from warp_lcp.simulation import Points, Surface
 
 ROOM = (1.0, 1.0, 1.0)
@@ -226,7 +226,7 @@ def test_water_bodies_and_solids_are_described(dots, tmp_path):
     meshes = {mesh.name: mesh for mesh in scene.meshes}
     assert set(meshes) == {"solid_0", "body_0", "liquid"}
     assert (
-        meshes["liquid"].finish is Finish.LIQUID
+        meshes["liquid"].finish is SurfaceFinish.LIQUID
         and meshes["liquid"].color[0] > meshes["liquid"].color[2] > 0.0
     )
     # Cut at the domain.
@@ -245,7 +245,7 @@ def test_water_bodies_and_solids_are_described(dots, tmp_path):
 def test_particles_become_grains(dots, tmp_path):
     folder = write_run(tmp_path / "run", [[grains()]], size=ROOM)
     (mesh,) = PhotoScenes(Recording(folder), 1.0).frame(0).meshes
-    assert mesh.finish is Finish.MATTE and len(mesh.corners) % (300 * 80) == 0
+    assert mesh.finish is SurfaceFinish.MATTE and len(mesh.corners) % (300 * 80) == 0
     np.testing.assert_allclose(mesh.velocity, [[0.0, -1.0, 0.0]] * len(mesh.points))
     assert mesh.points[:, 1].min() > -0.05
     colors = grain_colors(np.arange(4000))
@@ -337,7 +337,9 @@ def test_sand_is_rendered(dots, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Scene, "palette", "sand")
     image = shot(
-        write_run(tmp_path / "run", [[grains()]], size=ROOM), show=Show.PARTICLES, shutter=0.01
+        write_run(tmp_path / "run", [[grains()]], size=ROOM),
+        show=VisiblePart.PARTICLES,
+        shutter=0.01,
     )
     assert np.isfinite(image).all()
     sand = image[..., 0] > 1.25 * image[..., 2]

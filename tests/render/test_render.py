@@ -11,8 +11,8 @@ import warp as wp
 from command_line import invoke
 from default_run import covering
 from small_runs import ball
-from warp_lcp.extras.live import Live
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.extras.live import LiveRun
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.render.actors import shaded
 from warp_lcp.render.page import Page
 from warp_lcp.render.picture import Picture
@@ -21,11 +21,11 @@ from warp_lcp.render.recording import (
     ColorScale,
     Recording,
     RenderError,
-    Show,
+    VisiblePart,
     _round_up,
     spread,
 )
-from warp_lcp.render.render import INSTALL, Looks, expected_seconds, parse_size, render_run
+from warp_lcp.render.render import INSTALL, ImageStyle, expected_seconds, parse_size, render_run
 from warp_lcp.render.solid_meshes import Outline
 from warp_lcp.scene.camera import MARGIN, viewpoint
 from warp_lcp.scene.scene_file import dump_scene, load_scene
@@ -93,7 +93,7 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def draw(folder: Path, **looks) -> list[np.ndarray]:
-    return [pixels(path) for path in render_run(folder, looks=Looks(size=(400, 300), **looks))]
+    return [pixels(path) for path in render_run(folder, looks=ImageStyle(size=(400, 300), **looks))]
 
 
 def is_blue(image: np.ndarray) -> np.ndarray:
@@ -178,7 +178,7 @@ def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
 
 def test_the_duration_of_drawing_is_estimated_before_it_begins(pyvista, make_run):
     folder, reported = make_run([drops(5) for _ in range(4)]), []
-    looks, frames = Looks(size=(320, 240)), [0, 1, 2]
+    looks, frames = ImageStyle(size=(320, 240)), [0, 1, 2]
     drawn = render_run(
         folder,
         frames=frames,
@@ -191,7 +191,7 @@ def test_the_duration_of_drawing_is_estimated_before_it_begins(pyvista, make_run
     assert reported == [expected_seconds(Recording(folder), frames, looks), 0, 1]
     more = [
         expected_seconds(Recording(folder), frames * 2, looks),
-        expected_seconds(Recording(folder), frames, Looks(size=(640, 480))),
+        expected_seconds(Recording(folder), frames, ImageStyle(size=(640, 480))),
     ]
     assert more[0] == 2 * reported[0]
     assert more[1] > reported[0] > 0.0
@@ -202,7 +202,7 @@ def test_the_duration_of_drawing_is_estimated_before_it_begins(pyvista, make_run
 
 @pytest.mark.parametrize(
     ("simulator", "key", "expected"),
-    [("fluids", "liquid", Show.SURFACE), ("granular", "sand", Show.PARTICLES)],
+    [("fluids", "liquid", VisiblePart.SURFACE), ("granular", "sand", VisiblePart.PARTICLES)],
 )
 def test_by_default_sand_is_drawn_as_grains_and_liquid_as_a_surface(
     simulator, key, expected, tmp_path
@@ -229,13 +229,13 @@ def test_by_default_sand_is_drawn_as_grains_and_liquid_as_a_surface(
             ball([0.5, 0.5], 0.1),
         ],
     )
-    assert Recording(tmp_path).show is Live(tmp_path)._recording.show is expected
-    assert Recording(tmp_path, show=Show.SURFACE).show is Show.SURFACE
-    assert Recording(tmp_path, Color.SPEED).show is Show.PARTICLES
+    assert Recording(tmp_path).show is LiveRun(tmp_path)._recording.show is expected
+    assert Recording(tmp_path, show=VisiblePart.SURFACE).show is VisiblePart.SURFACE
+    assert Recording(tmp_path, Color.SPEED).show is VisiblePart.PARTICLES
     (tmp_path / "particles.pvd").unlink()
     for file in (tmp_path / "frames").glob("particles*"):
         file.unlink()
-    assert Recording(tmp_path).show is Show.SURFACE, "where there is nothing else"
+    assert Recording(tmp_path).show is VisiblePart.SURFACE, "where there is nothing else"
 
 
 def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):

@@ -6,8 +6,8 @@ import pytest
 from command_line import invoke
 from small_runs import ball, box, sphere, write_run
 from warp_lcp.render.actors import is_round, surface_meshes
-from warp_lcp.render.recording import Color, Recording, RenderError, Show
-from warp_lcp.render.render import Looks, render_run
+from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
+from warp_lcp.render.render import ImageStyle, render_run
 from warp_lcp.render.solid_meshes import prescribed_solids
 from warp_lcp.scene.camera import MARGIN
 from warp_lcp.simulation import Points, Surface
@@ -30,7 +30,7 @@ def pixels(path) -> np.ndarray:
 
 
 def draw(folder, **looks) -> list[np.ndarray]:
-    return [pixels(path) for path in render_run(folder, looks=Looks(size=SIZE, **looks))]
+    return [pixels(path) for path in render_run(folder, looks=ImageStyle(size=SIZE, **looks))]
 
 
 def is_blue(image):
@@ -70,17 +70,19 @@ def test_outlines_are_filled_inside_and_islands_left_out(pyvista, dots, tmp_path
 def test_the_surface_is_shown_where_there_is_one(dots, tmp_path):
     both = write_run(tmp_path / "both", [[PARTICLE, ball([0.5, 0.5], 0.2)]])
     alone = write_run(tmp_path / "alone", [[PARTICLE]])
-    assert Recording(both).show is Show.SURFACE
-    assert Recording(both, Color.SPEED).show is Show.PARTICLES  # colors are those of particles
-    assert Recording(alone).show is Show.PARTICLES
+    assert Recording(both).show is VisiblePart.SURFACE
+    assert (
+        Recording(both, Color.SPEED).show is VisiblePart.PARTICLES
+    )  # colors are those of particles
+    assert Recording(alone).show is VisiblePart.PARTICLES
     assert len(Recording(both).frame(0).points) == 0
-    assert Recording(both, show=Show.BOTH).frame(0).surface is not None
+    assert Recording(both, show=VisiblePart.BOTH).frame(0).surface is not None
     with pytest.raises(RenderError, match="--color speed is for particles"):
-        Recording(both, Color.SPEED, Show.SURFACE)
+        Recording(both, Color.SPEED, VisiblePart.SURFACE)
     with pytest.raises(RenderError, match="holds no frames of a surface"):
-        Recording(alone, show=Show.SURFACE)
+        Recording(alone, show=VisiblePart.SURFACE)
     with pytest.raises(RenderError, match="holds no frames of a surface"):
-        Recording(alone, show=Show.BOTH)
+        Recording(alone, show=VisiblePart.BOTH)
 
 
 def test_surfaces_come_back_as_they_were_written(dots, tmp_path):
@@ -227,7 +229,10 @@ def test_water_in_a_room_shows_what_is_in_it(pyvista, dots, tmp_path):
         {"velocity": np.zeros((5, 3), dtype=np.float32)},
     )
     folder = write_run(tmp_path / "both", [[many, ball([0.5, 0.5, 0.5], 0.3)]], text, ROOM)
-    (both,), (surface,) = draw(folder, show=Show.BOTH), draw(folder, show=Show.SURFACE)
+    (both,), (surface,) = (
+        draw(folder, show=VisiblePart.BOTH),
+        draw(folder, show=VisiblePart.SURFACE),
+    )
     assert (both != surface).any(axis=-1)[:120, :200].sum() > 8
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from command_line import invoke
 from small_runs import ball, sphere, write_run
-from warp_lcp.render.recording import Color, RenderError, Show
-from warp_lcp.render.render import INSTALL_MATPLOTLIB, Looks, render_run
+from warp_lcp.render.recording import Color, RenderError, VisiblePart
+from warp_lcp.render.render import INSTALL_MATPLOTLIB, ImageStyle, render_run
 from warp_lcp.render.section import cut
 from warp_lcp.simulation import Cells, Points, Surface
 
@@ -43,7 +43,7 @@ def draw(folder, **looks):
     from PIL import Image
 
     images = []
-    for path in render_run(folder, looks=Looks(size=SIZE, cut=True, **looks)):
+    for path in render_run(folder, looks=ImageStyle(size=SIZE, cut=True, **looks)):
         with Image.open(path) as image:
             images.append(np.asarray(image, dtype=int)[22:])
     return images
@@ -107,7 +107,7 @@ def test_surfaces_and_bodies_are_outlined(dots, tmp_path):
     folder = write_run(
         tmp_path / "run", [[*material(3), ball([0.5, 0.5, 0.5], 0.3), body]], size=(1.0, 1.0, 1.0)
     )
-    (image,), (plain,) = draw(folder, show=Show.BOTH), draw(folder)
+    (image,), (plain,) = draw(folder, show=VisiblePart.BOTH), draw(folder)
     assert (plain[..., 0] - plain[..., 2] > 80).sum() > 30  # the body
     assert ((image != plain).any(axis=-1)).sum() > 150  # the surface
 
@@ -140,7 +140,7 @@ def test_a_surface_alone_is_drawn_over_plain_cells(dots, tmp_path):
     _, cells = material(3)
     surface = ball([0.5, 0.5, 0.5], 0.3)
     folder = write_run(tmp_path / "run", [[cells, surface]], size=(1.0, 1.0, 1.0))
-    (image,), (asked,) = draw(folder), draw(folder, show=Show.SURFACE)
+    (image,), (asked,) = draw(folder), draw(folder, show=VisiblePart.SURFACE)
     assert (image[..., 2] - image[..., 0] > 80).sum() > 150  # outline of the surface
     np.testing.assert_array_equal(image, asked)
     with pytest.raises(RenderError, match="holds no frames of particles"):

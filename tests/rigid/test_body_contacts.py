@@ -8,7 +8,7 @@ import pytest
 from bodies_at_hand import GRAVITY, SIDES, bodies_of, run
 
 from warp_lcp.grid.motion import Pose, Rotation, Translation
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rigid.contact_detection import between, on_plane

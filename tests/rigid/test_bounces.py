@@ -8,7 +8,7 @@ import pytest
 from bodies_at_hand import GRAVITY, SIDES, bodies_of
 
 from default_run import slow
-from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.grid.signed_distance import Box, Sphere
 
 G = 9.81
 FLOOR = SIDES & ~0b000100

@@ -9,7 +9,7 @@ from bodies_at_hand import GRAVITY, run
 from test_contact_problem import EXACT, problem_of
 
 from default_run import slow
-from warp_lcp.grid.solids import Box
+from warp_lcp.grid.signed_distance import Box
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import RigidBody

@@ -11,7 +11,7 @@ from bodies_at_hand import GRAVITY, bodies_of, run
 from scipy.sparse.csgraph import connected_components
 
 import warp_lcp as wl
-from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.grid.signed_distance import Box, Sphere
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_models import BoxedModel, ContactSystem

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from default_run import slow
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Box, Capsule, Placement, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Placement, TriangleMesh
 from warp_lcp.grid.triangle_mesh import close_surface
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rigid.contact_detection import between

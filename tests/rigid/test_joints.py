@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from default_run import chosen, slow
-from warp_lcp.contacts.methods import BOXED, JOINTED, STEWART_TRINKLE, MethodOfChoice
-from warp_lcp.grid.solids import Box
+from warp_lcp.contacts.methods import BOXED, JOINTED, STEWART_TRINKLE, RegistryContactMethod
+from warp_lcp.grid.signed_distance import Box
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import RigidBody, rotation_by
 from warp_lcp.rigid.joints import WORLD, Joint, JointRows, joined_pairs
@@ -40,7 +40,9 @@ def system(
         RigidBody(mass_properties(shape, dimension, density=1000.0), name=f"bar {i}")
         for i, shape in enumerate(shapes)
     ]
-    solver = MethodOfChoice(method, directions=4, tolerance=tolerance, most=2000, device="cpu")
+    solver = RegistryContactMethod(
+        method, directions=4, tolerance=tolerance, most=2000, device="cpu"
+    )
     return RigidBodies(bodies, shapes, range(1, count + 1), (), dimension, solver, joints)
 
 

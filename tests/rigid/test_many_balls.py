@@ -8,9 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.grid.signed_distance import Box, Sphere
 from warp_lcp.rigid.body import BodyStates, RigidBody
-from warp_lcp.rigid.contact_detection import ContactDetection, Place, between, close_pairs, on_plane
+from warp_lcp.rigid.contact_detection import (
+    ContactDetection,
+    UncheckedPose,
+    between,
+    close_pairs,
+    on_plane,
+)
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contacts import SAME_PLACE, ContactMemory
 from warp_lcp.rigid.mass_properties import MassProperties
@@ -57,7 +63,7 @@ def test_balls_touch_where_each_two_of_them_do():
     bodies = placed(at, rng)
     ways = rng.uniform(0.0, 0.02, n)
     found = ContactDetection(bodies, shapes, (), 3).find(0.0, ways, np.zeros(0), 0.01)
-    places = [Place(body.rotation, body.position) for body in bodies]
+    places = [UncheckedPose(body.rotation, body.position) for body in bodies]
     expected = {}
     for i in range(n):
         for j in range(i):
@@ -72,7 +78,7 @@ def test_balls_touch_where_each_two_of_them_do():
         np.testing.assert_allclose(getattr(found.points, name), each, atol=1e-12)
 
 
-class Touching(SimpleNamespace):
+class TouchingPairs(SimpleNamespace):
     def __len__(self):
         return len(self.first)
 
@@ -87,7 +93,7 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
         rng = np.random.default_rng(seed)
         n, k, m = (int(count) for count in rng.integers((1, 1, 1), (5, 30, 30)))
         bodies = placed(rng.standard_normal((n, 3)), rng)
-        contacts = Touching(
+        contacts = TouchingPairs(
             first=rng.integers(0, n, k),
             second=rng.integers(0, n + 1, k),
             point=rng.standard_normal((k, 3)).round(1),
@@ -148,7 +154,11 @@ def test_balls_touch_planes_where_each_of_them_does():
     for i, body in enumerate(bodies):
         for point, normal in zip(planes.points + 0.1 * np.eye(3)[1], normals, strict=True):
             touch = on_plane(
-                shapes[i], Place(body.rotation, body.position), point, normal, 0.01 + ways[i]
+                shapes[i],
+                UncheckedPose(body.rotation, body.position),
+                point,
+                normal,
+                0.01 + ways[i],
             )
             expected += [
                 (i, *touch.point[k], *touch.normal[k], touch.gap[k]) for k in range(len(touch))

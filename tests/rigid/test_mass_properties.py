@@ -11,7 +11,7 @@ import pytest
 from scipy import integrate
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh, close_surface
 from warp_lcp.grid.voxelize import inside
 from warp_lcp.rigid.mass_properties import MassProperties, mass_properties

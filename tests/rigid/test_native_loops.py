@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid import motion
-from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere
+from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody

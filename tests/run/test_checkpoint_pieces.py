@@ -8,7 +8,7 @@ from small_runs import run_into
 from warp_lcp.distributed.collective import Collective
 from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import fingerprint
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 
@@ -40,7 +40,9 @@ def names(folder):
 
 
 def test_a_rank_writes_its_piece_and_then_the_whole(tmp_path):
-    folder = CheckpointFolder(tmp_path / "c", SCENE, {"time.cfl": 2.0}, Collective.of_one())
+    folder = CheckpointFolder(
+        tmp_path / "c", SCENE, {"time.cfl": 2.0}, Collective.for_one_process()
+    )
     assert (
         folder.write(Checkpoint(4, 0.5, state(0, 4)))
         == tmp_path / "c" / "rank_0000" / "step_000004.npz"
@@ -95,7 +97,7 @@ def test_without_a_piece_the_checkpoint_before_is_taken(tmp_path, harm):
     found, refused = one.newest()
     assert found is not None and found.step == 3
     assert len(refused) == 1 and str(piece) in refused[0]
-    many = CheckpointFolder(tmp_path, SCENE, {}, Collective.of_one())
+    many = CheckpointFolder(tmp_path, SCENE, {}, Collective.for_one_process())
     newest, _ = many.newest()
     assert newest is not None and newest.step == 4 and not many.complete(newest)
     again, refused_by_many = many.newest()
@@ -110,7 +112,7 @@ def test_without_a_piece_the_checkpoint_before_is_taken(tmp_path, harm):
 def test_old_pieces_go_with_their_checkpoint(tmp_path):
     write(tmp_path, 3, ranks=4)
     write(tmp_path, 6, ranks=2)
-    many = CheckpointFolder(tmp_path, SCENE, {}, Collective.of_one())
+    many = CheckpointFolder(tmp_path, SCENE, {}, Collective.for_one_process())
     many.prune(1)
     assert names(tmp_path) == [
         "rank_0000/step_000006.npz",
@@ -120,7 +122,7 @@ def test_old_pieces_go_with_their_checkpoint(tmp_path):
 
 
 def test_a_simulator_that_cannot_join_pieces_says_so(dots, scene_file, tmp_path):
-    out, watcher = tmp_path / "out", Lines(Console(quiet=True))
+    out, watcher = tmp_path / "out", ProgressLines(Console(quiet=True))
     scene = load_scene(scene_file)
     run_into(scene, out, observer=watcher, last_frame=1)
     for file in (out / "checkpoints").iterdir():

@@ -15,7 +15,7 @@ from rich.console import Console
 from small_runs import run_contents, run_into
 from warp_lcp.files.atomic import SUFFIX
 from warp_lcp.run.folder import OutputError
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 
 pytestmark = [
@@ -31,7 +31,9 @@ OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
 
 def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: bool = False) -> Any:
     loaded = load_scene(scene, [*SHORT, *overrides])
-    return run_into(loaded, out, observer=Lines(Console(quiet=True)), resume=resume, force=force)
+    return run_into(
+        loaded, out, observer=ProgressLines(Console(quiet=True)), resume=resume, force=force
+    )
 
 
 def contents(out: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from warp_lcp.run import folder as run_folder
 from warp_lcp.run.folder import OutputError, RunRecord
 
 
-class Disk:
+class FullDisk:
     """Files of a folder with a limited total size.
 
     Files opened by `open` fail beyond the limit.
@@ -59,7 +59,7 @@ class Disk:
             or not path.startswith(str(self.folder))
         ):
             return self._open(file, mode, buffering, *more, **options)
-        raw = Limited(file, mode.replace("b", "").replace("t", ""), path=path, disk=self)
+        raw = LimitedFile(file, mode.replace("b", "").replace("t", ""), path=path, disk=self)
         stream = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
         return (
             stream
@@ -68,7 +68,7 @@ class Disk:
         )
 
     @contextmanager
-    def mounted(self) -> Iterator["Disk"]:
+    def mounted(self) -> Iterator["FullDisk"]:
         self._open = builtins.open
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(builtins, "open", self.open)
@@ -76,10 +76,10 @@ class Disk:
             yield self
 
 
-class Limited(io.FileIO):
+class LimitedFile(io.FileIO):
     """File on such a disk."""
 
-    def __init__(self, file: Any, mode: str, *, path: str, disk: Disk) -> None:
+    def __init__(self, file: Any, mode: str, *, path: str, disk: FullDisk) -> None:
         super().__init__(file, mode)
         self._disk = disk
         self.path = path
@@ -113,7 +113,7 @@ def fill(
     for size in sizes:
         out = folder / f"full_{size}"
         out.mkdir()
-        with Disk(out, size, code, block).mounted() as disk:
+        with FullDisk(out, size, code, block).mounted() as disk:
             try:
                 record = go(scene, out)
             except OutputError:  # before the run began
@@ -185,16 +185,16 @@ def test_full_at_every_moment(quick, scene_file, tmp_path, code, block, stride):
 )
 def test_full_in_each_kind_of_file(quick, scene_file, tmp_path, monkeypatch, name):
     """Full disk at each kind of file, and from then on at every file."""
-    out, write, full = tmp_path / "out", Limited.write, []
+    out, write, full = tmp_path / "out", LimitedFile.write, []
 
-    def fails(self: Limited, data: Any) -> int:
+    def fails(self: LimitedFile, data: Any) -> int:
         if full or name in re.sub(r"\.[0-9a-f]{16}\.part$", ".part", Path(self.path).name):
             full.append(self.path)
             self._disk.size = 0
         return write(self, data)
 
-    monkeypatch.setattr(Limited, "write", fails)
-    with Disk(out, 10**9).mounted():
+    monkeypatch.setattr(LimitedFile, "write", fails)
+    with FullDisk(out, 10**9).mounted():
         record = go(scene_file, out)
     if name == "profile":  # not requested here
         assert record.status == "finished"
@@ -206,7 +206,7 @@ def test_full_in_each_kind_of_file(quick, scene_file, tmp_path, monkeypatch, nam
 
 
 def test_a_reason_of_some_length_has_its_room(quick, tmp_path):
-    with Disk(tmp_path, 20_000).mounted() as disk:
+    with FullDisk(tmp_path, 20_000).mounted() as disk:
         atomic.reserve(tmp_path / "run.json", run_folder.LAST_WORDS)
         atomic.write_text(tmp_path / "run.json", "{}")
         disk.size = disk.used()

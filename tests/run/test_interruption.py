@@ -156,14 +156,14 @@ def test_a_compiler_is_not_waited_for(monkeypatch):
     Python runs a signal handler only after native code has returned.
     """
 
-    class Compiling(Interruption):
+    class CompilingInterruption(Interruption):
         def _take(self, given: int, frame: Any) -> None:
             pass
 
     messages, ended = [], threading.Event()
     monkeypatch.setattr(interruption, "GRACE", 0.01)
     monkeypatch.setattr(os, "_exit", lambda code: (messages.append(code), ended.set()))
-    with Compiling(messages.append, last=messages.append):
+    with CompilingInterruption(messages.append, last=messages.append):
         signal.raise_signal(signal.SIGINT)
         ended.wait()
     assert messages == ["SIGINT: stopping before the first step has ended", "SIGINT", 1]

@@ -28,12 +28,12 @@ from warp_lcp.files.atomic import (
     reserve,
     write_text,
 )
-from warp_lcp.render.render import Looks, render_run
+from warp_lcp.render.render import ImageStyle, render_run
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.folder_lock import LOCK, locked
 from warp_lcp.run.log import Log
-from warp_lcp.run.profile import Profile
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.profile import Profiler
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import Cells, Points
@@ -83,7 +83,9 @@ def scene(tmp_path_factory) -> Scene:
 
 
 def go(scene: Scene, out: Path, **options: Any) -> Any:
-    return run_into(scene, out, record_problems=out / "problems", profile=Profile("cpu"), **options)
+    return run_into(
+        scene, out, record_problems=out / "problems", profile=Profiler("cpu"), **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +206,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     elsewhere.mkdir()
 
-    class Plants(Lines):
+    class LinkPlanter(ProgressLines):
         def step(self, row: Any) -> None:
             super().step(row)
             for number, name in enumerate(names(whole) if row["step"] == 1 else ()):
@@ -213,7 +215,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
                 if not checkpoint and not (out / name).exists() and not (out / name).is_symlink():
                     lay(out / name, elsewhere / f"{number}")
 
-    record = go(scene, out, observer=Plants(Console(quiet=True)))
+    record = go(scene, out, observer=LinkPlanter(Console(quiet=True)))
     assert record.status == "finished", record.reason
     assert len(list(elsewhere.iterdir())) > 20
     assert {path.read_text() for path in elsewhere.iterdir()} == {PRECIOUS}
@@ -223,7 +225,7 @@ def test_links_that_come_while_it_runs(scene, whole, tmp_path):
 def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
 
-    class Moves(Lines):
+    class FolderMover(ProgressLines):
         def step(self, row: Any) -> None:
             super().step(row)
             if row["step"] == 2:
@@ -235,7 +237,7 @@ def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
                 (out / name).symlink_to(elsewhere)
                 self.before = content(elsewhere)
 
-    observer = Moves(Console(quiet=True))
+    observer = FolderMover(Console(quiet=True))
     record = go(scene, out, observer=observer)
     assert record.status == "failed"
     assert "is a link" in record.reason
@@ -260,7 +262,7 @@ def test_images(drawn, tmp_path, name):
     lay(out / name, tmp_path / "precious")
     before = content(tmp_path / "precious")
     try:
-        list(render_run(out, looks=Looks(cut=True)))
+        list(render_run(out, looks=ImageStyle(cut=True)))
         assert stat.S_ISREG((out / name).lstat().st_mode)
     except Exception as error:
         assert "is a link" in str(error)
@@ -271,7 +273,7 @@ def test_images_elsewhere_may_go_through_links(drawn, tmp_path):
     """Images in another folder: links are allowed, since the user names it."""
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")
-    list(render_run(drawn, looks=Looks(cut=True), out=tmp_path / "link"))
+    list(render_run(drawn, looks=ImageStyle(cut=True), out=tmp_path / "link"))
     assert list((tmp_path / "there").glob("slice_*.png"))
 
 

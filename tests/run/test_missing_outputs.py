@@ -16,7 +16,7 @@ from small_runs import run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.missing_outputs import spans
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene
 
 STEP = 20  # step at which the run stops; checkpoints are those of steps 12, 16 and 20
@@ -30,7 +30,7 @@ def out(scene_file: Path, tmp_path: Path) -> Path:
     run_into(
         load_scene(scene_file),
         tmp_path / "out",
-        observer=Lines(Console(quiet=True)),
+        observer=ProgressLines(Console(quiet=True)),
         stop=lambda: next(asked) >= STEP,
     )
     return tmp_path / "out"
@@ -121,7 +121,12 @@ def test_frames_without_checkpoints_and_log_are_not_thrown_away(out, scene_file)
     for record in ("{}", (out / "run.json").read_text()):
         (out / "run.json").write_text(record)
         with pytest.raises(OutputError, match="no checkpoint to resume from"):
-            run_into(load_scene(scene_file), out, observer=Lines(Console(quiet=True)), resume=True)
+            run_into(
+                load_scene(scene_file),
+                out,
+                observer=ProgressLines(Console(quiet=True)),
+                resume=True,
+            )
     assert frames(out, "grid") == [0, 1, 2, 3]
 
 

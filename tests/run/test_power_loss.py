@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
 
 
 @dataclass(frozen=True)
-class Moment:
+class PowerFailure:
     """Possible contents of a disk if the power fails now.
 
     Args:
@@ -73,7 +73,7 @@ class Moment:
 
 
 @dataclass
-class Disk:
+class VolatileDisk:
     """Recorder of all operations on a folder, with the state at each moment.
 
     Args:
@@ -81,7 +81,7 @@ class Disk:
     """
 
     root: Path
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[PowerFailure] = field(default_factory=list)
     calls: list[tuple[str, str]] = field(default_factory=list)
     files: dict[int, bytes] = field(default_factory=dict)
     durable: dict[int, Names] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class Disk:
         except FileNotFoundError:  # another thread was faster: the next moment follows soon
             return
         last = self.moments[-1] if self.moments else None
-        moment = Moment(
+        moment = PowerFailure(
             now,
             {key: dict(value) for key, value in self.durable.items()},
             dict(self.files),
@@ -172,12 +172,12 @@ class Disk:
 
 
 @pytest.fixture
-def disk(tmp_path, monkeypatch) -> Iterator[Disk]:
+def disk(tmp_path, monkeypatch) -> Iterator[VolatileDisk]:
     if not Path("/proc/self/fd").is_dir():
         pytest.skip("tells which file a descriptor is of")
     root = tmp_path / "disk"
     root.mkdir()
-    disk = Disk(root)
+    disk = VolatileDisk(root)
     disk.durable[disk.number] = {}
     monkeypatch.setattr(os, "fsync", disk.sync)
     write = CheckpointFolder.write
@@ -194,7 +194,7 @@ def disk(tmp_path, monkeypatch) -> Iterator[Disk]:
 
 
 def survives(
-    scene: Path, folder: Path, disk: Disk, run: Callable[[Path], Any], stride: int
+    scene: Path, folder: Path, disk: VolatileDisk, run: Callable[[Path], Any], stride: int
 ) -> list[int]:
     """Simulate a power failure at every `stride`-th moment of a run.
 

@@ -7,14 +7,14 @@ from typing import ClassVar
 import pytest
 import warp as wp
 
-from warp_lcp.run.profile import KERNELS, Profile
+from warp_lcp.run.profile import KERNELS, Profiler
 from warp_lcp.simulation import NoStopwatch
 
 
 def test_stages_add_up(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     field, vectors = (
         wp.zeros(10, dtype=wp.float32, device="cpu"),
         wp.zeros((2, 3), dtype=wp.vec3, device="cpu"),
@@ -32,14 +32,14 @@ def test_stages_add_up(monkeypatch):
 
 
 def test_a_stage_that_fails_is_counted():
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     with pytest.raises(ValueError, match="no"), profile.stage("a"):
         raise ValueError("no")
     assert profile.stages["a"].calls == 1
 
 
 def test_files_and_other_threads(tmp_path):
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     (tmp_path / "x").write_bytes(bytes(100))
     with profile.beside("written"):
         pass
@@ -50,7 +50,7 @@ def test_files_and_other_threads(tmp_path):
 
 def test_the_table_accounts_for_all_of_the_time(monkeypatch):
     monkeypatch.setattr("warp_lcp.run.profile.get_threads", lambda: 1)
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     for name, seconds, moved in (("a", 1.0, 4e9), ("b", 2.0, 0)):
         with profile.stage(name):
             pass
@@ -74,7 +74,7 @@ def test_the_table_accounts_for_all_of_the_time(monkeypatch):
 
 
 def test_the_file_has_every_stage(tmp_path):
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     with profile.stage("a"):
         pass
     profile.write(tmp_path, 7, 1.5)
@@ -97,7 +97,7 @@ def test_kernels_that_load_are_a_stage_of_their_own():
     def fill(a: wp.array(dtype=wp.float32)):
         a[wp.tid()] = 3.0
 
-    class Said:
+    class RecordingLogger:
         messages: ClassVar[list[str]] = []
 
         def say(self, message, *_, **__):
@@ -105,8 +105,12 @@ def test_kernels_that_load_are_a_stage_of_their_own():
 
         debug = info = warning = error = say
 
-    profile, field = Profile("cpu"), wp.zeros(4, dtype=wp.float32, device="cpu")
-    with wp.ScopedLogger(Said()), wp.ScopedLogLevel(wp.LOG_WARNING), profile.kernels_apart():
+    profile, field = Profiler("cpu"), wp.zeros(4, dtype=wp.float32, device="cpu")
+    with (
+        wp.ScopedLogger(RecordingLogger()),
+        wp.ScopedLogLevel(wp.LOG_WARNING),
+        profile.kernels_apart(),
+    ):
         level = wp.config.log_level
         begun = time.perf_counter()
         with profile.stage("fill"):
@@ -119,7 +123,7 @@ def test_kernels_that_load_are_a_stage_of_their_own():
     assert kernels.calls == 1
     assert kernels.seconds > 0.0
     assert 0.0 <= stage.seconds <= seconds - 0.99 * kernels.seconds
-    assert Said.messages == ["heard"]
+    assert RecordingLogger.messages == ["heard"]
     assert profile.table(1, seconds).splitlines()[1].startswith(KERNELS)
 
 
@@ -136,7 +140,7 @@ def test_without_a_profile_nothing_is_measured(monkeypatch, tmp_path):
 
 @pytest.mark.cuda
 def test_a_gpu_is_waited_for():
-    profile = Profile("cuda:0")
+    profile = Profiler("cuda:0")
     big = wp.zeros(1 << 28, dtype=wp.float32, device="cuda:0")
     with profile.stage("fill", big):
         for _ in range(20):

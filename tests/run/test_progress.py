@@ -6,7 +6,14 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from warp_lcp.run.progress import WINDOW, Bar, Count, Lines, describe, time_left
+from warp_lcp.run.progress import (
+    WINDOW,
+    ProgressBar,
+    ProgressCounter,
+    ProgressLines,
+    describe,
+    time_left,
+)
 
 ROW = {
     "step": 3,
@@ -63,7 +70,7 @@ def test_the_residual_shown_is_the_one_that_the_tolerance_is_of():
 
 def test_lines_have_one_a_frame():
     stream = io.StringIO()
-    with Lines(Console(file=stream, width=200)) as lines:
+    with ProgressLines(Console(file=stream, width=200)) as lines:
         lines.start(0.0, 1.0)
         lines.note("a [note]")
         lines.frame(0, 2)
@@ -78,7 +85,7 @@ def test_lines_have_one_a_frame():
 
 def test_bar_shows_the_step():
     stream = io.StringIO()
-    with Bar(Console(file=stream, width=200, force_terminal=True)) as bar:
+    with ProgressBar(Console(file=stream, width=200, force_terminal=True)) as bar:
         bar.start(0.0, 1.0)
         bar.note("a [note]")
         bar.step(ROW)
@@ -90,7 +97,9 @@ def test_bar_shows_the_step():
 
 def test_a_count_has_a_line_now_and_then():
     stream, now = io.StringIO(), 0.0
-    with Count(Console(file=stream, width=200), "drawing", "images", lambda: now) as count:
+    with ProgressCounter(
+        Console(file=stream, width=200), "drawing", "images", lambda: now
+    ) as count:
         count(0, 12)
         for done in range(1, 13):
             now += 2.0
@@ -100,7 +109,9 @@ def test_a_count_has_a_line_now_and_then():
     lines = [f"drawing: {done} of 12 images  0:00:{2 * (12 - done):02d} left" for done in told_of]
     assert stream.getvalue().splitlines() == lines
     quiet = io.StringIO()
-    with Count(Console(file=quiet, quiet=True), "drawing", "images", lambda: now) as count:
+    with ProgressCounter(
+        Console(file=quiet, quiet=True), "drawing", "images", lambda: now
+    ) as count:
         count(0, 2)
         now += 60.0
         count(1, 2)
@@ -109,7 +120,9 @@ def test_a_count_has_a_line_now_and_then():
 
 def test_a_count_changes_in_place_on_a_terminal():
     stream = io.StringIO()
-    with Count(Console(file=stream, width=200, force_terminal=True), "drawing", "images") as told:
+    with ProgressCounter(
+        Console(file=stream, width=200, force_terminal=True), "drawing", "images"
+    ) as told:
         told(0, 4)
         told(2, 4)
     assert "drawing" in stream.getvalue()

@@ -15,12 +15,12 @@ from rich.console import Console
 
 from small_runs import read_record, run_contents, run_into
 from warp_lcp.frames import vtu as vtu_module
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.run import loop as run_module
 from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.folder import OutputError, RunRecord
-from warp_lcp.run.profile import Profile
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.profile import Profiler
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.scene import SceneError, Time
 from warp_lcp.scene.scene_file import load_scene
@@ -29,7 +29,7 @@ from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
 VOLATILE = "seconds"  # the only column of the log that differs in a repetition
 
 
-class Watcher(Lines):
+class RemarkObserver(ProgressLines):
     """Observer that stores the remarks."""
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Watcher(Lines):
 
 
 def go(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
-    observer = options.pop("observer", None) or Watcher()
+    observer = options.pop("observer", None) or RemarkObserver()
     return run_into(load_scene(scene, overrides), out, observer=observer, **options)
 
 
@@ -265,7 +265,7 @@ def test_resume_reports_a_broken_checkpoint_and_takes_the_one_before(scene_file,
     go(scene_file, parts, stop=stop_at(10))
     broken = parts / "checkpoints" / "step_000010.npz"
     broken.write_bytes(broken.read_bytes()[:-40])
-    observer = Watcher()
+    observer = RemarkObserver()
     result = go(scene_file, parts, resume=True, observer=observer)
     assert result.resumed_from_step == 8
     assert result.warnings == observer.notes == read_record(parts)["warnings"]
@@ -425,7 +425,7 @@ def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(
 
 
 def test_a_profile_counts_every_stage(scene_file, tmp_path):
-    out, profile = tmp_path / "out", Profile("cpu")
+    out, profile = tmp_path / "out", Profiler("cpu")
     result = go(scene_file, out, profile=profile)
     written = json.loads((out / "profile.json").read_text())
     assert (written["device"], written["steps"], written["seconds"]) == (
@@ -457,7 +457,7 @@ def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
         return simulation
 
     monkeypatch.setattr(type(dots), "create", watched)
-    profile = Profile("cpu")
+    profile = Profiler("cpu")
     go(scene_file, tmp_path / "out", last_frame=1)
     assert {type(watch) for watch in seen} == {NoStopwatch}
     assert not (tmp_path / "out" / "profile.json").exists()
@@ -536,7 +536,7 @@ def test_an_empty_simulation_has_frames(dots, scene_file, tmp_path):
 
 def test_notes_reach_the_user_and_the_record(dots, scene_file, tmp_path):
     dots.notes = ["solid[0]: lies outside the domain"]
-    observer = Watcher()
+    observer = RemarkObserver()
     assert go(scene_file, tmp_path / "out", observer=observer).warnings == dots.notes
     assert observer.notes == dots.notes
 

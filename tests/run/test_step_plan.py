@@ -19,7 +19,7 @@ SMOOTH = 1.1  # largest factor of the stable time step from one step to the next
 ROUNDING = 1e-12
 
 
-class Clockwork:
+class ClockSimulation:
     """Simulation with a clock alone.
 
     Its stable time step varies smoothly, some steps fail, and events happen at given times.
@@ -84,7 +84,7 @@ def run(clock: Any, stop: int = 10**6) -> list[tuple[float, float, int, float]]:
 
 def check(seed: int) -> None:
     """Assert the invariants of all runs."""
-    clock = Clockwork(seed)
+    clock = ClockSimulation(seed)
     rows = np.array(run(clock))
     starts, ends, retried, allowed = rows.T
     steps = ends - starts
@@ -117,12 +117,12 @@ def check(seed: int) -> None:
         assert soon or late or before_another or retried[number] > 0
     assert len(rows) <= 2 * len(frames) + 4.0 * np.sum(1.0 / allowed * steps) + 2 * len(clock.times)
 
-    resumed = Clockwork(seed)
+    resumed = ClockSimulation(seed)
     stop = len(rows) * (seed % 7) // 7
     before = run(resumed, stop)
-    continued = Clockwork(seed)
+    continued = ClockSimulation(seed)
     continued.time, continued.step_count = resumed.time, resumed.step_count
-    assert before + run(continued) == [tuple(row) for row in run(Clockwork(seed))]
+    assert before + run(continued) == [tuple(row) for row in run(ClockSimulation(seed))]
 
 
 def test_any_run_hits_its_frames_and_has_no_slivers() -> None:
@@ -151,10 +151,14 @@ def test_events_within_a_step(remaining: float, events: list[float], expected: f
 
 
 def test_a_simulation_in_which_nothing_is_known_to_happen_needs_no_events() -> None:
-    class Plain:
+    class SimulationWithoutEvents:
         time, step_count = 0.25, 3
 
         def step(self, dt: float) -> dict[str, Any]:
             return {"taken": dt}
 
-    assert take_step(Plain(), 0.1, 1.0, Time(duration=1.0, dt_max=0.2)) == (0.1, 0, {"taken": 0.1})  # type: ignore[arg-type]
+    assert take_step(SimulationWithoutEvents(), 0.1, 1.0, Time(duration=1.0, dt_max=0.2)) == (
+        0.1,
+        0,
+        {"taken": 0.1},
+    )  # type: ignore[arg-type]

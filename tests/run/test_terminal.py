@@ -18,7 +18,7 @@ from small_runs import MINIMAL, run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.files.size_limits import one_line, visible
 from warp_lcp.run import folder as run_folder
-from warp_lcp.run.progress import Lines
+from warp_lcp.run.progress import ProgressLines
 from warp_lcp.run.terminal import Terminal, say
 from warp_lcp.scene.scene_file import load_scene
 
@@ -205,11 +205,11 @@ def test_colors_and_bars_of_our_own_reach_the_terminal(capsys):
 
 @pytest.mark.parametrize("code", [errno.EPIPE, errno.EIO])
 def test_a_terminal_that_is_gone_ends_no_run(dots, scene_file, tmp_path, code):
-    class Gone(io.StringIO):
+    class ClosedTerminal(io.StringIO):
         def write(self, text: str) -> int:
             raise OSError(code, os.strerror(code))
 
-    watcher = Lines(Terminal(file=Gone()))
+    watcher = ProgressLines(Terminal(file=ClosedTerminal()))
     record = run_into(load_scene(scene_file), tmp_path / "out", observer=watcher, last_frame=2)
     assert record.status == "finished"
 

@@ -9,7 +9,7 @@ import pytest
 
 from command_line import invoke
 from warp_lcp.run import tune as tuning
-from warp_lcp.run.trial import Differences, Look, Trial, look_times, spread, trial
+from warp_lcp.run.trial import MaterialSnapshot, RunDifferences, Trial, look_times, spread, trial
 from warp_lcp.scene.presets import price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
@@ -21,7 +21,7 @@ SMALL = ["domain.resolution=32", "time.duration=0.2"]
 def made(distance: float, seconds: float, drift: float = 0.0) -> Trial:
     """Return a run whose distance from made(0.0, ...) is `distance`."""
     mass = np.array([1.0 - distance, distance])
-    looks = tuple(Look(time, mass, 1.0, 0.5) for time in (0.0, 0.1, 0.2))
+    looks = tuple(MaterialSnapshot(time, mass, 1.0, 0.5) for time in (0.0, 0.1, 0.2))
     return Trial(seconds, 10, 10, 10, looks, 0.0, volume=(1.0, 1.0 + drift))
 
 
@@ -49,7 +49,7 @@ def test_the_distance_of_a_point_that_moves(moved: float, distance: float) -> No
             1,
             1,
             tuple(
-                Look(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x)
+                MaterialSnapshot(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x)
                 for t in (0.0, 1.0)
             ),
             0.0,
@@ -84,7 +84,7 @@ def test_a_trial_is_the_run() -> None:
     assert first.penetration == 0.0
 
 
-class Model:
+class ModeledTrials:
     """Replacement of trials: distance and seconds by a formula of cfl and tolerance.
 
     Args:
@@ -110,7 +110,7 @@ class Model:
         )
 
 
-def tuned(monkeypatch: pytest.MonkeyPatch, model: Model) -> tuning.Tuning:
+def tuned(monkeypatch: pytest.MonkeyPatch, model: ModeledTrials) -> tuning.TuningResult:
     monkeypatch.setattr(tuning, "trial", model)
     return tuning.tune(load_scene("dam-break-2d"), accuracy="standard", device="cpu")
 
@@ -119,7 +119,7 @@ def tuned(monkeypatch: pytest.MonkeyPatch, model: Model) -> tuning.Tuning:
 def test_the_longest_step_within_the_bound_is_found(
     distance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = Model(distance)
+    model = ModeledTrials(distance)
     found = tuned(monkeypatch, model)
     bound = price_table()["fluids"].presets["standard"].distance
     longest = max(cfl for cfl, _ in price_table()["fluids"].steps if distance * cfl <= bound)
@@ -132,7 +132,7 @@ def test_the_longest_step_within_the_bound_is_found(
 
 
 def test_settings_that_fail_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = tuned(monkeypatch, Model(0.0001, fails=4.0))
+    found = tuned(monkeypatch, ModeledTrials(0.0001, fails=4.0))
     assert found.met
     assert found.scene.time.cfl == 3.0
     assert found.failed
@@ -140,12 +140,12 @@ def test_settings_that_fail_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_the_volume_counts_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = tuned(monkeypatch, Model(0.0001, drift=-0.02))
+    found = tuned(monkeypatch, ModeledTrials(0.0001, drift=-0.02))
     assert found.scene.time.cfl == 2.0  # 0.05 of the volume are allowed
     assert found.chosen.trial.volume_error(found.reference) == pytest.approx(0.04)
 
 
-class Blurred(Model):
+class NoisyTrials(ModeledTrials):
     """Replacement of trials with a distance of the reference runs.
 
     Runs as good as the reference are at this distance from it; all others have it in addition to
@@ -175,7 +175,7 @@ class Blurred(Model):
 def test_if_no_setting_is_accurate_enough_the_most_accurate_is_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = tuned(monkeypatch, Model(0.5))
+    found = tuned(monkeypatch, ModeledTrials(0.5))
     assert not found.met
     nearest = min(c.distance for c in found.tried)
     assert nearest <= found.chosen.distance <= 1.05 * nearest
@@ -190,22 +190,22 @@ def test_if_no_setting_is_accurate_enough_the_most_accurate_is_chosen(
     assert f"distance by a factor of {found.chosen.distance / 0.03:.2g}" in words
     assert "volume or packing by a factor" not in words
     with pytest.raises(SimulationFailed, match="no settings ran to the end of frame"):
-        tuned(monkeypatch, Model(0.5, fails=0.3))
+        tuned(monkeypatch, ModeledTrials(0.5, fails=0.3))
 
 
 def test_the_gain_of_shorter_steps_suggests_the_next_change(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    falls = tuned(monkeypatch, Steps(0.0, 0.2)).verdict("standard")[-1]
+    falls = tuned(monkeypatch, StepErrorTrials(0.0, 0.2)).verdict("standard")[-1]
     assert (
         falls == "the distance decreases with the step: shorter steps than those tried would help"
     )
-    stays = tuned(monkeypatch, Steps(0.2, 0.01)).verdict("standard")[-1]
+    stays = tuned(monkeypatch, StepErrorTrials(0.2, 0.01)).verdict("standard")[-1]
     assert "half or less: increase domain.resolution instead" in stays
     assert stays.startswith("4 times as many steps left 93 % of the distance")
 
 
-class Steps(Model):
+class StepErrorTrials(ModeledTrials):
     """Replacement of trials: 10 / cfl steps, and an irreducible part of the distance.
 
     Args:
@@ -233,7 +233,7 @@ def test_accuracy_is_limited_by_the_distance_of_references(
     The longest step whose own distance meets the bound is found beneath a noise of four times the
     bound, since distances add up in quadrature.
     """
-    model = Blurred(distance, noise=0.12)
+    model = NoisyTrials(distance, noise=0.12)
     found = tuned(monkeypatch, model)
     bound = price_table()["fluids"].presets["standard"].distance
     assert found.scene.time.cfl == max(
@@ -251,18 +251,18 @@ def test_accuracy_is_limited_by_the_distance_of_references(
         f"distance by a factor of {found.chosen.distance / bound:.2g}; but runs as accurate as the "
         "reference differ by 0.12" in words[2]
     )
-    far = tuned(monkeypatch, Blurred(0.5, noise=0.12))
+    far = tuned(monkeypatch, NoisyTrials(0.5, noise=0.12))
     assert not far.met
 
 
 def test_the_reference_is_not_doubted_where_its_bounds_are_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    model = Blurred(0.0001, noise=0.01)
+    model = NoisyTrials(0.0001, noise=0.01)
     found = tuned(monkeypatch, model)
     assert model.references == 1
     assert found.noise is None
-    assert found.bounds == Differences(0.03, 0.05)
+    assert found.bounds == RunDifferences(0.03, 0.05)
     assert found.verdict("standard")[0].startswith("standard: time.cfl=8 ")
 
 

@@ -10,27 +10,27 @@ from warp_lcp.benchmarks.models import offers
 from warp_lcp.cli import commands as cli
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.check import check_scene
-from warp_lcp.scene.models import Model, Price, model_lines, predicted_seconds, prices
+from warp_lcp.scene.models import ModelCost, SceneModel, model_lines, predicted_seconds, prices
 from warp_lcp.scene.scene_file import load_scene
 
 CELLS, PARTICLES = 1000, 4000
 LISTED = {
-    "base": Price(cell_seconds=1e-6, particle_seconds=1e-6, cell_bytes=100.0),
-    "walls": Price(cell_seconds=2e-6, cell_bytes=50.0),
-    "band": Price(particle_seconds=-1e-7, cell_bytes=-20.0),
+    "base": ModelCost(cell_seconds=1e-6, particle_seconds=1e-6, cell_bytes=100.0),
+    "walls": ModelCost(cell_seconds=2e-6, cell_bytes=50.0),
+    "band": ModelCost(particle_seconds=-1e-7, cell_bytes=-20.0),
 }
 
 
 def test_prices_add_up() -> None:
     models = [
-        Model("walls", "asked for"),
-        Model("band", "asked for"),
-        Model("unknown", "asked for"),
-        Model("walls", "", built=False),
+        SceneModel("walls", "asked for"),
+        SceneModel("band", "asked for"),
+        SceneModel("unknown", "asked for"),
+        SceneModel("walls", "", built=False),
     ]
     assert predicted_seconds(models, LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 2e-3 - 4e-4)
     assert predicted_seconds(models, {}, CELLS, PARTICLES) == 0.0, "nothing is known"
-    bodies = Model("walls", "three of them", count=3)
+    bodies = SceneModel("walls", "three of them", count=3)
     assert predicted_seconds([bodies], LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 3 * 2e-3)
     assert model_lines([bodies], LISTED, CELLS, PARTICLES, memory=200_000)[0][1].endswith(
         "75 % of memory, 6 ms a step (55 %)"
@@ -39,9 +39,9 @@ def test_prices_add_up() -> None:
 
 def test_a_plan_line_has_reason_and_cost() -> None:
     models = [
-        Model("walls", "asked for"),
-        Model("surface", "there is none", built=False),
-        Model("band", "too"),
+        SceneModel("walls", "asked for"),
+        SceneModel("surface", "there is none", built=False),
+        SceneModel("band", "too"),
     ]
     lines = model_lines(models, LISTED, CELLS, PARTICLES, memory=200_000)
     assert lines[0] == ("model", "walls: asked for; 25 % of memory, 2 ms a step (30 %)")
@@ -54,7 +54,7 @@ def test_a_plan_line_has_reason_and_cost() -> None:
 
 def test_a_measured_step_scales_the_prices() -> None:
     lines = model_lines(
-        [Model("walls", "asked for")], LISTED, CELLS, PARTICLES, memory=200_000, measured=14e-3
+        [SceneModel("walls", "asked for")], LISTED, CELLS, PARTICLES, memory=200_000, measured=14e-3
     )
     assert lines == [
         ("model", "walls: asked for; 25 % of memory, 4 ms a step (29 %)"),

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @dataclass
-class Traces:
+class SimulationTraces:
     """Traces of a simulation: kernel modules and allocated bytes.
 
     Bytes are by source file, and in total.
@@ -37,12 +37,12 @@ class Traces:
 
 
 @contextmanager
-def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
+def watching(patch: pytest.MonkeyPatch) -> Iterator[SimulationTraces]:
     """Record each kernel module of a launch, and each allocation.
 
     Allocations are recorded with the source files on the stack.
     """
-    traces, prepared = Traces(), program.prepared
+    traces, prepared = SimulationTraces(), program.prepared
     allocator = type(wp.get_device("cpu").default_allocator)
     load, allocate, entry, make_array = (
         wp.Module.load,
@@ -115,7 +115,7 @@ SAND: dict[str, Any] = {
 }
 
 
-def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) -> Traces:
+def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) -> SimulationTraces:
     """Build a simulation, step it and make a frame."""
     model = (
         small_sands.scene(**(SAND | tables)) if sand else small_liquids.scene(**(LIQUID | tables))
@@ -130,7 +130,7 @@ def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) 
 
 
 @dataclass(frozen=True)
-class Case:
+class OnOffModel:
     """Model, on and off.
 
     Args:
@@ -150,7 +150,7 @@ class Case:
 
 
 CASES = {
-    "cut cells": Case(
+    "cut cells": OnOffModel(
         {"solid": [BALL]},
         {"solid": [BALL], "solids": "voxel"},
         modules=(
@@ -161,113 +161,113 @@ CASES = {
         ),
         files=("warp_lcp/grid/cut_cells.py",),
     ),
-    "moving solids": Case(
+    "moving solids": OnOffModel(
         {"solid": [SWAYING]},
         {"solid": [BALL]},
         modules=("warp_lcp.grid.push_out", "fluids.pressure_cut_moving"),
         columns=("pushed", "stuck"),
     ),
-    "rigid bodies": Case(
+    "rigid bodies": OnOffModel(
         {"solid": [BALL | {"density": 500.0}]},
         {"solid": [SWAYING]},
         modules=("fluids.coupling", "warp_lcp.low_rank"),
         files=("fluids/coupling.py", "warp_lcp/operators/low_rank.py"),
         columns=("body0_x", "contacts"),
     ),
-    "ghost-fluid surface": Case(
+    "ghost-fluid surface": OnOffModel(
         {"pressure": {}},
         {"density_correction": {"every": 0}},
         modules=("fluids.pressure_ghost", "warp_lcp.grid.density"),
         files=("fluids/surface.py", "warp_lcp/grid/level_set.py"),
     ),
-    "smoothing": Case({"pressure": {"smoothing": 2}}, {"pressure": {}}),
-    "surface tension": Case(
+    "smoothing": OnOffModel({"pressure": {"smoothing": 2}}, {"pressure": {}}),
+    "surface tension": OnOffModel(
         {"pressure": {}, "surface_tension": {"coefficient": 0.072}},
         {"pressure": {}},
         modules=("fluids.surface_tension",),
         files=("fluids/surface_tension.py",),
     ),
-    "separating walls": Case(
+    "separating walls": OnOffModel(
         {"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/problem/bounds.py",)
     ),
-    "unilateral pressure": Case(
+    "unilateral pressure": OnOffModel(
         {"pressure": {"model": "unilateral"}},
         {"pressure": {}},
         modules=("fluids.unilateral_pressure",),
         files=("fluids/unilateral_pressure.py",),
     ),
-    "FLIP": Case({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}),
-    "density correction": Case(
+    "FLIP": OnOffModel({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}),
+    "density correction": OnOffModel(
         {"density_correction": {}},
         {"density_correction": {"every": 0}},
         modules=("warp_lcp.material.density_correction",),
         files=("warp_lcp/material/density_correction.py",),
         columns=("density_status", "density_iterations", "max_density"),
     ),
-    "reseeding": Case(
+    "reseeding": OnOffModel(
         {"particles": {"reseed": {"every": 1}}},
         modules=("warp_lcp.material.reseeding",),
         files=("warp_lcp/material/reseeding.py",),
         columns=("reseeded",),
     ),
-    "narrow band": Case(
+    "narrow band": OnOffModel(
         {"pressure": {}, "particles": {"narrow_band": {"width": 3.0}}},
         {"pressure": {}},
         modules=("warp_lcp.material.narrow_band", "warp_lcp.grid.semi_lagrangian"),
         files=("warp_lcp/material/narrow_band.py",),
         columns=("interior_density",),
     ),
-    "sources": Case(
+    "sources": OnOffModel(
         {"source": [small_liquids.box([0.9, 0.4], [1.0, 0.5], velocity=[-1.0, 0.0])]},
         modules=("warp_lcp.material.sources",),
         files=("warp_lcp/material/sources.py",),
         columns=("emitted",),
     ),
-    "outlets": Case(
+    "outlets": OnOffModel(
         {"drain": [small_liquids.box([0.0, 0.0], [0.1, 0.1])]},
         modules=("warp_lcp.material.outlets",),
         files=("warp_lcp/material/sources.py",),
         columns=("drained",),
     ),
-    "surface mesh": Case(
+    "surface mesh": OnOffModel(
         {"output": QUIET | {"surface": True}},
         modules=("warp_lcp.grid.surface_mesh", "warp_lcp.grid.marching_cubes"),
         files=("warp_lcp/grid/surface_mesh.py", "warp_lcp/grid/marching_cubes.py"),
     ),
-    "volume": Case(
+    "volume": OnOffModel(
         THICK | {"output": QUIET | {"volume": True}},
         THICK,
         files=("warp_lcp/material/particle_volume.py",),
     ),
-    "diagnostics": Case(
+    "diagnostics": OnOffModel(
         {"pressure": {}, "output": {}},
         {"pressure": {}},
         modules=("warp_lcp.grid.volume",),
         columns=("volume", "max_divergence"),
     ),
-    "automatic tolerance": Case(
+    "automatic tolerance": OnOffModel(
         {"solver": {"tolerance": "auto"}},
         modules=("warp_lcp.tolerance",),
         files=("fluids/tolerance.py",),
         columns=("tolerance", "time_error"),
     ),
-    "probes": Case(
+    "probes": OnOffModel(
         {"probe": [{"name": "a", "position": [0.1, 0.1], "quantity": "pressure"}]},
         modules=("fluids.probes",),
         files=("fluids/probes.py",),
     ),
-    "forces on solids": Case(
+    "forces on solids": OnOffModel(
         {"output": QUIET | {"forces": True}},
         modules=("fluids.forces",),
         files=("fluids/forces.py",),
     ),
-    "drag along walls": Case(
+    "drag along walls": OnOffModel(
         {"wall_drag": {"coefficient": 0.01}},
         modules=("fluids.wall_drag",),
         files=("fluids/wall_drag.py", "fluids/forces.py"),
         columns=("drag_work",),
     ),
-    "rigid bodies in sand": Case(
+    "rigid bodies in sand": OnOffModel(
         {"solid": [BALL | {"density": 500.0}]},
         {"solid": [SWAYING]},
         modules=("granular.bodies",),
@@ -275,31 +275,31 @@ CASES = {
         columns=("body0_x", "contacts"),
         sand=True,
     ),
-    "friction of walls": Case({"friction": 0.4}, {"friction": 0.0}, sand=True),
-    "friction of walls by sweeps": Case(
+    "friction of walls": OnOffModel({"friction": 0.4}, {"friction": 0.0}, sand=True),
+    "friction of walls by sweeps": OnOffModel(
         {"friction": 0.4, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
         {"friction": 0.0, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
         sand=True,
     ),
-    "box of friction": Case(
+    "box of friction": OnOffModel(
         {"friction": {"model": "box"}}, modules=("granular.stress_2d_float32_step_box",), sand=True
     ),
-    "friction that grows with the rate": Case(
+    "friction that grows with the rate": OnOffModel(
         {"friction": {"dynamic_angle": 40.0, "grain_size": 0.01}},
         modules=("granular.stress_2d_float32_step_rate",),
         sand=True,
     ),
-    "sweeps": Case(
+    "sweeps": OnOffModel(
         {"solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
         modules=("granular.interleaved_2d",),
         sand=True,
     ),
-    "gauge": Case({"gauge": {"height": 0.2}}, columns=("flow_rate",), sand=True),
-    "cohesion": Case({"material": {"cohesion": 200.0, "tensile_strength": 50.0}}, sand=True),
-    "diagnostics of sand": Case(
+    "gauge": OnOffModel({"gauge": {"height": 0.2}}, columns=("flow_rate",), sand=True),
+    "cohesion": OnOffModel({"material": {"cohesion": 200.0, "tensile_strength": 50.0}}, sand=True),
+    "diagnostics of sand": OnOffModel(
         {"output": {}}, columns=("yielded", "dissipation", "predicted_excess"), sand=True
     ),
-    "density correction of sand": Case(
+    "density correction of sand": OnOffModel(
         {"density_correction": {}},
         {"density_correction": {"every": 0}},
         modules=("warp_lcp.material.density_correction",),

@@ -9,7 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from default_run import covering
-from warp_lcp.reduced import grid_step_kernels as kernels
+from warp_lcp.subproblems import grid_step_kernels as kernels
 
 
 def started(precision="mixed", faces=None, closed=False):

@@ -11,8 +11,8 @@ import warp_lcp as wl
 from default_run import covering, slow
 from method_steps import begun
 from oracle import assemble, lemke, natural_residual
-from warp_lcp.reduced.low_rank_correction import WoodburyCorrection
-from warp_lcp.reduced.multigrid_coupled import CoupledWorkspace
+from warp_lcp.subproblems.low_rank_correction import WoodburyCorrection
+from warp_lcp.subproblems.multigrid_coupled import CoupledWorkspace
 
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=400)
 

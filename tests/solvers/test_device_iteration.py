@@ -18,7 +18,7 @@ from warp_lcp.kernels.readback import BYTES, LINE, DeviceScalar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
-from warp_lcp.reduced.device_iteration import DeviceIteration
+from warp_lcp.subproblems.device_iteration import DeviceIteration
 
 emulated = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
@@ -198,7 +198,7 @@ def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
     mean = MeanCriteria(
         rtol=0.0, atol=1e-3, max_iterations=50, count=lambda: count_calls.append(1) or float(n)
     )
-    from warp_lcp.problem.solve import solve
+    from warp_lcp.problem.solve_loop import solve
 
     result = solve(problem, SOLVER, stopping=mean)
     plain = wl.solve(

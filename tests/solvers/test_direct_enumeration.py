@@ -13,8 +13,8 @@ import warp_lcp as wl
 from default_run import covering
 from matrices import solve_matrix
 from oracle import boxed, natural_residual
-from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
+from warp_lcp.subproblems.enumeration_kernels import enumeration_kernels
 
 TIGHT = wl.StoppingCriteria(rtol=1e-12)
 

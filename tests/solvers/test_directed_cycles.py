@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from default_run import chosen
-from warp_lcp.reduced.principal_system import principal_system
+from warp_lcp.subproblems.principal_system import principal_system
 
 
 def stochastic(rng, n, kind):

@@ -11,7 +11,7 @@ import warp as wp
 import warp_lcp as wl
 from matrices import operator_of
 from oracle import lemke, natural_residual
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.problem.residual import NaturalResidual
 
 N, EMPTY = 12, (3, 4, 9)

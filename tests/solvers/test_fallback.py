@@ -15,15 +15,15 @@ import warp as wp
 import warp_lcp as wl
 from default_run import few
 from oracle import natural_residual
-from warp_lcp.default_chain import PathCreeps
-from warp_lcp.problem.solve import Step, WorkspaceBase, method_name
+from warp_lcp.default_chain import CentralPathStalls
+from warp_lcp.problem.solve_loop import Step, WorkspaceBase, method_name
 from warp_lcp.solvers.fallback import FIRST, Progress
 
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 LINES = wl.StoppingCriteria(rtol=1e-12, max_iterations=60)
 
 
-class Memory(WorkspaceBase):
+class ToyWorkspace(WorkspaceBase):
     """Memory of a toy method: each start, and its tolerance."""
 
     def start(self, *, warm, tolerance):
@@ -36,7 +36,7 @@ class Memory(WorkspaceBase):
 
 
 @dataclass(frozen=True)
-class Shrink:
+class ContractionMethod:
     """Toy method that multiplies the distance to the solution 1 by a rate."""
 
     rate: float
@@ -46,7 +46,7 @@ class Shrink:
     works: list = field(default_factory=list, compare=False, hash=False)
 
     def init(self, problem):
-        self.works.append(Memory(problem))
+        self.works.append(ToyWorkspace(problem))
         return self.works[-1]
 
     def step(self, problem, work, x):
@@ -57,7 +57,7 @@ class Shrink:
 
 
 @dataclass(frozen=True)
-class Refuses:
+class RefusingMethod:
     """Toy method that refuses the problem."""
 
     name: ClassVar[str] = "refuses"
@@ -109,7 +109,10 @@ def test_the_chain_is_a_plain_loop(first):
     ]
     problem = lines()
     chain = wl.Fallback(
-        *((Shrink(rate, name), when) if when else Shrink(rate, name) for rate, name, when in rows)
+        *(
+            (ContractionMethod(rate, name), when) if when else ContractionMethod(rate, name)
+            for rate, name, when in rows
+        )
     )
     result = wl.solve(problem, chain, stopping=LINES)
     names, distances = plain(rows, problem, 60)
@@ -129,9 +132,11 @@ def test_the_best_iterate_is_handed_on_after_a_failure():
 
     The first method doubles the distance and fails; the second begins at x = 0, the best so far.
     """
-    second = Shrink(0.1, "b")
+    second = ContractionMethod(0.1, "b")
     result = wl.solve(
-        lines(), wl.Fallback(Shrink(2.0, "a", fails_after=3), (second, wl.fails)), stopping=LINES
+        lines(),
+        wl.Fallback(ContractionMethod(2.0, "a", fails_after=3), (second, wl.fails)),
+        stopping=LINES,
     )
     assert result
     np.testing.assert_array_equal(second.works[0].begun, np.zeros(3))
@@ -141,8 +146,8 @@ def test_the_best_iterate_is_handed_on_after_a_failure():
 
 
 def test_the_last_iterate_is_handed_on_otherwise():
-    second = Shrink(0.1, "b")
-    wl.solve(lines(), wl.Fallback(Shrink(0.5, "a"), (second, after(4))), stopping=LINES)
+    second = ContractionMethod(0.1, "b")
+    wl.solve(lines(), wl.Fallback(ContractionMethod(0.5, "a"), (second, after(4))), stopping=LINES)
     np.testing.assert_allclose(second.works[0].begun, 1 - 0.5**4)
 
 
@@ -152,9 +157,11 @@ def test_a_restarted_method_begins_cold_and_hands_on_what_it_was_given(rate):
 
     Whether its own iterates are better or not: the best one is kept for the end.
     """
-    restarted, last = Shrink(rate, "b", fails_after=2), Shrink(0.1, "c")
+    restarted, last = ContractionMethod(rate, "b", fails_after=2), ContractionMethod(0.1, "c")
     chain = wl.Fallback(
-        Shrink(0.5, "a"), wl.FallbackEntry(restarted, after(3), restart=True), (last, wl.fails)
+        ContractionMethod(0.5, "a"),
+        wl.FallbackEntry(restarted, after(3), restart=True),
+        (last, wl.fails),
     )
     assert wl.solve(lines(), chain, stopping=LINES)
     np.testing.assert_array_equal(restarted.works[0].begun, np.zeros(3))
@@ -163,7 +170,10 @@ def test_a_restarted_method_begins_cold_and_hands_on_what_it_was_given(rate):
 
 
 def test_a_batch_counts_as_one_step():
-    chain = wl.Fallback(Shrink(1.0, "a"), wl.FallbackEntry(Shrink(0.5, "b"), after(1), batch=10))
+    chain = wl.Fallback(
+        ContractionMethod(1.0, "a"),
+        wl.FallbackEntry(ContractionMethod(0.5, "b"), after(1), batch=10),
+    )
     result = wl.solve(lines(), chain, stopping=LINES)
     steps = [record for record in result.history if record.method == "b"]
     # The first power below a tenth.
@@ -175,10 +185,10 @@ def test_methods_that_refuse_are_skipped():
     result = wl.solve(
         lines(),
         wl.Fallback(
-            Shrink(1.0, "a"),
-            (Refuses(), after(1)),
+            ContractionMethod(1.0, "a"),
+            (RefusingMethod(), after(1)),
             (wl.ProjectedMultigrid(), after(1)),
-            (Shrink(0.1, "c"), after(3)),
+            (ContractionMethod(0.1, "c"), after(3)),
         ),
         stopping=LINES,
     )
@@ -188,10 +198,12 @@ def test_methods_that_refuse_are_skipped():
 
 def test_a_failure_without_a_successor_is_the_status():
     for chain in (
-        Shrink(0.5, fails_after=2),
-        wl.Fallback(Shrink(0.5, fails_after=2), (Refuses(), wl.fails)),
+        ContractionMethod(0.5, fails_after=2),
+        wl.Fallback(ContractionMethod(0.5, fails_after=2), (RefusingMethod(), wl.fails)),
         wl.Fallback(
-            Shrink(0.5, fails_after=2), (Shrink(0.1, "b"), after(9)), (Shrink(0.1, "c"), wl.fails)
+            ContractionMethod(0.5, fails_after=2),
+            (ContractionMethod(0.1, "b"), after(9)),
+            (ContractionMethod(0.1, "c"), wl.fails),
         ),
     ):
         assert wl.solve(lines(), chain, stopping=LINES).status is wl.SolveStatus.NON_DESCENT
@@ -200,14 +212,14 @@ def test_a_failure_without_a_successor_is_the_status():
 def test_nothing_is_handed_over_at_the_rounding_floor():
     result = wl.solve(
         lines(),
-        wl.Fallback(Shrink(0.1, "a"), (Shrink(0.1, "b"), wl.stalls)),
+        wl.Fallback(ContractionMethod(0.1, "a"), (ContractionMethod(0.1, "b"), wl.stalls)),
         stopping=wl.StoppingCriteria(rtol=0.0),
     )
     assert {record.method for record in result.history} == {"a"}
 
 
 @dataclass(frozen=True)
-class AtFloor:
+class FloorMethod:
     """Toy method that stays next to the solution 1.
 
     The residual there is that of rounding, but not 0.
@@ -216,7 +228,7 @@ class AtFloor:
     name: str = "floor"
 
     def init(self, problem):
-        return Memory(problem)
+        return ToyWorkspace(problem)
 
     def step(self, problem, work, x):
         x.fill_(1 + 4 * np.finfo(float).eps)
@@ -229,11 +241,13 @@ def test_a_restarted_method_hands_over_at_the_rounding_floor():
     An unsuccessful path ends, and the solve with FLOOR, not with MAX_ITERATIONS.
     """
     entries = [
-        wl.FallbackEntry(AtFloor(), after(3), restart=True),
-        (Shrink(1.0, "c", fails_after=2), wl.stalls),
+        wl.FallbackEntry(FloorMethod(), after(3), restart=True),
+        (ContractionMethod(1.0, "c", fails_after=2), wl.stalls),
     ]
     result = wl.solve(
-        lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0)
+        lines(),
+        wl.Fallback(ContractionMethod(0.5, "a"), *entries),
+        stopping=wl.StoppingCriteria(rtol=0.0),
     )
     assert result.status is wl.SolveStatus.FLOOR
     assert result.method == "floor"
@@ -241,16 +255,20 @@ def test_a_restarted_method_hands_over_at_the_rounding_floor():
 
 
 def test_a_method_that_may_not_hand_over_at_the_rounding_floor_is_not_waited_for():
-    entries = [(AtFloor(), after(3)), (Shrink(1.0, "c"), wl.stalls)]
+    entries = [(FloorMethod(), after(3)), (ContractionMethod(1.0, "c"), wl.stalls)]
     result = wl.solve(
-        lines(), wl.Fallback(Shrink(0.5, "a"), *entries), stopping=wl.StoppingCriteria(rtol=0.0)
+        lines(),
+        wl.Fallback(ContractionMethod(0.5, "a"), *entries),
+        stopping=wl.StoppingCriteria(rtol=0.0),
     )
     assert result.status is wl.SolveStatus.FLOOR
     assert {record.method for record in result.history} == {"a", "floor"}
 
 
 def test_slow_linear_solves():
-    chain = wl.Fallback(Shrink(0.9, "a", linear=30), (Shrink(0.1, "b"), wl.slow_linear_solves))
+    chain = wl.Fallback(
+        ContractionMethod(0.9, "a", linear=30), (ContractionMethod(0.1, "b"), wl.slow_linear_solves)
+    )
     result = wl.solve(lines(), chain, stopping=LINES)
     assert [record.method for record in result.history[:3]] == ["a", "a", "b"]
 
@@ -291,8 +309,8 @@ def test_a_slow_interior_point_path_triggers_the_fallback():
         progress = Progress(None, 0.0)
         for k in range(12):
             progress.record(factor**k)
-        assert PathCreeps()(progress) is creeps
-        assert not PathCreeps(steps=30)(progress)
+        assert CentralPathStalls()(progress) is creeps
+        assert not CentralPathStalls(steps=30)(progress)
 
 
 def test_a_workspace_is_used_again():
@@ -300,7 +318,7 @@ def test_a_workspace_is_used_again():
 
     From its own start.
     """
-    first, second = Shrink(0.5, "a", fails_after=3), Shrink(0.1, "b")
+    first, second = ContractionMethod(0.5, "a", fails_after=3), ContractionMethod(0.1, "b")
     problem, chain = lines(), wl.Fallback(first, (second, wl.fails))
     work = chain.init(problem)
     histories = [

@@ -16,9 +16,9 @@ from method_steps import iterates, steps_of
 from oracle import assemble
 from plain_fischer import LEAST_Q, PlainMap, armijo
 from warp_lcp.gallery.contact_scenes import contact
-from warp_lcp.reduced.nonsmooth_map import NonsmoothMap
 from warp_lcp.solvers.fischer_newton import FischerDenseWorkspace, FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
+from warp_lcp.subproblems.nonsmooth_map import NonsmoothMap
 
 BOUNDS = [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25), (-np.inf, np.inf)]
 # A merit with a minimum that is no solution, between the bounds, and its place: A has the

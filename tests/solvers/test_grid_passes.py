@@ -11,7 +11,8 @@ from default_run import covering, slow
 from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.reduced.grid_step_kernels import (
+from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.subproblems.grid_step_kernels import (
     BETA,
     CARRY,
     NORM,
@@ -20,9 +21,8 @@ from warp_lcp.reduced.grid_step_kernels import (
     STEP,
     plan_whole_step_kernel,
 )
-from warp_lcp.reduced.grid_system import GridSystem
-from warp_lcp.reduced.nonsmooth_map import Kink, MapForm, NonsmoothMap
-from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.subproblems.grid_system import GridSystem
+from warp_lcp.subproblems.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 SHAPE = (6, 7, 21)
 FACES = [{}, {"face_y": 3.0}, "arrays"]

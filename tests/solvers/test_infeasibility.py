@@ -10,7 +10,7 @@ import scipy.sparse
 
 import warp_lcp as wl
 from default_run import covering
-from warp_lcp.reduced.dense_problem import (
+from warp_lcp.subproblems.dense_problem import (
     DenseProblem,
     certifies,
     diagonally_dominant,

@@ -18,7 +18,7 @@ ROWS = [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25), (-np.inf, np.inf), (0.75, 0
 EXACT = {"precision": "double", "eta": 1e-14, "predictor_eta": 1e-14, "monotone_cycles": 0}
 
 
-class PlainPath:
+class ReferencePath:
     """Newton's method for y = s - t, w s = v t = tau with w = x - l, v = u - x.
 
     Row by row; rows with l = u do not move.
@@ -207,7 +207,7 @@ def test_steps_are_those_of_the_algorithm(kind, settings, device):
             method,
             work,
             problem,
-            PlainPath(A, b, lower, upper, **settings),
+            ReferencePath(A, b, lower, upper, **settings),
             np.arange(len(b)),
             7,
             1e-8,
@@ -231,7 +231,7 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(bounds, mehrotra):
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), field.reshape(cells.shape), *bounds)
     method = InteriorPoint(mehrotra=mehrotra, **EXACT)
     work = begun(problem, method.init(problem))
-    plain = PlainPath(A, b, *(np.full(n, side) for side in bounds), mehrotra=mehrotra)
+    plain = ReferencePath(A, b, *(np.full(n, side) for side in bounds), mehrotra=mehrotra)
     compare(method, work, problem, plain, problem.layout.places()[fluid], 7, 1e-7)
 
 

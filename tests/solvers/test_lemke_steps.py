@@ -12,7 +12,7 @@ import scipy.sparse
 from warp_lcp.solvers.lemke import BandedBasis, Basis
 
 
-class PlainTableau:
+class ReferenceTableau:
     """Tableau of w - M z - d z0 = q in whole numbers, [Book] appendix C.
 
     Variables are w: 0 ... m-1, z: m ... 2m-1, z0: 2m. The row that leaves has the lexicographically
@@ -94,7 +94,7 @@ def test_pivots_are_those_of_the_lexicographic_rule(band, largest):
         M, q, d = degenerate(seed, 7, band, largest)
         if not (q < 0).any():
             continue
-        plain = PlainTableau(M, q, d)
+        plain = ReferenceTableau(M, q, d)
         bases = [Basis(M.astype(float), q.astype(float), d.astype(float))]
         if band is not None:
             bases.append(
@@ -135,7 +135,7 @@ def test_z0_leaves_as_soon_as_it_may():
             continue
         basis, plain, outcome = (
             Basis(M.astype(float), q.astype(float), d.astype(float)),
-            PlainTableau(M, q, d),
+            ReferenceTableau(M, q, d),
             None,
         )
         while outcome is None:

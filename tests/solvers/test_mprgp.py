@@ -9,7 +9,7 @@ import warp_lcp as wl
 from default_run import covering
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.gallery import (
-    Plant,
+    PlantedSolution,
     ball_obstacle,
     banded,
     definite,
@@ -27,10 +27,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=2000, patience=200)
     ("plant", "shape", "precision"),
     covering(
         [
-            Plant(),
-            Plant(weak=0.5, active=0.6),
-            Plant(boxed=True, mixed=0.2, active=0.5),
-            Plant(active=1.0),
+            PlantedSolution(),
+            PlantedSolution(weak=0.5, active=0.6),
+            PlantedSolution(boxed=True, mixed=0.2, active=0.5),
+            PlantedSolution(active=1.0),
         ],
         [(17, 13), (7, 6, 8)],
         ["mixed", "double"],
@@ -78,7 +78,7 @@ def test_matrices_against_lemke(problem, device):
 
 def test_boxes_against_exhaustive_search():
     for seed in range(20):
-        p = definite(6, plant=Plant(boxed=True, mixed=0.3, active=0.5), seed=seed)
+        p = definite(6, plant=PlantedSolution(boxed=True, mixed=0.3, active=0.5), seed=seed)
         b = np.random.default_rng(seed).standard_normal(6)
         result = wl.solve(
             wl.LCP(wl.DenseOperator(p.A, device="cpu"), b, p.lower, p.upper),
@@ -101,7 +101,7 @@ def test_sparse_multigrid_is_used_and_grid_independent():
 
 
 def test_energy_falls_from_step_to_step_off_grids():
-    p = definite(50, condition=1e3, plant=Plant(active=0.5), seed=8)
+    p = definite(50, condition=1e3, plant=PlantedSolution(active=0.5), seed=8)
     problem, method = p.lcp(device="cpu"), MPRGP()
     work = method.init(problem)
     energies = []

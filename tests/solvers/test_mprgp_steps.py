@@ -10,11 +10,11 @@ import warp as wp
 import warp_lcp as wl
 from method_steps import begun
 from oracle import assemble
-from warp_lcp.reduced.grid_step_kernels import conjugate
 from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.subproblems.grid_step_kernels import conjugate
 
 
-class PlainMPRGP:
+class ReferenceMPRGP:
     """MPRGP preconditioned by the diagonal D.
 
     The residual r = max(min(y, d (x - l)), d (x - u)) has a free part phi, on unknowns off their
@@ -120,7 +120,7 @@ def test_steps_are_those_of_the_algorithm(gamma, device):
             wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper),
             MPRGP(gamma=gamma),
         )
-        work, plain = started(problem, method, x0), PlainMPRGP(A, b, lower, upper, x0, gamma)
+        work, plain = started(problem, method, x0), ReferenceMPRGP(A, b, lower, upper, x0, gamma)
         for k in range(10):
             if work.residual.norm < 1e-9:  # rounding decides there
                 break

@@ -15,11 +15,11 @@ from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.gallery.matrices import semidefinite
 from warp_lcp.gallery.obstacle import ball_obstacle
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.reduced.energy_monitor import NonmonotoneSearch
-from warp_lcp.reduced.nonsmooth_map import Kink, MapForm, NonsmoothMap
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.subproblems.energy_monitor import NonmonotoneSearch
+from warp_lcp.subproblems.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=300)
 KINKS = [k.value for k in Kink]

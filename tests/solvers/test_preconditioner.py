@@ -11,7 +11,7 @@ from scipy.sparse.linalg import LinearOperator, aslinearoperator, spilu
 
 import warp_lcp as wl
 from default_run import covering
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 M = 24
 A = pyamg.gallery.poisson((M, M), format="csr")

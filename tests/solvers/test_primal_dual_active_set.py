@@ -11,14 +11,28 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual
-from warp_lcp.gallery import Plant, banded, contact, definite, period_three, poisson, skewed, splash
+from warp_lcp.gallery import (
+    PlantedSolution,
+    banded,
+    contact,
+    definite,
+    period_three,
+    poisson,
+    skewed,
+    splash,
+)
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 
 
 @pytest.mark.parametrize(
-    "plant", [Plant(), Plant(active=0.8, weak=0.5), Plant(boxed=True, mixed=0.2, active=0.5)]
+    "plant",
+    [
+        PlantedSolution(),
+        PlantedSolution(active=0.8, weak=0.5),
+        PlantedSolution(boxed=True, mixed=0.2, active=0.5),
+    ],
 )
 @pytest.mark.parametrize(
     "make",
@@ -37,7 +51,7 @@ def test_m_matrices_in_few_steps(make, plant):
 
 
 def test_the_set_found_is_the_planted_one_and_the_last_step_ends_it():
-    p = definite(40, condition=10, plant=Plant(active=0.5), seed=3)
+    p = definite(40, condition=10, plant=PlantedSolution(active=0.5), seed=3)
     result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet(), stopping=TIGHT)
     assert result, result.status
     np.testing.assert_array_equal(result.x.numpy() == 0, p.solution == 0)
@@ -62,7 +76,7 @@ def test_period_three_blocks_from_random_starts(boxes):
     rng = np.random.default_rng(71)
     cycled = 0
     for seed in range(40):
-        p = period_three(2, plant=Plant(active=rng.random(), boxed=boxes), seed=seed)
+        p = period_three(2, plant=PlantedSolution(active=rng.random(), boxed=boxes), seed=seed)
         result = wl.solve(
             p.lcp(device="cpu"), PrimalDualActiveSet(), x0=rng.uniform(0, 5, 6), stopping=TIGHT
         )

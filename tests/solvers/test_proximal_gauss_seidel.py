@@ -12,7 +12,7 @@ import scipy.sparse
 import warp_lcp as wl
 from drawn_contacts import FAMILIES, drawn
 from oracle import lemke
-from warp_lcp.contacts.methods import MethodOfChoice
+from warp_lcp.contacts.methods import RegistryContactMethod
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.solvers.proximal_gauss_seidel import colors
 
@@ -319,7 +319,7 @@ def test_redundant_contacts_of_a_pressed_packing_do_not_stall(seed):
     b = p.b + (p.jacobian @ press.ravel()).reshape(p.b.shape)
     assert np.linalg.matrix_rank(p.jacobian.toarray()) < p.b.size
     problem = ContactProblem(p.first, p.second, p.one, p.other, b, p.friction, p.bodies)
-    method = MethodOfChoice(
+    method = RegistryContactMethod(
         "proximal-gauss-seidel", directions=4, tolerance=tolerance, most=most, device="cpu"
     )
     found = method(problem, np.zeros_like(b))

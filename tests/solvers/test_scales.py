@@ -7,7 +7,7 @@ import warp as wp
 
 import warp_lcp as wl
 from default_run import by_turns
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 N = 20
 GRID = np.array([[0] * 5] + [[1] * 5] * 3)

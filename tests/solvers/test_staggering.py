@@ -102,7 +102,7 @@ def test_normal_force_and_friction_meet_at_their_common_solution(pull, device):
 
 
 def test_problems_that_cannot_be_split_are_refused():
-    class Ring:
+    class OperatorWithoutBlocks:
         shape, dtype, device, symmetric = (3,), wp.float64, wp.get_device("cpu"), True
 
         def apply(self, x, out=None):
@@ -116,7 +116,7 @@ def test_problems_that_cannot_be_split_are_refused():
     with pytest.raises(
         ValueError, match=r"Staggering needs an operator with rows .* or blocks .*; Ring has none"
     ):
-        Staggering().init(wl.LCP(Ring(), -np.ones(3)))
+        Staggering().init(wl.LCP(OperatorWithoutBlocks(), -np.ones(3)))
     for settings in ({"blocks": 0}, {"eta": 1.0}, {"max_block_iterations": 0}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             Staggering(**settings)

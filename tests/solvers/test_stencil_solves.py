@@ -205,8 +205,8 @@ def test_coarse_matrices_are_products_of_the_transfers():
     for fine, coarse in itertools.pairwise(hierarchy.levels):
         coarse.x.assign(rng.standard_normal(coarse.x.size) * (coarse.d.numpy() != 0))
         fine.b.zero_()
-        fine.correcting(coarse, add=False).launch()
-        for stage in fine.restricting(coarse):
+        fine.correct_kernel(coarse, add=False).launch()
+        for stage in fine.restrict_kernel(coarse):
             stage.launch()
         product = wp.zeros_like(coarse.x)
         coarse.stencil.product(coarse.x, product)

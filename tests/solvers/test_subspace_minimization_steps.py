@@ -15,7 +15,7 @@ from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 FRICTION = 0.4
 
 
-class PlainSubspace:
+class ReferenceSubspace:
     """Plain loop of [Book] algorithm 7 with eq. 2.92-2.97 and halved corrections.
 
     `bounds(x)` returns both sides at x: with friction those of a tangential force depend on its
@@ -139,7 +139,7 @@ def test_steps_are_those_of_the_algorithm(kind, settings, symmetric, device):
         A = A if symmetric else A + 0.2 * (C - C.T)
         lower, upper = np.array([BOXES[(seed + k) % 4] for k in range(10)]).T
         x0 = np.clip(np.zeros(10), lower, upper)
-        plain = PlainSubspace(A, b, lambda x, l=lower, u=upper: (l, u), x0, **settings)
+        plain = ReferenceSubspace(A, b, lambda x, l=lower, u=upper: (l, u), x0, **settings)
         operator = (
             wl.DenseOperator(A, device=device)
             if kind == "dense"
@@ -176,7 +176,7 @@ def test_friction_is_at_its_limit_before_and_after_a_correction(backtracks, devi
             return np.where(tangential, -limit, 0.0), np.where(tangential, limit, np.inf)
 
         settings = {"sweeps": 1, "solves": 2, "omega": 1.0, "backtracks": backtracks}
-        plain = PlainSubspace(A, b, bounds, np.zeros(12), affine=True, **settings)
+        plain = ReferenceSubspace(A, b, bounds, np.zeros(12), affine=True, **settings)
         problem = wl.LCP(
             wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction(normal, FRICTION)
         )

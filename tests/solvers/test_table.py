@@ -14,7 +14,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, boxed, lemke, natural_residual
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.solvers.registry import METHODS
 
 FAMILIES = ("dense", "sparse", "grid")

@@ -7,7 +7,7 @@ import scipy.sparse
 import warp_lcp as wl
 from default_run import by_turns
 from oracle import boxed, lemke
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=2000, patience=2000)
 

@@ -17,14 +17,14 @@ from warp_lcp.cli.exit_codes import FAILED, WRONG_INPUT, end, wrong_input
 from warp_lcp.cli.solve_file import FileOutcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks, suite_names
-from warp_lcp.cli.view_commands import export, looked_on, render, serve, view
+from warp_lcp.cli.view_commands import export, render, serve, show_while_running, view
 from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.extras.viewer import check_window
 from warp_lcp.files.tables import Tables
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.estimate import doubts, estimate_run
@@ -34,11 +34,11 @@ from warp_lcp.run.launcher import default_folder
 from warp_lcp.run.launcher_choice import launcher_of
 from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
-from warp_lcp.run.profile import Profile
-from warp_lcp.run.progress import Bar, Lines
-from warp_lcp.run.terminal import Commands, Terminal, say, table_lines, tell
+from warp_lcp.run.profile import Profiler
+from warp_lcp.run.progress import ProgressBar, ProgressLines
+from warp_lcp.run.terminal import CommandGroup, Terminal, say, table_lines, tell
 from warp_lcp.run.trial import step_seconds
-from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
+from warp_lcp.run.tune import FRAMES, TuningResult, tune, write_tuned
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene_file import built_in_scenes, fix_file, installed_simulators, load_scene
 from warp_lcp.settings import nearest
@@ -50,7 +50,7 @@ RANKED_SUITE = "scaling"  # suite of `bench --engine petsc`
 
 app = typer.Typer(
     name="warp-lcp",
-    cls=Commands,
+    cls=CommandGroup,
     help="Complementarity solvers and simulators. Exit codes: 0 success, 1 failed or stopped, 2 "
     "wrong input.",
     no_args_is_help=True,
@@ -262,9 +262,12 @@ def run(
         if window:
             check_window(folder)
         stop = Interruption(partial(say, console), at_once=at_once, last=last)
-        with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
-            watch = Profile(chosen_device) if profile and launcher.is_root else None
-            with looked_on(
+        with (
+            stop,
+            ProgressBar(console) if console.is_terminal else ProgressLines(console) as observer,
+        ):
+            watch = Profiler(chosen_device) if profile and launcher.is_root else None
+            with show_while_running(
                 observer, folder, page=page and launcher.is_root, window=window and launcher.is_root
             ) as observers:
                 record = launcher.run(request, observer=observers, stop=stop, profile=watch)
@@ -638,7 +641,7 @@ def _use_threads(count: int | None) -> None:
         raise InputError(str(error).replace("count:", "--threads:")) from None
 
 
-def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
+def _print_tuning(tuning: TuningResult, accuracy: str, device: str) -> None:
     """Print the measurements and the fastest settings."""
     rows = tuning.rows()
     tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))

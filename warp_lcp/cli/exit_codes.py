@@ -10,7 +10,7 @@ from typing import NoReturn, TextIO
 
 import typer
 
-from warp_lcp.run.interruption import Interrupted
+from warp_lcp.run.interruption import RunInterrupted
 from warp_lcp.run.terminal import tell
 from warp_lcp.scene.renamed_keys import RenamedKeyWarning
 from warp_lcp.simulation import InputError
@@ -38,7 +38,7 @@ def wrong_input() -> Iterator[None]:
         ):
             raise
         end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
-    except Interrupted as error:
+    except RunInterrupted as error:
         end(f"stopped: interrupted by {error} before the run began", FAILED)
 
 

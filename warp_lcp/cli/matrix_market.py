@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.files.size_limits import ClaimError, check_claim, free_host_memory, read_whole
+from warp_lcp.files.size_limits import SizeLimitError, check_claim, free_host_memory, read_whole
 
 PACKED: dict[str, Callable[[Path], gzip.GzipFile | bz2.BZ2File]] = {
     ".gz": gzip.open,
@@ -203,7 +203,7 @@ def _text(path: Path, most: int | None = None) -> bytes:
                 return bytes(stream.read(most))
             text: bytes = stream.read(-1 if free is None else free // COPIES)
             if free is not None and stream.read(1):
-                raise ClaimError("its unpacked content does not fit into the free memory")
+                raise SizeLimitError("its unpacked content does not fit into the free memory")
     except (EOFError, zlib.error, MemoryError) as error:
         raise MarketError(f"cannot be unpacked: {error}") from error
     return text

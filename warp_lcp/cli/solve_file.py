@@ -13,14 +13,14 @@ import scipy.sparse
 from rich.table import Table
 
 from warp_lcp.cli.matrix_market import Fits, MarketError, Matrix, read_market, read_shape
-from warp_lcp.default import solve
 from warp_lcp.files.atomic import replacing
+from warp_lcp.method_selection import solve
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.settings import SettingError

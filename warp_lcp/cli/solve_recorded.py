@@ -15,13 +15,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.cli.solve_file import FileOutcome, criteria, method_named
-from warp_lcp.default import solve
 from warp_lcp.default_chain import default_chain
 from warp_lcp.files.atomic import replacing, replacing_by_name
 from warp_lcp.files.tables import Tables
+from warp_lcp.method_selection import solve
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import FLOAT32_ROUNDING
+from warp_lcp.problem.operator_protocol import FLOAT32_ROUNDING
 from warp_lcp.recorded_problem import cell_counts, load_part
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid

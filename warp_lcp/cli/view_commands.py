@@ -28,16 +28,16 @@ from warp_lcp.render.photo.photo import (
     photograph_film,
     photograph_run,
 )
-from warp_lcp.render.recording import Color, Recording, RenderError, Show
-from warp_lcp.render.render import Looks, film_run, parse_size, render_run
+from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
+from warp_lcp.render.render import ImageStyle, film_run, parse_size, render_run
 from warp_lcp.run.devices import devices
 from warp_lcp.run.log import Value
-from warp_lcp.run.progress import Count, Observer
+from warp_lcp.run.progress import Observer, ProgressCounter
 from warp_lcp.run.terminal import Terminal, say, tell
 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Run folder.")]
 ShowOption = Annotated[
-    Show | None,
+    VisiblePart | None,
     typer.Option(
         help="Parts to show. Default: the surface if the run wrote one, else particles, else "
         "bodies.",
@@ -61,7 +61,7 @@ CameraOption = Annotated[
 ]
 
 
-class RenderLook(StrEnum):
+class ImageRenderer(StrEnum):
     """Renderer of images."""
 
     QUICK = "quick"
@@ -71,8 +71,8 @@ class RenderLook(StrEnum):
 def render(
     folder: RunArgument,
     look: Annotated[
-        RenderLook, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")
-    ] = RenderLook.QUICK,
+        ImageRenderer, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")
+    ] = ImageRenderer.QUICK,
     frame: Annotated[
         list[int] | None,
         typer.Option(
@@ -154,15 +154,15 @@ def render(
             console,
             "drawing takes about "
             f"{timedelta(seconds=math.ceil(seconds))}"
-            f"{'' if look is RenderLook.PHOTO else ' on one core'}",
+            f"{'' if look is ImageRenderer.PHOTO else ' on one core'}",
         )
 
-    with wrong_input(), Count(console, "drawing", "images") as counter:
+    with wrong_input(), ProgressCounter(console, "drawing", "images") as counter:
         frame = [
             *(frame or ()),
             *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ()),
         ]
-        if look is RenderLook.PHOTO:
+        if look is ImageRenderer.PHOTO:
             if fps is not None and film is None:
                 raise RenderError("--fps: needs --film")
             refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)
@@ -195,7 +195,7 @@ def render(
             raise RenderError(
                 f"--{'shutter' if samples is None else 'samples'}: needs --look photo"
             )
-        looks = Looks(
+        looks = ImageStyle(
             size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ()
         )
         if film is not None:
@@ -266,7 +266,7 @@ def view(
     """
     devices()
     with wrong_input():
-        view_run(folder, Looks(color=color, show=show, overrides=overrides or ()))
+        view_run(folder, ImageStyle(color=color, show=show, overrides=overrides or ()))
 
 
 def serve(
@@ -320,14 +320,14 @@ def export(
     Needs the extra `usd`.
     """
     devices()
-    with wrong_input(), Count(Terminal(stderr=True), "writing", "frames") as told:
+    with wrong_input(), ProgressCounter(Terminal(stderr=True), "writing", "frames") as told:
         count = len(
             list(export_run(folder, out, show=show, first=first, last=last, on_progress=told))
         )
     tell(f"{out}: {count} frames")
 
 
-class _BegunRun:
+class _StartObserver:
     """Observer that forwards all events and calls a function at the start."""
 
     def __init__(self, observer: Observer, begin: Callable[[], None]) -> None:
@@ -352,7 +352,9 @@ class _BegunRun:
 
 
 @contextmanager
-def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> Iterator[Observer]:
+def show_while_running(
+    observer: Observer, folder: Path, *, page: bool, window: bool
+) -> Iterator[Observer]:
     """Show a web page or a window of a run once its folder exists.
 
     The window runs in another process, and stays open.
@@ -369,4 +371,4 @@ def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> 
                     start_new_session=True,
                 )
 
-        yield _BegunRun(observer, begin) if page or window else observer
+        yield _StartObserver(observer, begin) if page or window else observer

@@ -13,7 +13,7 @@ from warp_lcp.default_chain import default_chain
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Solver, solve
+from warp_lcp.problem.solve_loop import Solver, solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import CountOrZero, NonNegative, Positive, Settings
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting

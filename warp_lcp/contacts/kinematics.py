@@ -23,7 +23,7 @@ COLUMNS = ("target_error", "solver", "solve_status", "solve_iterations", "solve_
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class TargetPath:
     """Target path of a point of a body.
 
     Args:
@@ -75,7 +75,7 @@ def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
 
 
 def figure_of(
-    joints: Sequence[Joint], order: Sequence[int], targets: Sequence[Target], dimension: int
+    joints: Sequence[Joint], order: Sequence[int], targets: Sequence[TargetPath], dimension: int
 ) -> ArticulatedFigure:
     """Return the articulated figure of hinges and targets, in the order of `tree_of`."""
     place = {joints[number].first: index for index, number in enumerate(order)}
@@ -119,7 +119,7 @@ class KinematicSimulation:
     def __init__(
         self,
         bodies: RigidBodies,
-        targets: Sequence[Target],
+        targets: Sequence[TargetPath],
         solver: InverseKinematics,
         method: str,
         dt: float,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 import warp_lcp as wl
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,
@@ -62,7 +62,7 @@ KINEMATIC = (
 assert {*BOXED, *STEWART_TRINKLE, *CONE} <= METHODS.keys()
 
 
-class MethodOfChoice:
+class RegistryContactMethod:
     """Solve the contact problem of a step by a method of `wl.METHODS`.
 
     It implements `ImpulseSolver`.

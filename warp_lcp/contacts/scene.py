@@ -8,14 +8,14 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
-from warp_lcp.contacts.kinematics import Target, tree_of
+from warp_lcp.contacts.kinematics import TargetPath, tree_of
 from warp_lcp.contacts.methods import BOXED, CONE, DEFAULT, JOINTED, KINEMATIC, STEWART_TRINKLE
-from warp_lcp.problem.solve import PrecisionName
+from warp_lcp.problem.solve_loop import PrecisionName
 from warp_lcp.rigid.joints import WORLD, Joint, JointKind
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene import MOST_CELLS, Domain, Output, Scene
 from warp_lcp.scene.shapes import SolidProperties
-from warp_lcp.scene.table import Complaint, Table, Vector, counted
+from warp_lcp.scene.table import CrossKeyError, Table, Vector, counted
 from warp_lcp.settings import Count, Positive, Share
 
 NO_MATERIAL = "there is no material, only bodies move"
@@ -91,13 +91,13 @@ class JointTable(Table):
         default=None, description="largest torque of the motor [N m]"
     )
 
-    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[Complaint]:
+    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[CrossKeyError]:
         """Return errors of the joint among these solids in 2 or 3 dimensions."""
         complaints, hinge = [], self.kind == "hinge"
         for number in self.solids:
             if not 0 <= number < len(solids):
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("solids",),
                         self.solids,
                         f"must be numbers of [[solid]]s, from 0 to {len(solids) - 1}",
@@ -105,7 +105,7 @@ class JointTable(Table):
                 )
             elif solids[number].motion is not None:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("solids",),
                         self.solids,
                         f"solid[{number}] has a motion: bodies can be joined only to a fixed solid",
@@ -113,46 +113,48 @@ class JointTable(Table):
                 )
         if not complaints and not solids[self.solids[0]].is_body:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("solids",),
                     self.solids,
                     "the first must be a rigid body: give it a density or a mass",
                 )
             )
         if len(set(self.solids)) < len(self.solids):
-            complaints.append(Complaint(("solids",), self.solids, "must differ"))
+            complaints.append(CrossKeyError(("solids",), self.solids, "must differ"))
         for key in ("anchor", "axis"):
             value = getattr(self, key)
             if value is not None and len(value) != dimension:
                 complaints.append(
-                    Complaint((key,), value, f"must {counted(dimension)} in {dimension}-D")
+                    CrossKeyError((key,), value, f"must {counted(dimension)} in {dimension}-D")
                 )
         for key in ("axis", "limits", "motor_speed", "motor_torque"):
             if not hinge and getattr(self, key) is not None:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         (key,), getattr(self, key), f"is only for hinges: this joint is {self.kind}"
                     )
                 )
         if (self.motor_speed is None) != (self.motor_torque is None):
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("motor_torque",), self.motor_torque, "must be given together with motor_speed"
                 )
             )
         if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
             complaints.append(
-                Complaint(("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero")
+                CrossKeyError(
+                    ("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero"
+                )
             )
         if hinge and dimension == 2 and self.axis is not None:
             complaints.append(
-                Complaint(("axis",), self.axis, "must be left out in 2-D, where it is z")
+                CrossKeyError(("axis",), self.axis, "must be left out in 2-D, where it is z")
             )
         if self.kind == "ball" and dimension == 2:
-            complaints.append(Complaint(("kind",), self.kind, "must be hinge in 2-D"))
+            complaints.append(CrossKeyError(("kind",), self.kind, "must be hinge in 2-D"))
         if self.limits is not None and not -180.0 <= self.limits[0] <= self.limits[1] <= 180.0:
             complaints.append(
-                Complaint(("limits",), self.limits, "must be in order and within 180 degrees")
+                CrossKeyError(("limits",), self.limits, "must be in order and within 180 degrees")
             )
         return complaints
 
@@ -187,12 +189,12 @@ class TargetTable(Table):
         min_length=1, description="its places at these times [m], straight lines between"
     )
 
-    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[Complaint]:
+    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[CrossKeyError]:
         """Return errors of the target among these solids in 2 or 3 dimensions."""
         complaints = []
         if self.solid >= len(solids) or not solids[self.solid].is_body:
             complaints.append(
-                Complaint(("solid",), self.solid, "must be the number of a rigid body")
+                CrossKeyError(("solid",), self.solid, "must be the number of a rigid body")
             )
         for place, value in [
             (("point",), self.point),
@@ -200,13 +202,13 @@ class TargetTable(Table):
         ]:
             if len(value) != dimension:
                 complaints.append(
-                    Complaint(place, value, f"must {counted(dimension)} in {dimension}-D")
+                    CrossKeyError(place, value, f"must {counted(dimension)} in {dimension}-D")
                 )
         if not (np.diff(self.times) > 0.0).all():
-            complaints.append(Complaint(("times",), self.times, "must increase"))
+            complaints.append(CrossKeyError(("times",), self.times, "must increase"))
         if len(self.places) != len(self.times):
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("places",),
                     self.places,
                     f"must have {len(self.times)} entries, one for each time",
@@ -251,30 +253,32 @@ class ContactScene(Scene):
         """Return the joints, with the numbers of their bodies."""
         return [table.to_joint(self.body_numbers()) for table in self.joint]
 
-    def targets(self) -> list[Target]:
+    def targets(self) -> list[TargetPath]:
         """Return the targets of inverse kinematics."""
         rows = [
             (table, np.array([[*row, 0.0][:3] for row in [table.point, *table.places]]))
             for table in self.target
         ]
         return [
-            Target(self.body_numbers()[table.solid], of[0], np.array(table.times), of[1:])
+            TargetPath(self.body_numbers()[table.solid], of[0], np.array(table.times), of[1:])
             for table, of in rows
         ]
 
-    def complaints(self) -> list[Complaint]:
+    def complaints(self) -> list[CrossKeyError]:
         """Return errors that involve several keys."""
         complaints = super().complaints()
         if not any(solid.is_body for solid in self.solid):
             complaints.append(
-                Complaint(("solid",), None, "has no rigid body: give one a density or a mass")
+                CrossKeyError(("solid",), None, "has no rigid body: give one a density or a mass")
             )
         for key in ("particles", "grid", "surface", "volume", "forces"):
             if getattr(self.output, key):
-                complaints.append(Complaint(("output", key), True, f"must be false: {NO_MATERIAL}"))
+                complaints.append(
+                    CrossKeyError(("output", key), True, f"must be false: {NO_MATERIAL}")
+                )
         if self.physics.density != type(self.physics).model_fields["density"].default:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("physics", "density"),
                     self.physics.density,
                     f"{NO_MATERIAL}; density is a key of each [[solid]]",
@@ -283,7 +287,7 @@ class ContactScene(Scene):
         for key, usual in (("wall", "separating"), ("solids", "cut-cell"), ("follow", True)):
             if getattr(self.domain, key) != usual:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("domain", key),
                         getattr(self.domain, key),
                         f"must be left out: {NO_MATERIAL}",
@@ -291,7 +295,7 @@ class ContactScene(Scene):
                 )
         if self.solver.preset is not None:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("solver", "preset"),
                     self.solver.preset,
                     "must be left out for bodies alone: give time.dt_max and solver.tolerance",
@@ -299,7 +303,7 @@ class ContactScene(Scene):
             )
         if self.solver.precision != "double":
             complaints.append(
-                Complaint(("solver", "precision"), self.solver.precision, "must be double")
+                CrossKeyError(("solver", "precision"), self.solver.precision, "must be double")
             )
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
             incompatible = (
@@ -311,27 +315,29 @@ class ContactScene(Scene):
                 f"is only for the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} "
                 f"{incompatible}"
             )
-            complaints.append(Complaint(("solver", "directions"), self.solver.directions, message))
+            complaints.append(
+                CrossKeyError(("solver", "directions"), self.solver.directions, message)
+            )
         return (
             complaints
             + (self._joint_complaints() if self.joint else [])
             + (self._target_complaints() if self.target else [])
         )
 
-    def _target_complaints(self) -> list[Complaint]:
+    def _target_complaints(self) -> list[CrossKeyError]:
         """Return errors of targets and of the bodies that they move."""
         complaints = [
-            Complaint(("target", index, *c.place), c.value, c.message)
+            CrossKeyError(("target", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.target)
             for c in table.complaints(self.dimension, self.solid)
         ]
         if self.solver.method not in KINEMATIC:
             message = f"cannot be used for inverse kinematics; choose from {', '.join(KINEMATIC)}"
-            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(CrossKeyError(("solver", "method"), self.solver.method, message))
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("joint", index, "motor_torque"),
                         table.motor_torque,
                         "must be left out: targets move the bodies",
@@ -341,13 +347,13 @@ class ContactScene(Scene):
             try:
                 tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
             except ValueError as error:
-                complaints.append(Complaint(("target",), None, str(error)))
+                complaints.append(CrossKeyError(("target",), None, str(error)))
         return complaints
 
-    def _joint_complaints(self) -> list[Complaint]:
+    def _joint_complaints(self) -> list[CrossKeyError]:
         """Return errors of joints, and of keys that exclude joints."""
         complaints = [
-            Complaint(("joint", index, *c.place), c.value, c.message)
+            CrossKeyError(("joint", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.joint)
             for c in table.complaints(self.dimension, self.solid)
         ]
@@ -356,17 +362,17 @@ class ContactScene(Scene):
                 "cannot solve joints, which are equations; choose from "
                 f"{', '.join((*BOXED, *STEWART_TRINKLE))}"
             )
-            complaints.append(Complaint(("solver", "method"), self.solver.method, message))
+            complaints.append(CrossKeyError(("solver", "method"), self.solver.method, message))
         if self.domain.open:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("domain", "open"), self.domain.open, "must be left out in a scene with joints"
                 )
             )
         for index, solid in enumerate(self.solid):
             if solid.restitution:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("solid", index, "restitution"),
                         solid.restitution,
                         "must be 0 where there are joints",

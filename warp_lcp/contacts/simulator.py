@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_lcp.contacts.inverse_kinematics import InverseKinematics
 from warp_lcp.contacts.kinematics import KinematicSimulation
-from warp_lcp.contacts.methods import MethodOfChoice
+from warp_lcp.contacts.methods import RegistryContactMethod
 from warp_lcp.contacts.scene import ContactScene
 from warp_lcp.material.particle_assembly import make_bodies, placed_solids
 from warp_lcp.rigid.bodies import RigidBodies
@@ -46,7 +46,9 @@ class ContactSimulation:
         watch: measures the stages of a step.
     """
 
-    def __init__(self, scene: ContactScene, bodies: RigidBodies, method: MethodOfChoice) -> None:
+    def __init__(
+        self, scene: ContactScene, bodies: RigidBodies, method: RegistryContactMethod
+    ) -> None:
         self.scene, self.bodies, self._method = scene, bodies, method
         bodies.material = False
         self.time, self.step_count, self._last_dt = 0.0, 0, 0.0
@@ -170,7 +172,7 @@ class ContactSimulator:
         if not isinstance(scene, ContactScene):
             raise ValueError("scene.simulator: contacts needs a scene of rigid bodies")
         solver = scene.solver
-        method = MethodOfChoice(
+        method = RegistryContactMethod(
             solver.method,
             directions=solver.directions,
             tolerance=solver.tolerance,

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warp_lcp.distributed.decomposition import OPEN, Decomposition, Triple, cuttings, parts, seen_by
+from warp_lcp.distributed.decomposition import (
+    OPEN,
+    Decomposition,
+    Triple,
+    cells_with_ghosts,
+    cuttings,
+    parts,
+)
 from warp_lcp.grid.particles import Particles
 from warp_lcp.multigrid.halo_levels import GATHERED
 
@@ -28,7 +35,7 @@ Parts = list[list[int]]  # cells of each box along x, y, z
 
 
 @dataclass(frozen=True)
-class Load:
+class WorkLoad:
     """Work of a step, by blocks of cells.
 
     Cuts lie between blocks, so that the levels of multigrid that ranks share end at them.
@@ -113,7 +120,7 @@ class Load:
         n, ranks, other_axes = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
         ends = np.append(np.arange(0, n, self.edge), n)
         beside, material = (
-            seen_by(self.counts, [*cut[:axis], [n], *cut[axis + 1 :]], self.layers),
+            cells_with_ghosts(self.counts, [*cut[:axis], [n], *cut[axis + 1 :]], self.layers),
             np.moveaxis(self.material, axis, 0),
         )
         for place, other in enumerate(other_axes, start=1):
@@ -191,7 +198,7 @@ class Balance:
             n / a_cell + OPEN * seen
             for n, seen in zip(
                 particles.exchange.counts,
-                seen_by(now.counts, now.parts, layers).ravel("F"),
+                cells_with_ghosts(now.counts, now.parts, layers).ravel("F"),
                 strict=True,
             )
         ]
@@ -200,7 +207,7 @@ class Balance:
             return None
         # Each rank searches its share of the box counts; the best result of all ranks counts.
         edge = edge_of_blocks(now.counts, part.ranks.size)
-        load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
+        load = WorkLoad(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
         # The present boxes stay if no boxes end between blocks.
         least, cut = min(

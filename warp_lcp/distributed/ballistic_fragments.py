@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.components import GROUND, joined, nodes_of
-from warp_lcp.grid.part import BodyNumbers
+from warp_lcp.grid.grid_part import BodyNumbers
 from warp_lcp.grid.staggered import Window
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ ALONE = -1  # a cell that belongs to no body
 Plane = tuple[tuple[slice, ...], np.ndarray]  # cells, and their nodes
 
 
-class TreesAtCuts:
+class FragmentMerger:
     """Joins the trees of several ranks to bodies.
 
     A rank grows the trees of its cells and of those beside them at cuts, where weights are correct.

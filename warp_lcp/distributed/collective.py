@@ -35,7 +35,7 @@ class RankFailed(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Failure:
+class RankException:
     """Error of a rank.
 
     Args:
@@ -70,7 +70,7 @@ class Collective:
         failed: the ranks on which the last block failed.
         watchdog: deadlock watchdog, or None.
 
-    >>> alone = Collective.of_one()
+    >>> alone = Collective.for_one_process()
     >>> with alone.together():
     ...     raise OSError("the disk is full")
     Traceback (most recent call last):
@@ -94,7 +94,7 @@ class Collective:
         self._raised: BaseException | None = None  # exception that a block has raised on all ranks
 
     @classmethod
-    def of_one(cls) -> Collective:
+    def for_one_process(cls) -> Collective:
         """Return the collective of a single process; needs no MPI."""
         return cls(Ranks(SimpleNamespace(rank=0, size=1)))
 
@@ -102,7 +102,7 @@ class Collective:
         """Return the context of a block that all ranks execute."""
         return self._block(named=True)
 
-    def led(self) -> AbstractContextManager[None]:
+    def root_only(self) -> AbstractContextManager[None]:
         """Return the context of a block that the root rank executes for all."""
         return self._block(named=False)
 
@@ -166,16 +166,18 @@ class Collective:
         self._raised = _joined(fresh or failed, named)
         raise self._raised from error
 
-    def _failure(self, error: BaseException | None) -> Failure | None:
+    def _failure(self, error: BaseException | None) -> RankException | None:
         if error is None:
             return None
         planned = isinstance(error, self._planned)
         kind = type(error) if planned else RankFailed
         text = str(error) if planned else f"{type(error).__name__}: {error}"
         errno = error.errno if isinstance(error, OSError) else None
-        return Failure(kind, text, errno, planned, error is self._raised)
+        return RankException(kind, text, errno, planned, error is self._raised)
 
-    def _meet(self, error: BaseException | None, failure: Failure | None) -> list[Failure | None]:
+    def _meet(
+        self, error: BaseException | None, failure: RankException | None
+    ) -> list[RankException | None]:
         """Gather the outcome of a block on every rank."""
         if self.ranks.size == 1:
             return [failure]
@@ -184,7 +186,9 @@ class Collective:
                 met = finish(self._own.comm.Ibarrier(), math.inf if error is None else PATIENCE)
             if error is not None and not met:
                 self._end_all(error)
-            found: list[tuple[int, Failure | None]] = self._own.collect((self._depth, failure))
+            found: list[tuple[int, RankException | None]] = self._own.collect(
+                (self._depth, failure)
+            )
             if max(depth for depth, _ in found) <= self._depth or failure is None:
                 return [other for _, other in found]
             # A rank that failed between two blocks meets ranks that were still inside one: they
@@ -209,7 +213,7 @@ class Collective:
         self.ranks.comm.Abort(1)
 
 
-def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
+def _joined(failed: list[tuple[int, RankException]], named: bool) -> BaseException:
     """Return one exception for the failures of some ranks."""
     first = failed[0][1]
     texts = list(_lines(failed)) if named else [first.text]
@@ -221,7 +225,7 @@ def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
     return error
 
 
-def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
+def _lines(failed: list[tuple[int, RankException]]) -> Iterator[str]:
     """Yield a line for each different message."""
     ranks: dict[str, list[int]] = {}
     for rank, failure in failed:
@@ -261,7 +265,7 @@ def on_root(
     def collective(
         self: HasCollectiveT, *arguments: ArgumentsT.args, **options: ArgumentsT.kwargs
     ) -> ResultT | None:
-        with self.collective.led():
+        with self.collective.root_only():
             return method(self, *arguments, **options) if self.collective.ranks.is_root else None
 
     return collective

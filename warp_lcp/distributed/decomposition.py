@@ -355,7 +355,7 @@ def _most_work(
 ) -> float:
     """Return the work of the busiest rank, in cells full of material."""
     low, high = _ends(cuts)
-    work = OPEN * seen_by(counts, cuts, layers)
+    work = OPEN * cells_with_ghosts(counts, cuts, layers)
     for corners in state:
         work += _of_boxes(
             [
@@ -366,7 +366,7 @@ def _most_work(
     return float(work.max())
 
 
-def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.ndarray:
+def cells_with_ghosts(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.ndarray:
     """Return the number of cells of each box with its ghost layers.
 
     Shape (boxes along x, y, z).

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 LEAST_RIGHT = 2
 
 
-def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
+def displacement_beyond_ghosts(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
     """Return the largest displacement [cells] that may leave the ghost layers.
 
     Returns 0 if no particle can leave them. A particle reads faces up to three quarters of its path
@@ -46,7 +46,7 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
     return worst
 
 
-class Refill:
+class GhostLayerExchange:
     """Halo exchange of ghost layers during velocity extrapolation.
 
     The extrapolation calls it after every layer. Ghost layers are filled before wrong values in

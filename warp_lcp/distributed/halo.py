@@ -14,11 +14,11 @@ import warp as wp
 
 from warp_lcp.distributed.components import GROUND, joined, nodes_of
 from warp_lcp.distributed.launch import petsc
-from warp_lcp.distributed.messages import exchange, exchanging
+from warp_lcp.distributed.messages import exchange, exchange_operation
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
+from warp_lcp.kernels.launch_graph import HostTask, Launch, launch_now
 from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:
@@ -144,9 +144,9 @@ class Halo:
         )
 
     @cached_property
-    def gathering(self) -> Gathering:
+    def field_gather(self) -> GridGather:
         """Gathering of the fields of all ranks on every rank."""
-        return Gathering(self.decomposition)
+        return GridGather(self.decomposition)
 
     def fill(self, field: DeviceArray | np.ndarray) -> None:
         """Halo exchange: fill the ghost cells of a contiguous field; collective.
@@ -160,17 +160,17 @@ class Halo:
             return
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
-    def filling(self, field: DeviceArray) -> Task:
+    def fill_task(self, field: DeviceArray) -> HostTask:
         """Return the halo exchange of a field, to run now or within a recorded program.
 
         For more than one rank.
         """
         if field.device.is_cuda:
-            return Task(partial(self.fill, field))
+            return HostTask(partial(self.fill, field))
         assert self._forest is not None
-        return Task(
+        return HostTask(
             partial(self.fill, field),
-            partial(exchanging, self._forest, field.numpy(), field.numpy()),
+            partial(exchange_operation, self._forest, field.numpy(), field.numpy()),
         )
 
     def _fill_through_host(self, field: DeviceArray) -> None:
@@ -207,7 +207,7 @@ class Halo:
         return slabs
 
 
-class Gathering:
+class GridGather:
     """Gathers a field of all boxes into one field of the whole grid on every rank.
 
     Both fields have one layer of ghost cells.
@@ -237,13 +237,13 @@ class Gathering:
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def collecting(self, own_part: DeviceArray, whole: DeviceArray) -> Task:
+    def collect_task(self, own_part: DeviceArray, whole: DeviceArray) -> HostTask:
         """Return `collect`, now or among the launches of a program."""
         if whole.device.is_cuda:
-            return Task(partial(self.collect, own_part, whole))
-        return Task(
+            return HostTask(partial(self.collect, own_part, whole))
+        return HostTask(
             partial(self.collect, own_part, whole),
-            partial(exchanging, self._forest, own_part.numpy(), whole.numpy()),
+            partial(exchange_operation, self._forest, own_part.numpy(), whole.numpy()),
         )
 
     def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:

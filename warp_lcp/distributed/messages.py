@@ -239,12 +239,14 @@ def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarra
                 )
 
 
-def exchanging(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
+def exchange_operation(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
     """Return `exchange` as an operation of the thread pool."""
-    return exchanging_all(forest, [(roots, leaves)])
+    return exchange_all_operation(forest, [(roots, leaves)])
 
 
-def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Operation:
+def exchange_all_operation(
+    forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> Operation:
     """Return `exchange_all` as an operation of the thread pool."""
     library = _library()
     functions = (ctypes.cast(call, ctypes.c_void_p).value for call in (library.begin, library.end))
@@ -263,7 +265,7 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
     return _operation(exchange_kernel, kernel_args, (forest, words, pairs))
 
 
-def adding(comm: MPI.Comm, sums: np.ndarray) -> Operation:
+def sum_operation(comm: MPI.Comm, sums: np.ndarray) -> Operation:
     """Return an operation that replaces float64 sums by those over all ranks.
 
     The partial sums are added in the order of the ranks. The operation runs in the thread pool.

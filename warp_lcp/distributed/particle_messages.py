@@ -15,7 +15,7 @@ from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.grid.particles import MOST_A_CELL, Particles
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import LaunchGraph
-from warp_lcp.kernels.memory import Scalar, Slot
+from warp_lcp.kernels.recorded_arguments import Scalar, Slot
 from warp_lcp.kernels.types import DeviceArray
 
 if TYPE_CHECKING:

@@ -44,7 +44,7 @@ def take_pieces(
         ValueError: the pieces do not belong to this scene, or do not cover the domain; on all
             ranks.
     """
-    with part.decomposition.collective.led():
+    with part.decomposition.collective.root_only():
         fields = fields_of(like)
         alike = (*CLOCK, *(name for name in like if name not in fields), "signature", "counts")
         numbers = _numbers(

@@ -25,8 +25,8 @@ from warp_lcp.distributed.particle_messages import (
     ParticleMessages,
     bounds_of,
 )
-from warp_lcp.distributed.summation_order import PlaceOrder
-from warp_lcp.grid.part import ParticleExchange
+from warp_lcp.distributed.summation_order import SummationOrder
+from warp_lcp.grid.grid_part import ParticleExchange
 from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.particles import NEW, Particles, ParticleTotals
 
@@ -63,7 +63,7 @@ class ParticleMigration(ParticleExchange):
         self.part, decomposition, around = part, part.decomposition, part.box.grown(REACH)
         # Indices of this rank's own particles, or how many of the first; None: all.
         self._own: np.ndarray | int | None = None
-        self._lying: PlaceOrder | None = None  # order of this rank's particles; None: not known
+        self._lying: SummationOrder | None = None  # order of this rank's particles; None: not known
         self._neighbors = [
             r
             for r, box in enumerate(decomposition.boxes)
@@ -157,7 +157,7 @@ class ParticleMigration(ParticleExchange):
         assert isinstance(self._own, int), "ghosts lie behind the others"
         if self._lying is None:
             self._order_first(self._own)
-            self._lying = PlaceOrder(self.place[: self._own].copy())
+            self._lying = SummationOrder(self.place[: self._own].copy())
         runs = self._lying.runs(self.place, self._own)
         self.particles.set_runs(wp.array(runs, dtype=wp.int32, device=self.part.grid.device))
 
@@ -207,7 +207,7 @@ class ParticleMigration(ParticleExchange):
         self._counts, self._added = self.part.ranks.gather(self.particles.count).ravel().tolist(), 0
         self._expected = sum(self._counts)
 
-    def appended(self, count: int) -> None:
+    def register_append(self, count: int) -> None:
         """Assign the next places to new particles, which are stored behind the others."""
         self.add_places(max(NEW, 1 + int(self.place.max(initial=0))) + np.arange(count))
 
@@ -216,7 +216,7 @@ class ParticleMigration(ParticleExchange):
         self.place, self._lying = np.append(self.place, places), None
         self._added += len(places)
 
-    def removing(self, marks: wp.array) -> None:
+    def register_removal(self, marks: wp.array) -> None:
         """Drop the places of particles that are about to be removed."""
         before = len(self.place)
         self.place, self._lying = self.place[marks.numpy()[: self.particles.count] == 0], None
@@ -231,7 +231,7 @@ class ParticleMigration(ParticleExchange):
         elif mine is not None:
             self._take(np.flatnonzero(mine))
             self.particles.number()
-            self._lying = PlaceOrder(self.place.copy())
+            self._lying = SummationOrder(self.place.copy())
 
     def joined_totals(self, own_totals: ParticleTotals) -> ParticleTotals:
         """Return sums over all ranks' particles; there must be no ghosts."""

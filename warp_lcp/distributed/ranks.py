@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.launch import petsc
-from warp_lcp.distributed.messages import adding
+from warp_lcp.distributed.messages import sum_operation
 from warp_lcp.kernels.thread_pool import Operation
 
 if TYPE_CHECKING:
@@ -98,12 +98,12 @@ class Ranks:
         """Return the sum over the ranks of a number or an array."""
         return self._shaped(self.gather(values).sum(axis=0), values)
 
-    def adding(self, sums: np.ndarray) -> Operation:
+    def sum_operation(self, sums: np.ndarray) -> Operation:
         """Return an operation that replaces float64 sums by their sum over the ranks.
 
         It works in place and runs among the launches of the thread pool.
         """
-        return adding(self.comm, sums)
+        return sum_operation(self.comm, sums)
 
     def total(self, counts: np.ndarray) -> np.ndarray:
         """Return the sum over the ranks of an integer array; exact in any order."""
@@ -210,12 +210,12 @@ def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
     of_machine.Free()
     found = [device.alias for device in wp.get_cuda_devices()]
     try:
-        return dealt(name, number, found)
+        return device_by_number(name, number, found)
     except ValueError as error:
         raise ValueError(f"{error} (rank {ranks.rank})") from error
 
 
-def dealt(name: str | None, number: int, gpus: list[str]) -> str:
+def device_by_number(name: str | None, number: int, gpus: list[str]) -> str:
     """Return the device of a rank, by its number on its machine.
 
     Args:
@@ -227,7 +227,7 @@ def dealt(name: str | None, number: int, gpus: list[str]) -> str:
         ValueError: there is no such device.
 
     Example:
-        >>> [dealt("cuda", number, ["cuda:0", "cuda:1"]) for number in range(3)]
+        >>> [device_by_number("cuda", number, ["cuda:0", "cuda:1"]) for number in range(3)]
         ['cuda:0', 'cuda:1', 'cuda:0']
     """
     if name == "cpu" or (name is None and not gpus):

@@ -11,24 +11,24 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.balance import Balance
-from warp_lcp.distributed.ballistic_fragments import TreesAtCuts
+from warp_lcp.distributed.ballistic_fragments import FragmentMerger
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.ghost_width import Refill, too_far
+from warp_lcp.distributed.ghost_width import GhostLayerExchange, displacement_beyond_ghosts
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.interruptible_wait import waiting
-from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchanging_all
+from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchange_all_operation
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.repartition import cuts_of, migrate
-from warp_lcp.distributed.solids import boundary_of_part
+from warp_lcp.distributed.subdomain_boundary import boundary_of_part
 from warp_lcp.grid.cell_box import CellBox
-from warp_lcp.grid.part import BodyNumbers, Corner, FieldT, GridPart
+from warp_lcp.grid.grid_part import BodyNumbers, Corner, FieldT, GridPart
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import Task, is_recording, launch, run_table
+from warp_lcp.kernels.launch_graph import HostTask, is_recording, launch, run_table
 from warp_lcp.kernels.thread_pool import Operation, OperationTable, team
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, convert
@@ -94,10 +94,10 @@ def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
             field.assign(host)
 
 
-def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
+def _fill_operation(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
     """Return `_fill` as an operation of the thread pool."""
     hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
-    return exchanging_all(forest, [(host, host) for host in hosts])
+    return exchange_all_operation(forest, [(host, host) for host in hosts])
 
 
 class Subdomain(GridPart):
@@ -153,7 +153,7 @@ class Subdomain(GridPart):
         self._fillings: dict[Hashable, OperationTable] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: StarForest | None = None
-        self._trees: TreesAtCuts | None = None
+        self._trees: FragmentMerger | None = None
         self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # key: layers around the box
         for axis in decomposition.cut_axes:
             least, most = (
@@ -262,7 +262,7 @@ class Subdomain(GridPart):
 
         Returns this part if the boxes are the same, and None if the ranks cannot have them.
         """
-        with self.decomposition.collective.led():
+        with self.decomposition.collective.root_only():
             cuts = cuts_of(pieces, self)
         if cuts is None or cuts == self.decomposition.parts:
             return None if cuts is None else self
@@ -303,19 +303,19 @@ class Subdomain(GridPart):
             for name, values in fields.items()
         }
 
-    def refill(self) -> Refill:
+    def refill(self) -> GhostLayerExchange:
         """Return a function that fills ghost cells during velocity extrapolation.
 
         It exchanges halos before wrong values in the ghost cells can reach the box.
         """
-        return Refill(self)
+        return GhostLayerExchange(self)
 
     def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
         """Return the largest displacement in a step that may leave the ghost layers.
 
         It is the largest of all ranks, in cells; 0: no particle leaves them.
         """
-        return float(self.ranks.max(too_far(self, velocity, dt)))
+        return float(self.ranks.max(displacement_beyond_ghosts(self, velocity, dt)))
 
     def notes(self) -> list[str]:
         """Return the number of ranks and the size of their boxes, as text."""
@@ -457,12 +457,12 @@ class Subdomain(GridPart):
             if not is_recording() and team() is not None and all(map(_stays, fields)):
                 self._fill_again(forest, fields)
                 return
-        self.filling(*fields, forest=forest).launch()
+        self.fill_task(*fields, forest=forest).launch()
 
-    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
+    def fill_task(self, *fields: wp.array | np.ndarray, forest: StarForest) -> HostTask:
         """Return `fill` over a star forest, to run now or in a recorded program."""
-        operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
-        return Task(partial(_fill, forest, fields), operation)
+        operation = None if self.grid.device.is_cuda else partial(_fill_operation, forest, fields)
+        return HostTask(partial(_fill, forest, fields), operation)
 
     def _fill_again(self, forest: StarForest, fields: Sequence[wp.array]) -> None:
         """Fill fields that were filled before, by the exchange set up then."""
@@ -472,7 +472,7 @@ class Subdomain(GridPart):
                 self._fillings.clear()
             hosts = [field.numpy() for field in fields]
             self._fillings[key] = OperationTable(
-                [exchanging_all(forest, [(host, host) for host in hosts])]
+                [exchange_all_operation(forest, [(host, host) for host in hosts])]
             )
         run_table(self._fillings[key])
 
@@ -638,7 +638,7 @@ class Subdomain(GridPart):
     ) -> BodyNumbers:
         """Join the trees of cells that extend over several boxes; collective."""
         if self._trees is None:
-            self._trees = TreesAtCuts(self)
+            self._trees = FragmentMerger(self)
         return self._trees.join(trees, seen, parent, number, held)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ def _none() -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PlaceOrder:
+class SummationOrder:
     """Sorted and unsorted particles of a list, by place.
 
     Args:
@@ -23,13 +23,13 @@ class PlaceOrder:
     places: np.ndarray
     loose: np.ndarray = field(default_factory=_none)
 
-    def changed(self, numbers: np.ndarray, before: int, count: int) -> PlaceOrder:
+    def changed(self, numbers: np.ndarray, before: int, count: int) -> SummationOrder:
         """Return the order after particles of some numbers were replaced.
 
         There are then `count` particles, where there were `before`.
         """
         loose = np.concatenate([self.loose, numbers, np.arange(before, count)])
-        return PlaceOrder(self.places, np.unique(loose[loose < count]))
+        return SummationOrder(self.places, np.unique(loose[loose < count]))
 
     def runs(self, place: np.ndarray, count: int) -> np.ndarray:
         """Return begin and end of each sorted run of particles, shape (2 runs,).

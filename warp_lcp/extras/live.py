@@ -28,8 +28,8 @@ import warp as wp
 from warp_lcp.files.atomic import open_in_place
 from warp_lcp.files.tables import Tables
 from warp_lcp.grid.motion import Motion, Pose
-from warp_lcp.grid.solids import Geometry
-from warp_lcp.render.recording import PALETTES, Recording, RenderError, Show
+from warp_lcp.grid.signed_distance import Geometry
+from warp_lcp.render.recording import PALETTES, Recording, RenderError, VisiblePart
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.run.folder import read_record
 from warp_lcp.scene.camera import viewpoint
@@ -62,7 +62,7 @@ class QueryError(ValueError):
 
 
 @dataclass
-class Live:
+class LiveRun:
     """Data of a run for the page; the run may be running or not yet started.
 
     Args:
@@ -71,7 +71,7 @@ class Live:
     """
 
     folder: Path
-    show: Show | None = None
+    show: VisiblePart | None = None
 
     def __post_init__(self) -> None:
         self._lock = Lock()  # requests run on threads of their own
@@ -82,7 +82,7 @@ class Live:
         output, liquid = recording.scene.output, recording.scene.palette != "sand"
         # The surface of a frame is written after its particles.
         late = self.show is None and liquid and getattr(output, "surface", False)
-        return Recording(self.folder, show=Show.SURFACE) if late else recording
+        return Recording(self.folder, show=VisiblePart.SURFACE) if late else recording
 
     def state(self) -> Tables:
         """Return the numbers of the frames, and the data needed to draw them.
@@ -197,7 +197,7 @@ class Live:
         return np.asarray(lattice[np.abs(distance) < 0.6 * step])
 
 
-class Answers(BaseHTTPRequestHandler):
+class PageRequestHandler(BaseHTTPRequestHandler):
     """Request handler of the page, `/run`, `/frame?number=N` and `/log?from=BYTE`.
 
     No other paths are served.
@@ -273,13 +273,13 @@ class LiveServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 64  # waiting connections, which a busy run accepts late
 
-    def __init__(self, live: Live, port: int) -> None:
+    def __init__(self, live: LiveRun, port: int) -> None:
         self.live = live
         self._open: dict[socket.socket, None] = {}  # connections, the oldest first
         self._answered = 0  # requests in progress
         self._counting = Lock()
         self.page = files("warp_lcp.extras").joinpath("live.html").read_bytes()
-        super().__init__((LOOPBACK, port), Answers)
+        super().__init__((LOOPBACK, port), PageRequestHandler)
 
     @property
     def address(self) -> str:
@@ -323,14 +323,14 @@ class LiveServer(ThreadingHTTPServer):
         """Ignore errors of closed browsers."""
 
 
-def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> LiveServer:
+def live_server(folder: Path, *, port: int = PORT, show: VisiblePart | None = None) -> LiveServer:
     """Return a server of a run's page, which answers once `serve_forever` runs.
 
     Raises:
         RenderError: the port is taken.
     """
     try:
-        return LiveServer(Live(folder, show), port)
+        return LiveServer(LiveRun(folder, show), port)
     except OSError as error:
         raise RenderError(
             f"--port {port}: cannot be used: {error.strerror}; 0: any free port"

@@ -25,7 +25,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
-from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.operator_protocol import HasStencil
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -16,7 +16,13 @@ from scipy.spatial.transform import Rotation
 from warp_lcp.files.atomic import make_folder, replacing_by_name
 from warp_lcp.grid.motion import Motion
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
-from warp_lcp.render.recording import WITH_PARTICLES, WITH_SURFACE, Recording, RenderError, Show
+from warp_lcp.render.recording import (
+    WITH_PARTICLES,
+    WITH_SURFACE,
+    Recording,
+    RenderError,
+    VisiblePart,
+)
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.shapes import PlaneTable
@@ -36,7 +42,7 @@ def export_run(
     folder: Path,
     file: Path,
     *,
-    show: Show | None = None,
+    show: VisiblePart | None = None,
     first: int | None = None,
     last: int | None = None,
     on_progress: Callable[[int, int], None] = lambda done, of: None,

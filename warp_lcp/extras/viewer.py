@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from warp_lcp.render.page import INK
 from warp_lcp.render.recording import Recording, RenderError
-from warp_lcp.render.render import INSTALL, Looks
+from warp_lcp.render.render import INSTALL, ImageStyle
 from warp_lcp.render.solid_meshes import EDGE
 from warp_lcp.run.folder import read_record
 
@@ -165,7 +165,7 @@ def check_window(folder: Path) -> None:
         raise RenderError(_no_display("DISPLAY is not set", folder))
 
 
-def view_run(folder: Path, looks: Looks | None = None) -> None:
+def view_run(folder: Path, looks: ImageStyle | None = None) -> None:
     """Show a run's frames in a window until it is closed.
 
     New frames of a running run are added; without frames it waits for the first.
@@ -174,7 +174,7 @@ def view_run(folder: Path, looks: Looks | None = None) -> None:
         RenderError: pyvista or a display is missing, or there are no frames.
         SceneError: the run's scene cannot be read.
     """
-    looks = looks or Looks()
+    looks = looks or ImageStyle()
     while read_record(folder).get("status") == "running" and not any(folder.glob("frames/*")):
         time.sleep(LOOK)
     recording = Recording(folder, looks.color, looks.show, looks.overrides)

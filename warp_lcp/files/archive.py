@@ -21,7 +21,7 @@ from typing import IO, Self
 
 import numpy as np
 
-from warp_lcp.files.size_limits import ClaimError, check_claim
+from warp_lcp.files.size_limits import SizeLimitError, check_claim
 
 SUFFIX = ".npy"  # suffix of an archive's members
 HEADER = re.compile(  # as NumPy writes it; NumPy's reader evaluates the text
@@ -234,7 +234,7 @@ class Archive:
             raise ArchiveError(f"it lacks {', '.join(missing)}")
         try:
             check_claim(f"{len(names)} arrays", sum(self.headers[name].nbytes for name in names))
-        except ClaimError as error:
+        except SizeLimitError as error:
             raise ArchiveError(str(error)) from error
 
 

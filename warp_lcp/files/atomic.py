@@ -23,7 +23,7 @@ BY_DESCRIPTOR = {os.open, os.rename, os.unlink} <= os.supports_dir_fd  # not on 
 
 
 @dataclass(frozen=True)
-class _Folder:
+class _FolderHandle:
     """Folder for opening, renaming and deleting files by name.
 
     With a descriptor, later changes of the folder's path have no effect.
@@ -38,7 +38,7 @@ class _Folder:
 
     @classmethod
     @contextmanager
-    def opened(cls, path: Path) -> Iterator[_Folder]:
+    def opened(cls, path: Path) -> Iterator[_FolderHandle]:
         descriptor = (
             os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC) if BY_DESCRIPTOR else None
         )
@@ -109,13 +109,13 @@ def replacing_by_name(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _temporary(path: Path) -> Iterator[tuple[_Folder, str]]:
+def _temporary(path: Path) -> Iterator[tuple[_FolderHandle, str]]:
     """Yield the folder and a random temporary name beside a file.
 
     The temporary file is deleted at the end.
     """
     name = f".{path.name.removeprefix('.').removesuffix(SUFFIX)}.{secrets.token_hex(8)}{SUFFIX}"
-    with _Folder.opened(path.parent) as folder:
+    with _FolderHandle.opened(path.parent) as folder:
         try:
             yield folder, name
         finally:

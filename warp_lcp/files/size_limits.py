@@ -15,7 +15,7 @@ LAYOUT = "\n\t"  # control characters allowed in a text of several lines
 OWN_SIZE = Path("/proc/self/statm")  # in pages; the address space comes first
 
 
-class ClaimError(ValueError):
+class SizeLimitError(ValueError):
     """A size in a file exceeds the file or the free memory.
 
     The message gives the amount, but not the file's name.
@@ -40,14 +40,14 @@ def check_claim(
         ClaimError: the size is negative, larger than the file, or larger than the free memory.
     """
     if needed < 0:
-        raise ClaimError(f"{what}: a size must be >= 0")
+        raise SizeLimitError(f"{what}: a size must be >= 0")
     if stored is not None and available is not None and stored > available:
-        raise ClaimError(
+        raise SizeLimitError(
             f"{what}: these take {_bytes(stored)}, and the file has {_bytes(available)}"
         )
     free = free_host_memory()
     if free is not None and needed > free:
-        raise ClaimError(
+        raise SizeLimitError(
             f"{what}: these need {_bytes(needed)} of memory, and {_bytes(free)} are free"
         )
 
@@ -65,7 +65,7 @@ def read_whole(path: Path, *, copies: int = 2) -> bytes:
     """
     size = path.stat().st_size
     if not path.is_file():
-        raise ClaimError("it is not a file")
+        raise SizeLimitError("it is not a file")
     check_claim("its content", copies * size)
     return path.read_bytes()
 

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from warp_lcp.files.atomic import replacing_by_name
-from warp_lcp.frames.vtu import Mesh, mesh_of, vtu_bytes
+from warp_lcp.frames.vtu import VtuMesh, mesh_of, vtu_bytes
 from warp_lcp.simulation import Cells, Points, Surface, Volume
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ FAULTS = (
 )
 
 
-class Dress(IntEnum):
+class MeshConversion(IntEnum):
     """Conversion of a mesh that a format needs, from none to most."""
 
     AS_IS = 0
@@ -115,7 +115,7 @@ class Dress(IntEnum):
 
 
 @dataclass(frozen=True)
-class Holds:
+class FormatSupport:
     """Support of a format for a kind of parts.
 
     Args:
@@ -125,14 +125,14 @@ class Holds:
         why: reason if it cannot.
     """
 
-    dress: Dress | None
+    dress: MeshConversion | None
     empty: bool = False
     size: float = 1.0
     why: str = ""
 
 
 def to_meshio(part: Points | Cells | Surface | Volume) -> meshio.Mesh:
-    """Return a part of a frame as a `meshio.Mesh`.
+    """Return a part of a frame as a `meshio.VtuMesh`.
 
     Points [m], cells, and its fields as point data or cell data. Points become vertices, surfaces
     triangles or lines, cells quadrilaterals or hexahedra that share their corners. The voxels of a
@@ -148,8 +148,8 @@ def to_meshio(part: Points | Cells | Surface | Volume) -> meshio.Mesh:
     return meshio_of(mesh_of(_active(part) if isinstance(part, Volume) else part))
 
 
-def from_meshio(mesh: meshio.Mesh) -> Mesh:
-    """Return the content of a `meshio.Mesh` with one kind of cells.
+def from_meshio(mesh: meshio.Mesh) -> VtuMesh:
+    """Return the content of a `meshio.VtuMesh` with one kind of cells.
 
     Vectors that were stored as three fields are joined again.
 
@@ -192,7 +192,7 @@ def from_meshio(mesh: meshio.Mesh) -> Mesh:
         }
     if any(len(values) != len(corners if on_cells else points) for values in fields.values()):
         raise ValueError("a field has not as many values as there are points or cells")
-    return Mesh(points, corners, _joined(fields), on_cells)
+    return VtuMesh(points, corners, _joined(fields), on_cells)
 
 
 def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
@@ -224,7 +224,7 @@ def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
             ) from error
 
 
-def read_meshio(path: Path, name: str) -> Mesh:
+def read_meshio(path: Path, name: str) -> VtuMesh:
     """Return the content of a file of `write_meshio`.
 
     Raises:
@@ -258,7 +258,7 @@ def kind_of(part: Points | Cells | Surface) -> tuple[type, int]:
 
 
 @cache
-def holds(name: str, kind: type, dimension: int) -> Holds:
+def holds(name: str, kind: type, dimension: int) -> FormatSupport:
     """Return how a format supports the parts of a kind.
 
     A sample is written, read back and compared.
@@ -279,8 +279,8 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
         contextlib.redirect_stdout(captured),
     ):
         path = Path(folder) / f"sample.{SUFFIXES[name]}"
-        for dress in Dress:
-            if support and dress is Dress.BARE:
+        for dress in MeshConversion:
+            if support and dress is MeshConversion.BARE:
                 break
             captured.truncate(captured.seek(0))
             try:
@@ -296,13 +296,15 @@ def holds(name: str, kind: type, dimension: int) -> Holds:
             empty = False
             with contextlib.suppress(*_faults()):
                 empty = _round_trips(path, none, name, dress)
-            support = support or Holds(dress, empty, size)
+            support = support or FormatSupport(dress, empty, size)
             if not warns:  # else meshio would warn at every frame; another conversion is tried
-                return Holds(dress, empty, size)
-    return support or Holds(None, why=why)
+                return FormatSupport(dress, empty, size)
+    return support or FormatSupport(None, why=why)
 
 
-def _round_trips(path: Path, part: Points | Cells | Surface, name: str, dress: Dress) -> bool:
+def _round_trips(
+    path: Path, part: Points | Cells | Surface, name: str, dress: MeshConversion
+) -> bool:
     """Return whether a part is unchanged after writing and reading.
 
     That is, its points to float32, its cells, and its fields unless bare.
@@ -318,7 +320,7 @@ def _round_trips(path: Path, part: Points | Cells | Surface, name: str, dress: D
     if expected.corners.size and not np.array_equal(copy.corners, expected.corners):
         return False
     return (
-        dress is Dress.BARE
+        dress is MeshConversion.BARE
         or not len(points)
         or all(
             key in copy.fields
@@ -329,16 +331,16 @@ def _round_trips(path: Path, part: Points | Cells | Surface, name: str, dress: D
     )
 
 
-def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
+def _dressed(mesh: VtuMesh, dress: MeshConversion) -> VtuMesh:
     """Return a mesh after a conversion."""
-    if dress is Dress.AS_IS:
+    if dress is MeshConversion.AS_IS:
         return mesh
-    fields = {} if dress is Dress.BARE else mesh.fields
+    fields = {} if dress is MeshConversion.BARE else mesh.fields
     fields = {
         name: values.astype(np.int32) if values.dtype.kind in "biu" else values
         for name, values in fields.items()
     }
-    if dress is Dress.SCALARS:
+    if dress is MeshConversion.SCALARS:
         flat: dict[str, np.ndarray] = {}
         for name, values in fields.items():
             flat |= (
@@ -349,7 +351,7 @@ def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
                 }
             )
         fields = flat
-    return Mesh(mesh.points.astype(np.float64), mesh.corners, fields, mesh.on_cells)
+    return VtuMesh(mesh.points.astype(np.float64), mesh.corners, fields, mesh.on_cells)
 
 
 def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -365,8 +367,8 @@ def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return joined
 
 
-def meshio_of(mesh: Mesh) -> meshio.Mesh:
-    """Return a mesh as a `meshio.Mesh`."""
+def meshio_of(mesh: VtuMesh) -> meshio.Mesh:
+    """Return a mesh as a `meshio.VtuMesh`."""
     import meshio
 
     kind = CELL_KINDS[mesh.corners.shape[1]]
@@ -379,7 +381,7 @@ def meshio_of(mesh: Mesh) -> meshio.Mesh:
     return meshio.Mesh(mesh.points, [(kind, mesh.corners)], point_data=dict(mesh.fields))
 
 
-def _write(path: Path, mesh: Mesh, name: str) -> None:
+def _write(path: Path, mesh: VtuMesh, name: str) -> None:
     with np.errstate(divide="ignore", invalid="ignore"):  # normals of triangles without area
         _module(name).write(str(path), meshio_of(mesh), **OPTIONS.get(name, {}))
 

@@ -17,7 +17,7 @@ from warp_lcp.files.atomic import write_text
 from warp_lcp.files.size_limits import read_whole
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end
 from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable, writable_fields
-from warp_lcp.frames.vtu import Mesh
+from warp_lcp.frames.vtu import VtuMesh
 from warp_lcp.simulation import Cells, Points, Surface
 
 # Folder of a rank's parts of frames and checkpoints.
@@ -124,7 +124,7 @@ def piece_files(path: Path) -> list[Path]:
         return [path.parent / file for file in sources]
 
 
-def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
+def one_mesh(meshes: Sequence[VtuMesh]) -> VtuMesh:
     """Return one mesh from those of all parts, at least one.
 
     Empty parts may have another kind of cells. Parts of a surface have the points on cuts twice,
@@ -141,7 +141,7 @@ def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
     ):
         raise ValueError("its pieces have different fields")
     starts = np.cumsum([0, *(len(mesh.points) for mesh in filled)])
-    joined = Mesh(
+    joined = VtuMesh(
         np.concatenate([mesh.points for mesh in filled]),
         np.concatenate(
             [mesh.corners + start for mesh, start in zip(filled, starts[:-1], strict=True)]
@@ -199,7 +199,7 @@ def remove_empty_ranks(folder: Path) -> None:
             path.rmdir()
 
 
-def _sewn(mesh: Mesh) -> Mesh:
+def _sewn(mesh: VtuMesh) -> VtuMesh:
     """Return a mesh with points at one position merged into the first of them."""
     places = (
         np.ascontiguousarray(mesh.points).view(np.dtype((np.void, mesh.points.strides[0]))).ravel()
@@ -211,7 +211,7 @@ def _sewn(mesh: Mesh) -> Mesh:
         if mesh.on_cells
         else {name: values[first_points] for name, values in mesh.fields.items()}
     )
-    return Mesh(mesh.points[first_points], number[place][mesh.corners], fields, mesh.on_cells)
+    return VtuMesh(mesh.points[first_points], number[place][mesh.corners], fields, mesh.on_cells)
 
 
 def _mesh(pieces: Sequence[tuple[str, VtkPiece]], first: VtkPiece) -> Iterator[str]:

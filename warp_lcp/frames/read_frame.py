@@ -7,17 +7,17 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warp_lcp.frames.frames import FRAME_FILE
+from warp_lcp.frames.frame_folder import FRAME_FILE
 from warp_lcp.frames.meshio_format import FORMAT_OF, WRITTEN_ONLY, meshio_of, read_meshio, to_meshio
 from warp_lcp.frames.pieces import one_grid, one_mesh, piece_files
 from warp_lcp.frames.vti import read_vti
-from warp_lcp.frames.vtu import Mesh, read_vtu
+from warp_lcp.frames.vtu import VtuMesh, read_vtu
 from warp_lcp.simulation import Cells
 
 if TYPE_CHECKING:
     import meshio
 
-READERS: dict[str, tuple[Callable[[Path], Mesh | Cells], Callable[..., Mesh | Cells]]] = {
+READERS: dict[str, tuple[Callable[[Path], VtuMesh | Cells], Callable[..., VtuMesh | Cells]]] = {
     "vtu": (read_vtu, one_mesh),
     "vti": (read_vti, one_grid),
 }
@@ -26,7 +26,7 @@ MESHIO_READS = (suffix for suffix, name in FORMAT_OF.items() if name not in WRIT
 READABLE = ("vti", "pvti", "pvtu", "vtu", *MESHIO_READS)
 
 
-def read_part(file: Path) -> Mesh | Cells:
+def read_part(file: Path) -> VtuMesh | Cells:
     """Return the content of a frame's file, or of the parts that it lists.
 
     Raises:
@@ -51,7 +51,7 @@ def read_part(file: Path) -> Mesh | Cells:
 
 
 def read_frame(file: str | PathLike[str]) -> meshio.Mesh:
-    """Read a file of a run's `frames` as a `meshio.Mesh`.
+    """Read a file of a run's `frames` as a `meshio.VtuMesh`.
 
     meshio itself reads neither VTU files without cells, as frames before the first drop are, nor
     VTI files, nor files that list parts of ranks. This function reads all of these, and other
@@ -61,7 +61,7 @@ def read_frame(file: str | PathLike[str]) -> meshio.Mesh:
         file: such as `out/frames/particles_000012.vtu`.
 
     Returns:
-        A `meshio.Mesh`: points [m], cells, and the fields as point data or cell data.
+        A `meshio.VtuMesh`: points [m], cells, and the fields as point data or cell data.
 
     Raises:
         OSError: the file cannot be read.

@@ -37,7 +37,7 @@ OFFSET_BYTES, TYPE_BYTES, POINT_BYTES = 4, 1, 12
 
 
 @dataclass(frozen=True)
-class Mesh:
+class VtuMesh:
     """Content of a VTU file.
 
     Args:
@@ -78,7 +78,7 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
         )
 
 
-def mesh_of(part: Points | Cells | Surface) -> Mesh:
+def mesh_of(part: Points | Cells | Surface) -> VtuMesh:
     """Return the mesh of a part, its fields in types of VTK.
 
     Points are vertices; cells share their corners.
@@ -99,10 +99,10 @@ def mesh_of(part: Points | Cells | Surface) -> Mesh:
         )
     else:
         points, corners = _corners(part)
-    return Mesh(points, corners, fields, isinstance(part, Cells))
+    return VtuMesh(points, corners, fields, isinstance(part, Cells))
 
 
-def read_vtu(path: Path) -> Mesh:
+def read_vtu(path: Path) -> VtuMesh:
     """Return the content of a file of `write_vtu`.
 
     Raises:
@@ -132,7 +132,7 @@ def read_vtu(path: Path) -> Mesh:
             raise ValueError(f"a cell names a point that does not exist (there are {len(points)})")
         if any(len(array) != len(corners if on_cells else points) for array in fields.values()):
             raise ValueError("a field has not as many values as there are points or cells")
-        return Mesh(points, corners, fields, on_cells)
+        return VtuMesh(points, corners, fields, on_cells)
 
 
 def vtu_bytes(part: Points | Cells | Surface) -> int:

@@ -5,11 +5,11 @@ from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES
 from warp_lcp.gallery.fclib import FclibProblem, read_fclib
 from warp_lcp.gallery.fluid import Splash, basin, splash
-from warp_lcp.gallery.heston import Heston, Prices
+from warp_lcp.gallery.heston import Heston, OptionPrices
 from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
 from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
-from warp_lcp.gallery.planted import Plant, planted, poisson
-from warp_lcp.gallery.published import PUBLISHED, Published
+from warp_lcp.gallery.planted import PlantedSolution, planted, poisson
+from warp_lcp.gallery.published import PUBLISHED, PublishedFigure
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.gallery.shallow_ice import IceDome
 from warp_lcp.host_problem import FACTS, Problem
@@ -20,6 +20,7 @@ from warp_lcp.rigid.contact_models import (
     StewartTrinkleModel,
     proximal_sweeps,
 )
+from warp_lcp.settings import renamed_names
 
 __all__ = [
     "FACTS",
@@ -33,10 +34,10 @@ __all__ = [
     "FrozenBoxModel",
     "Heston",
     "IceDome",
-    "Plant",
-    "Prices",
+    "OptionPrices",
+    "PlantedSolution",
     "Problem",
-    "Published",
+    "PublishedFigure",
     "Splash",
     "StewartTrinkleModel",
     "World",
@@ -59,3 +60,8 @@ __all__ = [
     "splash",
     "torsion",
 ]
+
+
+__getattr__ = renamed_names(
+    __name__, Plant="PlantedSolution", Prices="OptionPrices", Published="PublishedFigure"
+)

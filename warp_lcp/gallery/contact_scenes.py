@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
-from warp_lcp.grid.solids import Box, Placement, Sphere
+from warp_lcp.grid.signed_distance import Box, Placement, Sphere
 from warp_lcp.host_problem import Problem
 from warp_lcp.rigid.contact_models import (
     BoxedModel,

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
-from warp_lcp.gallery.planted import Plant, poisson
+from warp_lcp.gallery.planted import PlantedSolution, poisson
 from warp_lcp.host_problem import Problem
 
 
@@ -22,7 +22,12 @@ def _some(seed: int) -> np.random.Generator:
 
 
 def _poisson(
-    seed: int, *, plant: Plant, air: float = 0.0, solid: float = 0.0, coefficients: str = "uniform"
+    seed: int,
+    *,
+    plant: PlantedSolution,
+    air: float = 0.0,
+    solid: float = 0.0,
+    coefficients: str = "uniform",
 ) -> Problem:
     rng = _some(seed)
     shape = tuple(
@@ -40,12 +45,14 @@ def _poisson(
 
 
 FAMILIES: dict[str, Callable[[int], Problem]] = {
-    "poisson": lambda seed: _poisson(seed, plant=Plant(active=_some(seed + 1).random())),
-    "poisson-weak": lambda seed: _poisson(seed, plant=Plant(active=0.5, weak=0.5)),
-    "poisson-boxed": lambda seed: _poisson(seed, plant=Plant(active=0.5, boxed=True, mixed=0.2)),
+    "poisson": lambda seed: _poisson(seed, plant=PlantedSolution(active=_some(seed + 1).random())),
+    "poisson-weak": lambda seed: _poisson(seed, plant=PlantedSolution(active=0.5, weak=0.5)),
+    "poisson-boxed": lambda seed: _poisson(
+        seed, plant=PlantedSolution(active=0.5, boxed=True, mixed=0.2)
+    ),
     "poisson-cavities": lambda seed: _poisson(
         seed,
-        plant=Plant(size=10.0 ** _some(seed + 1).integers(-6, 7)),
+        plant=PlantedSolution(size=10.0 ** _some(seed + 1).integers(-6, 7)),
         air=0.1,
         solid=0.2,
         coefficients="random",
@@ -54,20 +61,24 @@ FAMILIES: dict[str, Callable[[int], Problem]] = {
         int(_some(seed).integers(8, 60)), bands=int(_some(seed).integers(1, 6)), seed=seed
     ),
     "banded-boxed": lambda seed: banded(
-        int(_some(seed).integers(8, 60)), plant=Plant(boxed=True, mixed=0.2), seed=seed
+        int(_some(seed).integers(8, 60)), plant=PlantedSolution(boxed=True, mixed=0.2), seed=seed
     ),
     "definite": lambda seed: definite(
         int(_some(seed).integers(2, 40)), condition=10.0 ** _some(seed + 1).uniform(0, 4), seed=seed
     ),
     "definite-boxed": lambda seed: definite(
-        int(_some(seed).integers(2, 40)), plant=Plant(boxed=True, mixed=0.2, active=0.5), seed=seed
+        int(_some(seed).integers(2, 40)),
+        plant=PlantedSolution(boxed=True, mixed=0.2, active=0.5),
+        seed=seed,
     ),
     "semidefinite": lambda seed: semidefinite(
         int(_some(seed).integers(4, 40)), zeros=_some(seed + 1).uniform(0, 0.8), seed=seed
     ),
     "skewed": lambda seed: skewed(int(_some(seed).integers(4, 40)), seed=seed),
     "period-three": lambda seed: period_three(
-        int(_some(seed).integers(1, 5)), plant=Plant(active=_some(seed + 1).random()), seed=seed
+        int(_some(seed).integers(1, 5)),
+        plant=PlantedSolution(active=_some(seed + 1).random()),
+        seed=seed,
     ),
     "contact": lambda seed: contact(int(_some(seed).integers(1, 7)), seed=seed),
     "tiny": lambda seed: definite(int(_some(seed).integers(1, 5)), condition=10.0, seed=seed),

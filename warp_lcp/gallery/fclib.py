@@ -23,7 +23,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from warp_lcp.files.archive import DEFLATED
-from warp_lcp.files.size_limits import ClaimError, check_claim
+from warp_lcp.files.size_limits import SizeLimitError, check_claim
 from warp_lcp.rigid.contact_models import ContactSystem
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def read_fclib(path: Path | str) -> FclibProblem:
     try:
         with h5py.File(path, "r") as file:
             return _read(file, path)
-    except ClaimError as error:
+    except SizeLimitError as error:
         raise ValueError(f"{path}: {error}") from error
     except (OSError, RuntimeError, KeyError, TypeError, OverflowError, MemoryError) as error:
         raise ValueError(

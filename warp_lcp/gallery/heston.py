@@ -12,13 +12,14 @@ import numpy as np
 import scipy.interpolate
 import warp as wp
 
-from warp_lcp.default import solve
 from warp_lcp.default_chain import default_chain
+from warp_lcp.method_selection import solve
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import AIR, FLUID
+from warp_lcp.problem.operator_protocol import AIR, FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.settings import renamed_names
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 Coefficients = dict[tuple[int, int], np.ndarray]
@@ -159,7 +160,7 @@ class Heston:
 
     def put(
         self, ns: int, nv: int, steps: int, *, american: bool = True, device: wp.DeviceLike = None
-    ) -> Prices:
+    ) -> OptionPrices:
         """Return the prices of the put at time 0.
 
         Each time step is a complementarity problem, which starts from the last one's solution. Time
@@ -208,7 +209,7 @@ class Heston:
             if not result:
                 raise RuntimeError(f"time step {step}: {result.status.name}")
             u = A.layout.unload(result.x.flatten()).numpy().copy()
-        return Prices(S, v, u)
+        return OptionPrices(S, v, u)
 
     def extrapolated(
         self,
@@ -242,7 +243,7 @@ class Heston:
 
 
 @dataclass(frozen=True, eq=False)
-class Prices:
+class OptionPrices:
     """Option prices on a grid.
 
     Attributes:
@@ -260,3 +261,6 @@ class Prices:
         return scipy.interpolate.CubicSpline(
             self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance)
         )(spot)
+
+
+__getattr__ = renamed_names(__name__, Prices="OptionPrices")

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from warp_lcp.gallery.planted import Plant, planted
+from warp_lcp.gallery.planted import PlantedSolution, planted
 from warp_lcp.host_problem import M_MATRIX, Problem
 
 
@@ -22,7 +22,7 @@ def spectrum_matrix(eigenvalues: np.ndarray, rng: np.random.Generator) -> np.nda
 
 
 def definite(
-    n: int, *, condition: float = 100.0, plant: Plant | None = None, seed: int = 2015
+    n: int, *, condition: float = 100.0, plant: PlantedSolution | None = None, seed: int = 2015
 ) -> Problem:
     """Return a planted problem with a dense symmetric positive definite matrix.
 
@@ -43,14 +43,14 @@ def definite(
     return planted(
         A,
         rng,
-        plant or Plant(),
+        plant or PlantedSolution(),
         name=f"definite {n}, condition {condition:g}",
         facts=M_MATRIX - {"m-matrix"},
     )
 
 
 def semidefinite(
-    n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed: int = 2015
+    n: int, *, zeros: float = 0.5, plant: PlantedSolution | None = None, seed: int = 2015
 ) -> Problem:
     """Return a planted problem with a dense semidefinite matrix.
 
@@ -77,13 +77,15 @@ def semidefinite(
     return planted(
         B @ B.T,
         rng,
-        plant or Plant(),
+        plant or PlantedSolution(),
         name=f"semidefinite {n}, {zeros:.0%} zeros",
         facts=frozenset(facts),
     )
 
 
-def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int = 2015) -> Problem:
+def skewed(
+    n: int, *, skew: float = 1.0, plant: PlantedSolution | None = None, seed: int = 2015
+) -> Problem:
     """Return a planted problem with an unsymmetric positive definite matrix.
 
     A P-matrix B B' + I/2 + skew (C - C').
@@ -100,14 +102,14 @@ def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int =
     return planted(
         B @ B.T + 0.5 * np.eye(n) + skew * (C - C.T),
         rng,
-        plant or Plant(),
+        plant or PlantedSolution(),
         name=f"skewed {n}",
         facts=facts,
     )
 
 
 def period_three(
-    blocks: int = 1, *, plant: Plant | None = None, seed: int | None = None
+    blocks: int = 1, *, plant: PlantedSolution | None = None, seed: int | None = None
 ) -> Problem:
     """Return P-matrices on which the minimum-map Newton method cycles.
 
@@ -162,7 +164,9 @@ def banded_matrix(n: int, bands: int, rng: np.random.Generator) -> scipy.sparse.
     return scipy.sparse.diags_array(entries, offsets=offsets, shape=(n, n)).tocsr()
 
 
-def banded(n: int, *, bands: int = 3, plant: Plant | None = None, seed: int = 2015) -> Problem:
+def banded(
+    n: int, *, bands: int = 3, plant: PlantedSolution | None = None, seed: int = 2015
+) -> Problem:
     """Return a planted problem with a random banded matrix.
 
     A symmetric positive definite M-matrix.
@@ -182,7 +186,7 @@ def banded(n: int, *, bands: int = 3, plant: Plant | None = None, seed: int = 20
     return planted(
         banded_matrix(n, bands, rng),
         rng,
-        plant or Plant(),
+        plant or PlantedSolution(),
         name=f"banded {n}, {bands} bands",
         facts=M_MATRIX,
     )

@@ -11,11 +11,11 @@ import warp as wp
 from warp_lcp.host_problem import M_MATRIX, Matrix, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
-from warp_lcp.settings import Part, Positive, Settings
+from warp_lcp.settings import Part, Positive, Settings, renamed_names
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plant(Settings):
+class PlantedSolution(Settings):
     """Settings of a planted solution.
 
     Args:
@@ -38,7 +38,7 @@ class Plant(Settings):
 
 
 def planted(
-    A: Matrix, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]
+    A: Matrix, rng: np.random.Generator, plant: PlantedSolution, *, name: str, facts: frozenset[str]
 ) -> Problem:
     """Return a problem with a given matrix and a planted solution.
 
@@ -116,7 +116,7 @@ def random_cells(
 def poisson(
     shape: tuple[int, ...],
     *,
-    plant: Plant | None = None,
+    plant: PlantedSolution | None = None,
     air: float = 0.0,
     solid: float = 0.0,
     ring: bool = True,
@@ -144,7 +144,7 @@ def poisson(
     """
     if coefficients not in ("uniform", "random"):
         raise ValueError(f"coefficients = {coefficients!r}: must be 'uniform' or 'random'")
-    rng, plant = np.random.default_rng(seed), plant or Plant()
+    rng, plant = np.random.default_rng(seed), plant or PlantedSolution()
     cells = random_cells(shape, rng, air=air, solid=solid, ring=ring)
     faces: dict[str, np.ndarray] = {}
     for axis, face in enumerate(
@@ -179,3 +179,6 @@ def poisson(
         x,
         flat.facts,
     )
+
+
+__getattr__ = renamed_names(__name__, Plant="PlantedSolution")

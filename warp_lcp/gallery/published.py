@@ -10,20 +10,21 @@ from functools import cache, partial
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve
 from warp_lcp.gallery.heston import Heston
 from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
 from warp_lcp.gallery.shallow_ice import IceDome
 from warp_lcp.host_problem import Problem
+from warp_lcp.method_selection import solve
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.settings import renamed_names
 
 PETSC, CUTEST, P4PDES = "PETSc", "CUTEst", "p4pdes"
 SPG = "CSPG.jl"  # its table of CUTEst's problems, with the spectral projected gradient method
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedFigure:
     """Published figure and the function that recomputes it.
 
     Attributes:
@@ -76,11 +77,11 @@ def _energy(
     return measure
 
 
-def _bearings() -> list[Published]:
+def _bearings() -> list[PublishedFigure]:
     """Return the published figures of journal bearings."""
     rows = [(8, 12, 0.1, "-.183437"), (10, 16, 0.9, "-15.607"), (50, 50, 0.99, "-60.1509")]
     figures = [
-        Published(
+        PublishedFigure(
             "Journal bearing",
             f"jbearing2, {nx} x {ny}, e = {e}",
             printed,
@@ -100,7 +101,7 @@ def _bearings() -> list[Published]:
     }
     for n, printed in published.items():
         figures.append(
-            Published(
+            PublishedFigure(
                 "Journal bearing",
                 f"JNLBRNG1, {n} x {n}",
                 printed,
@@ -113,7 +114,7 @@ def _bearings() -> list[Published]:
         ("JNLBRNG2", 0.5, "-4.14865279e+00", 4e-8),
     ):
         figures.append(
-            Published(
+            PublishedFigure(
                 "Journal bearing",
                 f"{name}, 100 x 100",
                 printed,
@@ -180,7 +181,7 @@ TORSIONS_SPG = [
 ]
 
 
-def _torsions() -> list[Published]:
+def _torsions() -> list[PublishedFigure]:
     """Return the published figures of torsion problems."""
     rows = [
         (*key, Q, *value, CUTEST) for key, values in TORSIONS.items() for Q, value in values.items()
@@ -190,7 +191,7 @@ def _torsions() -> list[Published]:
         for name, load, border, printed, within in TORSIONS_SPG
     ]
     return [
-        Published(
+        PublishedFigure(
             "Torsion",
             f"{name}, Q = {Q}",
             printed,
@@ -202,7 +203,7 @@ def _torsions() -> list[Published]:
     ]
 
 
-def _sines() -> list[Published]:
+def _sines() -> list[PublishedFigure]:
     """Return the published figures of membranes over obstacles."""
     hill = {
         4: "0.753659753",
@@ -219,7 +220,7 @@ def _sines() -> list[Published]:
         100: "7.27215590e+00",
     }
     return [
-        Published(
+        PublishedFigure(
             "Sine obstacles",
             f"{name}, {n} x {n}",
             printed,
@@ -253,7 +254,7 @@ def _ball_errors(n: int) -> np.ndarray:
     )
 
 
-def _balls() -> list[Published]:
+def _balls() -> list[PublishedFigure]:
     """Return the published figures of the ball obstacle problem."""
     published = {
         5: ("4.531e-02", "1.635e-01"),
@@ -262,7 +263,7 @@ def _balls() -> list[Published]:
         33: ("8.182e-04", "5.747e-03"),
     }
     return [
-        Published(
+        PublishedFigure(
             "Ball obstacle",
             f"{n} x {n}, {norm} error",
             printed,
@@ -301,7 +302,7 @@ def _height(nx: int) -> float:
     return seepage_height(_dam(nx))
 
 
-def _dams() -> list[Published]:
+def _dams() -> list[PublishedFigure]:
     """Return the published figures of dams."""
     rows = {
         5: ("2.53716015237691",),
@@ -311,7 +312,9 @@ def _dams() -> list[Published]:
         1: ("146.570291707977", "94.3247021169195", "44.7462088399388"),
     }
     figures = [
-        Published("Dam", f"5 x 7, w at ({i}, {j})", printed, P4PDES, partial(_entry, j, i), 2e-11)
+        PublishedFigure(
+            "Dam", f"5 x 7, w at ({i}, {j})", printed, P4PDES, partial(_entry, j, i), 2e-11
+        )
         for j, values in rows.items()
         for i, printed in enumerate(values, 1)
     ]
@@ -326,7 +329,7 @@ def _dams() -> list[Published]:
     for nx, printed in heights.items():
         case = f"{nx} x {(nx - 1) * 3 // 2 + 1}, height of the seepage face"
         figures.append(
-            Published("Dam", case, printed, P4PDES, partial(_height, nx), slow=nx > 1025)
+            PublishedFigure("Dam", case, printed, P4PDES, partial(_height, nx), slow=nx > 1025)
         )
     return figures
 
@@ -340,14 +343,14 @@ def _price(k: int) -> float:
     return float(_prices()[k])
 
 
-def _puts() -> list[Published]:
+def _puts() -> list[PublishedFigure]:
     """Return the published figures of puts in Heston's model."""
     four, six = (
         ("2.0000", "1.1076", "0.5200", "0.2137", "0.0820"),
         ("2.00000", "1.10763", "0.520038", "0.213681", "0.082046"),
     )
     return [
-        Published(
+        PublishedFigure(
             "American put", f"S = {8 + k}, {digits}", value[k], source, partial(_price, k), within
         )
         for digits, value, source, within in (
@@ -364,7 +367,7 @@ def _ice_errors(nodes: int, regularization: float) -> np.ndarray:
     return np.abs(dome.solve(device="cpu") - dome.thickness())
 
 
-def _domes() -> list[Published]:
+def _domes() -> list[PublishedFigure]:
     """Return the published figures of ice domes."""
     rows = [
         (1e-3, "largest", "938.275"),
@@ -373,7 +376,7 @@ def _domes() -> list[Published]:
         (0.1, "average", "150.765"),
     ]
     return [
-        Published(
+        PublishedFigure(
             "Ice dome",
             f"9 x 9, {share} of D constant, {norm} error [m]",
             printed,
@@ -385,3 +388,6 @@ def _domes() -> list[Published]:
 
 
 PUBLISHED = (*_bearings(), *_torsions(), *_sines(), *_balls(), *_dams(), *_puts(), *_domes())
+
+
+__getattr__ = renamed_names(__name__, Published="PublishedFigure")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.grid.signed_distance import Box, Sphere
 from warp_lcp.rigid.body import BodyStates, RigidBody
 from warp_lcp.rigid.contact_detection import NONE, ContactDetection
 from warp_lcp.rigid.contact_models import ContactSystem

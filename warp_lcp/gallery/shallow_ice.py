@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.default import solve
+from warp_lcp.method_selection import solve
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.stopping import StoppingCriteria

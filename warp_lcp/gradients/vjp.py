@@ -16,22 +16,22 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve
 from warp_lcp.gradients.names import Name, flat
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Array
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import ADD, Sums, Tally, rows_of
+from warp_lcp.kernels.vectors import ADD, DynamicReduction, RowReduction, rows_of
+from warp_lcp.method_selection import solve
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import (
-    HasBlocks,
+from warp_lcp.problem.operator_protocol import (
     HasCells,
     HasCoefficients,
+    HasFloatingComponents,
+    HasRestriction,
     HasRows,
     HasStencil,
-    NamesComponents,
     Operator,
     has,
     layout_of,
@@ -160,7 +160,7 @@ def vjp(
     _gather(problem, multiplier, g, z)
     by_coefficient = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
     at_upper = layout.zeros(f64) if varying[1] else None
-    sums = Sums(_rows(problem), 2).of(HELD, side=side, z=z, upper=at_upper).tolist()
+    sums = RowReduction(_rows(problem), 2).of(HELD, side=side, z=z, upper=at_upper).tolist()
     lower, upper = (
         _as_given(problem, v) if varies else s
         for v, varies, s in zip((z, at_upper), varying, sums, strict=True)
@@ -227,7 +227,7 @@ def _classified(
     problem.bounds.refresh()
     residual.affine(x)
     tally, bounds, y, d = (
-        Tally(LARGEST, problem.device),
+        DynamicReduction(LARGEST, problem.device),
         problem.bounds.operands,
         residual.y,
         residual.diagonal,
@@ -242,7 +242,7 @@ def _classified(
             "has changed in place since"
         )
     cells, side = wp.clone(problem.unknown), layout.zeros(i8)
-    free, degenerate, wrong = Sums(rows, 3).of(
+    free, degenerate, wrong = RowReduction(rows, 3).of(
         SETS,
         bounds=bounds,
         x=x,
@@ -279,9 +279,9 @@ def _adjoint(
     A, layout = problem.A, problem.layout
     if count == 0:  # the system solved is 1 x = 0
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
-    if has(A, HasBlocks):
+    if has(A, HasRestriction):
         transposed = _transposed(A)
-        assert has(transposed, HasBlocks), "as A"
+        assert has(transposed, HasRestriction), "as A"
         restricted = transposed.on_cells(cells.numpy())
         right = _projected(_floating(restricted), g, cells)  # its value in AIR has no effect
         result = solve(
@@ -324,7 +324,7 @@ def _gather(problem: LCP, multiplier: DeviceArray, g: DeviceArray, z: DeviceArra
 
 def _floating(A: Operator) -> FloatingComponents | None:
     """Return the components on which an operator is singular, None if unknown."""
-    return A.floating_components() if has(A, NamesComponents) else None
+    return A.floating_components() if has(A, HasFloatingComponents) else None
 
 
 def _projected(

@@ -38,7 +38,7 @@ from warp_lcp.grid.particle_loops import MARGIN, launch
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.memory import Scalar, scaled
+from warp_lcp.kernels.recorded_arguments import Scalar, scaled
 from warp_lcp.operators.grid_poisson import SOLID
 
 # Cells. A particle that moves further in a step walks from cell to cell, which is always right.

@@ -32,7 +32,7 @@ from warp_lcp.grid.cell_kernel import (
     spline,
 )
 from warp_lcp.grid.cut_cells_kernels import corner
-from warp_lcp.grid.solids_kernels import FAR
+from warp_lcp.grid.signed_distance_kernels import FAR
 from warp_lcp.grid.thin_walls_kernels import MESH, into_group
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 

@@ -18,7 +18,7 @@ MODULE = "warp_lcp.grid.barriers.velocity"
 
 
 @wp.struct
-class Components:
+class FaceComponents:
     """Face fields of the components; w is null in 2-D."""
 
     u: F32
@@ -27,7 +27,7 @@ class Components:
 
 
 @wp.struct
-class Marks:
+class FaceMarks:
     """Marks of the faces of the components."""
 
     u: I8
@@ -65,8 +65,8 @@ def constrain_kernel(
     B: Barrier,
     axis: int,
     number: I16,
-    U: Components,
-    K: Marks,
+    U: FaceComponents,
+    K: FaceMarks,
     turn: TURNS,
     shift: SHIFTS,
     kind: I8,

@@ -364,7 +364,7 @@ class Barriers:
             contact: uint8, `released` where material leaves its wall.
             released: see there.
         """
-        components, marks = velocity_kernels.Components(), velocity_kernels.Marks()
+        components, marks = velocity_kernels.FaceComponents(), velocity_kernels.FaceMarks()
         components.u, components.v, components.w = three_components(velocity)
         marks.u, marks.v, marks.w = three_components(known)
         for axis, (number, result) in enumerate(zip(self.number, self._scratch, strict=True)):

@@ -19,7 +19,7 @@ from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.distributed_distance import enter_layers, measure_together
 from warp_lcp.grid.domain_sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.motion import Motions, Pose
-from warp_lcp.grid.moving_mesh_distance import FlatCells, PlacedMesh, tables_of
+from warp_lcp.grid.moving_mesh_distance import FlatCells, MovingMesh, tables_of
 from warp_lcp.grid.node_distance import (
     NodeBox,
     NodeDistances,
@@ -28,7 +28,7 @@ from warp_lcp.grid.node_distance import (
     box_near,
     node_window,
 )
-from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.signed_distance import Geometry, TriangleMesh
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.kernels.host_array import HostArray
@@ -182,7 +182,7 @@ class CutCells:
             self._refreshing = LaunchGraph(grid.device, self._launch_refreshing)
             self._before = self._after = lambda: None
             self._filling = LaunchGraph(grid.device, self._launch_velocity)
-            self.moving = kernels.Moving()
+            self.moving = kernels.MovingSolids()
             self.moving.nodes, self.moving.standing = self._nodes.struct, self._standing.near
             self.moving.moves = wp.array(
                 [False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device
@@ -545,10 +545,10 @@ def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
 
 def _runs(
     grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], left_out: Collection[int]
-) -> Iterator[ShapeTable | PlacedMesh | int]:
+) -> Iterator[ShapeTable | MovingMesh | int]:
     """Split solids, in order, into tables of neighboring entries that tables hold.
 
-    On a GPU meshes are yielded as `PlacedMesh`, and other solids by their index.
+    On a GPU meshes are yielded as `MovingMesh`, and other solids by their index.
     """
     cutting = [place for place, (number, _) in enumerate(solids) if number not in left_out]
     for held, of in groupby(cutting, key=lambda place: ShapeTable.holds(solids[place][1])):
@@ -559,6 +559,6 @@ def _runs(
         for place in of:
             number, geometry = solids[place]
             if grid.device.is_cuda and not grid.part.shared and isinstance(geometry, TriangleMesh):
-                yield PlacedMesh(grid, number, geometry, [place])
+                yield MovingMesh(grid, number, geometry, [place])
             else:
                 yield place

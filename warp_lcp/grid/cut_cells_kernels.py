@@ -10,7 +10,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
-from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
+from warp_lcp.grid.node_distance_kernels import HOLLOW, NearestSolids
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.compiler import forward_kernel
@@ -107,16 +107,16 @@ _TURNS, _SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
 
 
 @wp.struct
-class Moving:
+class MovingSolids:
     """Node distances and marks of moving solids, to find the one on a face."""
 
-    nodes: Nearest
+    nodes: NearestSolids
     standing: F32  # distance to the nearest solid that stands still, at nodes [cells]
     moves: wp.array(dtype=wp.uint8)  # whether a solid does
 
 
 @wp.func
-def least_moving(S: Moving, k: int, j: int, i: int):
+def least_moving(S: MovingSolids, k: int, j: int, i: int):
     """Return the moving solid among a node's two nearest, and its distance [cells].
 
     The number is 0 if neither moves.
@@ -132,7 +132,9 @@ def least_moving(S: Moving, k: int, j: int, i: int):
 
 
 @wp.func
-def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open: F32, wall: I16):
+def moving_part(
+    S: MovingSolids, axis: int, planes: int, k: int, j: int, i: int, open: F32, wall: I16
+):
     """Return the moving solid that covers a face, and its part of the closed fraction.
 
     The number is 0 if no moving solid covers it. The part that standing solids cover is at rest. So
@@ -166,7 +168,7 @@ def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open:
 
 @wp.func
 def face_velocity(
-    S: Moving,
+    S: MovingSolids,
     axis: int,
     planes: int,
     spacing: float,
@@ -204,7 +206,7 @@ def velocity_kernel(
     k,
     j,
     i,
-    S: Moving,
+    S: MovingSolids,
     planes: int,
     spacing: float,
     origin: wp.vec3i,

@@ -13,8 +13,8 @@ import warp as wp
 from warp_lcp.grid.cell_box import CellBox
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.node_distance_kernels import claim_nodes
-from warp_lcp.grid.solids import Geometry
-from warp_lcp.grid.solids_kernels import block_of
+from warp_lcp.grid.signed_distance import Geometry
+from warp_lcp.grid.signed_distance_kernels import block_of
 from warp_lcp.grid.staggered import StaggeredGrid
 
 # Nodes of the domain, and the distances [cells] there, shape (nz, ny, nx).

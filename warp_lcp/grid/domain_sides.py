@@ -163,7 +163,7 @@ class PeriodicSides:
 
     Of n cells along such an axis, stored with a ring, 0 is cell n again and n + 1 is cell 1; so it
     is with faces. What particles add up in the ring belongs to the cells and faces that it repeats.
-    Along axes that `grid.part` has cut, other ranks fill what lies beyond.
+    Along axes that `grid.grid_part` has cut, other ranks fill what lies beyond.
 
     Args:
         grid: the grid.

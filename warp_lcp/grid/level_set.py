@@ -12,7 +12,7 @@ from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.particle_loops import scatter, touched_planes
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import COPY, ActiveWindow, StaggeredGrid, Window
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 
 REACH = 1.5  # half the width of a cell's kernel [cells]
@@ -64,7 +64,7 @@ class LevelSet:
         self.phi, self.density, self._known = grid.field(), grid.field(), grid.field(wp.int8)
         self.phi.fill_(self.limit)
         self._scratch = [grid.field() for _ in range(3)] if smoothing else []
-        self._volume: WindowTally | None = None  # made when it is first asked for
+        self._volume: WindowReduction | None = None  # made when it is first asked for
         self._box, self._measuring = (
             ActiveWindow(grid.domain),
             LaunchGraph(grid.device, self._launch_volume),
@@ -181,7 +181,7 @@ class LevelSet:
         if box is None:
             return
         if self._volume is None:
-            self._volume = WindowTally(kernels.VOLUME, self.grid)
+            self._volume = WindowReduction(kernels.VOLUME, self.grid)
         self._box.move_to(box)
         self._measuring.run(distance, variant=box.near is None)
         self._volume.changed()

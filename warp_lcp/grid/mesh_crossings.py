@@ -30,7 +30,7 @@ SAMPLE = 4096
 
 
 @dataclass(frozen=True)
-class Crossings:
+class SelfIntersections:
     """Self-intersections of a surface.
 
     Attributes:
@@ -200,7 +200,9 @@ def look_beside(
     kind[i] = wp.uint8(wp.max(outside, inside))
 
 
-def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> Crossings:
+def find_self_crossings(
+    mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray
+) -> SelfIntersections:
     """Find where a closed surface crosses itself or lies inside itself.
 
     Args:
@@ -238,7 +240,7 @@ def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarr
         else firsts[:0]
     )
     if not len(crossing) and not len(nested):
-        return Crossings()
+        return SelfIntersections()
     area = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
@@ -248,7 +250,7 @@ def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarr
     )
     kind = beside(which, chance.dirichlet(np.ones(3), SAMPLE))
     first = crossing[0] if len(crossing) else nested[0]
-    return Crossings(
+    return SelfIntersections(
         len(crossing),
         corners[first].mean(axis=0),
         *(float((kind == int(what)).mean()) for what in (DOUBLED, INVERTED)),

@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 
 # Cells by which the surface reaches into solids, so that renderers see no film of air and no two
 # faces at one place.

@@ -38,7 +38,7 @@ UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of an unbound
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
-class Placed(Protocol):
+class RigidTransform(Protocol):
     """A rotation and a translation, of a frozen dataclass."""
 
     @property
@@ -50,7 +50,7 @@ class Placed(Protocol):
         """[m], shape (3,)."""
 
 
-def keep_checked(frozen: Placed, error: float) -> None:
+def keep_checked(frozen: RigidTransform, error: float) -> None:
     """Check `rotation` and `translation` of a frozen dataclass; store them as float64.
 
     Args:
@@ -297,7 +297,7 @@ class Keyframes:
     center: Vector = (0.0, 0.0, 0.0)
     smooth: bool = False
     _shift: _Curve | None = field(init=False, repr=False, compare=False)
-    _turns: _Turns | None = field(init=False, repr=False, compare=False)
+    _turns: _RotationCurve | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the values and build the curves."""
@@ -318,7 +318,7 @@ class Keyframes:
             angles = _rows(
                 "rotate", angles[:, None] if angles.ndim == 1 else angles, len(times), (1, 3)
             )
-            turns = _Turns(times, angles, smooth=self.smooth)
+            turns = _RotationCurve(times, angles, smooth=self.smooth)
         object.__setattr__(self, "center", _in_space("center", self.center))
         object.__setattr__(self, "_shift", shift)
         object.__setattr__(self, "_turns", turns)
@@ -476,7 +476,7 @@ class _Curve:
         return np.array([np.interp(time, self.times, column) for column in self.values.T])
 
 
-class _Turns:
+class _RotationCurve:
     """Rotations over time, constant before the first and after the last.
 
     Args:

@@ -18,14 +18,14 @@ from warp_lcp.grid.node_distance_kernels import (
     FAR,
     HOLLOW,
     ROUNDING,
-    Nearest,
+    NearestSolids,
     PlacedShape,
     enter,
     shape_distance,
     snapped,
 )
-from warp_lcp.grid.solids import Geometry, TriangleMesh
-from warp_lcp.grid.solids_kernels import (
+from warp_lcp.grid.signed_distance import Geometry, TriangleMesh
+from warp_lcp.grid.signed_distance_kernels import (
     Block,
     ShapeFrame,
     block_of,
@@ -64,7 +64,7 @@ def enter_mesh(
     distance: Distances,
     snap: float,
     solid: int,
-    nodes: Nearest,
+    nodes: NearestSolids,
 ):
     """Enter a mesh's distance at a node.
 
@@ -151,7 +151,7 @@ def mark_flat_cells_of_mesh(
             marks[k, j, i] = wp.int8(0)
 
 
-class PlacedMesh:
+class MovingMesh:
     """Moving mesh whose distances are entered by recordable launches.
 
     It has the interface of `ShapeTable`.
@@ -226,7 +226,7 @@ class FlatCells:
         solids: tables of all solids.
     """
 
-    def __init__(self, grid: StaggeredGrid, solids: Sequence[ShapeTable | PlacedMesh]) -> None:
+    def __init__(self, grid: StaggeredGrid, solids: Sequence[ShapeTable | MovingMesh]) -> None:
         self.grid, self._solids = grid, list(solids)
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
 
@@ -239,7 +239,7 @@ class FlatCells:
             marks: int8, one a stored cell (updated).
         """
         for order, solid in enumerate(self._solids):
-            if isinstance(solid, PlacedMesh):
+            if isinstance(solid, MovingMesh):
                 solid.mark(window, nodes.near, self._block, marks, begin=order == 0)
             else:
                 inputs = [
@@ -255,14 +255,14 @@ class FlatCells:
 
 def tables_of(
     grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]
-) -> list[ShapeTable | PlacedMesh] | None:
+) -> list[ShapeTable | MovingMesh] | None:
     """Return tables of standing solids, in order; None if one fits in no table."""
-    tables: list[ShapeTable | PlacedMesh] = []
+    tables: list[ShapeTable | MovingMesh] = []
     for number, geometry in solids:
         if ShapeTable.holds(geometry):
             tables.append(ShapeTable(grid, [(number, geometry)], []))
         elif isinstance(geometry, TriangleMesh):
-            tables.append(PlacedMesh(grid, number, geometry))
+            tables.append(MovingMesh(grid, number, geometry))
         else:
             return None
     for table in tables:

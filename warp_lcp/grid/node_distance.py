@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from warp_lcp.grid import node_distance_kernels as kernels
 from warp_lcp.grid.motion import UNLIMITED
-from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
-from warp_lcp.grid.solids_kernels import Block, block_of, item_points
+from warp_lcp.grid.node_distance_kernels import COARSE, FAR, NearestSolids
+from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
+from warp_lcp.grid.signed_distance_kernels import Block, block_of, item_points
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.host_array import HostArray
@@ -70,7 +70,7 @@ class NodeDistances:
         )
         self.near.fill_(FAR)
         self.next_near.fill_(FAR)
-        self.struct = Nearest()
+        self.struct = NearestSolids()
         self.struct.near, self.struct.owner = self.near, self.owner
         self.struct.next_near, self.struct.next_owner = self.next_near, self.next_owner
 

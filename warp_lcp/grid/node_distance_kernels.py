@@ -7,7 +7,7 @@ A flat cell has distance 0 at all corners; only its center shows whether it is o
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
-from warp_lcp.grid.solids_kernels import (
+from warp_lcp.grid.signed_distance_kernels import (
     Block,
     Distances,
     Points,
@@ -34,7 +34,7 @@ options = {"module": "warp_lcp.grid.node_distance"}
 
 
 @wp.struct
-class Nearest:
+class NearestSolids:
     """The two nearest solids of each node.
 
     See `warp_lcp.grid.node_distance.NodeDistances`.
@@ -83,7 +83,7 @@ def shape_distance(p: wp.vec3, shape: PlacedShape) -> float:
 
 
 @wp.func
-def enter(node: wp.vec3i, d: float, solid: int, nodes: Nearest):
+def enter(node: wp.vec3i, d: float, solid: int, nodes: NearestSolids):
     """Enter a solid's distance d [cells] among the two nearest of a node.
 
     Of solids equally near the first one stays.
@@ -114,7 +114,7 @@ def snapped(meters: float, spacing: float, snap: float):
 
 
 @forward_kernel(**options)
-def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, nodes: Nearest):
+def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, nodes: NearestSolids):
     """Enter the distances [m] of a solid at a block of nodes."""
     c = wp.tid()
     enter(first_node(block, c), snapped(distance[c], block.spacing, snap), solid, nodes)
@@ -130,7 +130,7 @@ def enter_solids(
     solids: wp.array(dtype=ShapeGroup),
     shapes: wp.array(dtype=PlacedShape),
     snap: float,
-    nodes: Nearest,
+    nodes: NearestSolids,
 ):
     """Enter the distances of several solids, in sequence, at a row of nodes."""
     for s in range(solids.shape[0]):
@@ -150,7 +150,7 @@ def claim_groups(
     block: Block,
     distance: Distances,
     solid: int,
-    nodes: Nearest,
+    nodes: NearestSolids,
     unsure: Listed,
     sure: Listed,
     listed: wp.array(dtype=wp.int32),
@@ -191,7 +191,7 @@ def listed_points(block: Block, list: Listed, out: Points):
 
 @forward_kernel(**options)
 def claim_listed(
-    block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: Nearest
+    block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: NearestSolids
 ):
     """Enter the distances [m] of a solid at listed nodes.
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.launch_graph import is_recording
-from warp_lcp.kernels.memory import Scalar, Slot, rows_memory
+from warp_lcp.kernels.recorded_arguments import Scalar, Slot, rows_memory
 from warp_lcp.kernels.thread_pool import get_threads
 from warp_lcp.kernels.types import DeviceArray
 

@@ -17,9 +17,9 @@ from warp_lcp.kernels import Rows
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.launch_graph import LaunchGraph, call, clear
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
-from warp_lcp.kernels.memory import RowsMemory, Scalar, Slot, rows_memory
 from warp_lcp.kernels.readback import DeviceScalar
-from warp_lcp.kernels.vectors import Tally
+from warp_lcp.kernels.recorded_arguments import RowsMemory, Scalar, Slot, rows_memory
+from warp_lcp.kernels.vectors import DynamicReduction
 
 CHUNK = 256  # fewest particles that one thread sums up
 THREADS = 1024  # most threads of a sum; the host adds their partial results
@@ -88,7 +88,7 @@ class ParticleTotals:
         )
 
 
-class Column:
+class ParticleArray:
     """Array of one vector per particle, with spare capacity.
 
     Attributes:
@@ -167,7 +167,7 @@ class Particles:
             None unless `indexed`.
         runs: begin and end of each run of particles in the order of summation, int32, shape (2
             runs,); None if all particles are in this order.
-        exchange: exchange with other processes, see `warp_lcp.grid.part.ParticleExchange`.
+        exchange: exchange with other processes, see `warp_lcp.grid.grid_part.ParticleExchange`.
 
     Raises:
         ValueError: the shapes do not match.
@@ -175,7 +175,7 @@ class Particles:
 
     runs: wp.array | None = None
     _order: wp.array  # scratch memory, as large as `key`
-    _spare: Column  # memory of the next reordered column
+    _spare: ParticleArray  # memory of the next reordered column
 
     def __init__(
         self,
@@ -211,7 +211,7 @@ class Particles:
         self._stays: wp.array | None = None  # beside them
         self._total_rows = rows_memory(device, LIST_ROOM)
         if device.is_cuda:
-            self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
+            self._tally = DynamicReduction(kernels.TOTAL, device, CUDA_THREADS)
         else:
             self._partials = wp.zeros(columns * THREADS, dtype=wp.float64, device=device)
             self._device_totals, self._places = DeviceScalar(device, columns), Scalar()
@@ -220,7 +220,7 @@ class Particles:
         self._last: ParticleTotals | None = None
         self._totals_launched = False  # whether a GPU has the sums of the current particles
         self._current_totals: ParticleTotals | None = None  # current sums
-        self._columns: dict[str, Column] = {}
+        self._columns: dict[str, ParticleArray] = {}
         self._memory = ListMemory(grid.device)
         self.exchange = grid.part.exchange_of(self)
         self._grow(0)
@@ -298,7 +298,7 @@ class Particles:
                 column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
             else:  # sorting may have left anything behind the particles in use
                 column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
-        self.exchange.appended(len(position))
+        self.exchange.register_append(len(position))
 
     def make_room(self, count: int) -> int:
         """Add particles at the end and return the index of the first.
@@ -385,7 +385,7 @@ class Particles:
                         kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device
                     )
                     self._columns[name], self._spare = self._spare, column
-            self.exchange.removing(marks)
+            self.exchange.register_removal(marks)
             self.resize(self.count - first - others)
         return first, others
 
@@ -468,11 +468,11 @@ class Particles:
         device = self.grid.device
         self._capacity = max(int(self.exchange.room * self.count), int(GROWTH * self._capacity), 1)
         for name in self._names:
-            column = Column(self._capacity, self.count, device)
+            column = ParticleArray(self._capacity, self.count, device)
             if before:
                 wp.copy(column.store, self._columns[name].store, count=before)
             self._columns[name] = column
-        self._spare = Column(self._capacity, self.count, device)
+        self._spare = ParticleArray(self._capacity, self.count, device)
         self.key = zeros(2 * self._capacity, wp.int32, device)
         self._order = zeros(2 * self._capacity, wp.int32, device)
         self._sorting.forget()  # its recorded launches use both halves

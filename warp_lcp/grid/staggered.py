@@ -20,13 +20,20 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.part import GridPart
+from warp_lcp.grid.grid_part import GridPart
 from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.fields import checked_device, zeros
-from warp_lcp.kernels.launch_graph import Identified, Launch, LaunchGraph, clear, launch_ranges
+from warp_lcp.kernels.launch_graph import KeyedArgument, Launch, LaunchGraph, clear, launch_ranges
 from warp_lcp.kernels.layout import grain
-from warp_lcp.kernels.memory import DeviceRows, RowsMemory, Scalar, Slot, larger, rows_memory
+from warp_lcp.kernels.recorded_arguments import (
+    DeviceRows,
+    RowsMemory,
+    Scalar,
+    Slot,
+    larger,
+    rows_memory,
+)
 from warp_lcp.settings import renamed_names
 
 if typing.TYPE_CHECKING:
@@ -100,7 +107,7 @@ def _corners(
 
 
 @dataclass(frozen=True)
-class Window(Identified):
+class Window(KeyedArgument):
     """Box of stored cells, low <= (k, j, i) < high, over which kernels run.
 
     Args:

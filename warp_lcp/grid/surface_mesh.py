@@ -21,7 +21,7 @@ from warp_lcp.grid.mesh_smoothing import ON_SOLID, TOUCHING
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
 from warp_lcp.grid.mesh_walls import MeshWalls, fit_to_walls
 from warp_lcp.grid.particle_loops import MARGIN, launch, scatter, touched_planes
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
@@ -51,7 +51,7 @@ def surface_layers(parts: int) -> int:
 
 
 @dataclass(frozen=True)
-class Obstacles:
+class SurfaceObstacles:
     """Solids inside the domain.
 
     Attributes:
@@ -74,7 +74,7 @@ class Obstacles:
 
 
 @dataclass(frozen=True)
-class Interior:
+class FilledInterior:
     """Full region without particles (inside a narrow band).
 
     Attributes:
@@ -120,7 +120,7 @@ class SurfaceMesh:
         per_axis: int,
         resolution: int | None = None,
         smoothing: float = 1.5,
-        obstacles: Obstacles | None = None,
+        obstacles: SurfaceObstacles | None = None,
     ) -> None:
         parts = per_axis if resolution is None else resolution
         if per_axis < 1 or parts < 1:
@@ -155,7 +155,7 @@ class SurfaceMesh:
         # Cells whose triangles this rank keeps; None for all.
         self._kept = self._lattice_cells() if grid.part.shared else None
 
-    def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
+    def find(self, position: wp.array, interior: FilledInterior | None = None) -> DeviceMesh:
         """Return the surface around particles, ghosts among them; collective.
 
         On CUDA the last bits may differ between runs, as do sums over particles.
@@ -291,7 +291,7 @@ class SurfaceMesh:
         size = np.asarray(lattice.extent)
         mesh.points.assign(np.clip(fitted * spacing, 0.0, size).astype(np.float32))
 
-    def _place(self, obstacles: Obstacles) -> None:
+    def _place(self, obstacles: SurfaceObstacles) -> None:
         """Compute the open share of each kernel beside the solids."""
         lattice, domain = self.lattice, self.lattice.domain
         room, capacity = self._room, self._capacity

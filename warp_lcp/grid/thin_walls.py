@@ -19,7 +19,7 @@ from warp_lcp.grid import thin_walls_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.motion import Motion, Motions
 from warp_lcp.grid.particle_loops import MARGIN
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
+from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import copy

@@ -28,7 +28,7 @@ from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.particle_loops import launch, scatter, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile, StencilKernel
-from warp_lcp.kernels.memory import Scalar, value_of
+from warp_lcp.kernels.recorded_arguments import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # least weight of a face that particles touch
 # A particle exactly on the boundary between cells would leave one face of its own cell without

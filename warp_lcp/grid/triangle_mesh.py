@@ -13,9 +13,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from warp_lcp.grid.mesh_crossings import Crossings, find_self_crossings
+from warp_lcp.grid.mesh_crossings import SelfIntersections, find_self_crossings
 from warp_lcp.grid.mesh_file import read_triangles
-from warp_lcp.grid.solids_kernels import mesh_thickness
+from warp_lcp.grid.signed_distance_kernels import mesh_thickness
 
 Triangles = tuple[np.ndarray, np.ndarray]  # vertices, and triangles of them
 
@@ -154,7 +154,7 @@ class ClosedSurface:
         return mesh
 
     @cached_property
-    def crossings(self) -> Crossings:
+    def crossings(self) -> SelfIntersections:
         """Self-intersections of the surface and parts inside itself; found on the CPU."""
         mesh = self.on_device(wp.get_device("cpu"))
         found = find_self_crossings(mesh, (self.vertices - self.center) / self.size, self.triangles)

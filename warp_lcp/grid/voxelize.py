@@ -14,8 +14,8 @@ import warp as wp
 from warp_lcp.grid.domain_sides import open_ring
 from warp_lcp.grid.motion import Motion
 from warp_lcp.grid.node_distance import CHUNK, NodeSampler, nodes_near
-from warp_lcp.grid.solids import Geometry, TriangleMesh
-from warp_lcp.grid.solids_kernels import claim_cells
+from warp_lcp.grid.signed_distance import Geometry, TriangleMesh
+from warp_lcp.grid.signed_distance_kernels import claim_cells
 from warp_lcp.grid.staggered import StaggeredGrid
 
 OPEN = -1

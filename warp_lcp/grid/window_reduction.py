@@ -8,9 +8,9 @@ import warp as wp
 
 from warp_lcp.grid.staggered import KERNELS, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels import Rows, StencilKernel
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
-from warp_lcp.kernels.vectors import Tally
+from warp_lcp.kernels.recorded_arguments import Scalar
+from warp_lcp.kernels.vectors import DynamicReduction
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -22,7 +22,7 @@ CUDA_PLANES = 16  # least planes of a column
 ADD_ROWS = KERNELS["warp_lcp.grid.window_reduction.add_rows"]
 
 
-class WindowTally:
+class WindowReduction:
     """Reduction over windows of a grid; the CPU sums rows in the order of the grid.
 
     Args:
@@ -39,7 +39,7 @@ class WindowTally:
         self.name, self._counted = declared.name, counted
         columns, device = len(declared.found), grid.device
         self._tally = (
-            Tally(declared, device, domain.rows_of_sums(self._planes).places)
+            DynamicReduction(declared, device, domain.rows_of_sums(self._planes).places)
             if device.is_cuda
             else None
         )

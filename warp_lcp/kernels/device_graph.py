@@ -2,11 +2,12 @@
 """CUDA graphs of a step's launches, whose arguments lie in device memory.
 
 A graph is captured once. Quantities that change from run to run (windows, list lengths, replaced
-arrays, `Scalar`s) stand in memory of the host, see `memory.py`. The arguments of all kernels of a
-graph lie one after another in one array of the device, the *image*. Each run gathers the changed
-numbers in one pinned buffer. The graph copies it to the device, writes its bytes to their places in
-the image (one kernel), and launches the kernels, each of which reads its arguments from there.
-Launch dimensions are those of the largest rows; threads beyond the present ones return at once.
+arrays, `Scalar`s) stand in memory of the host, see `recorded_arguments.py`. The arguments of all
+kernels of a graph lie one after another in one array of the device, the *image*. Each run gathers
+the changed numbers in one pinned buffer. The graph copies it to the device, writes its bytes to
+their places in the image (one kernel), and launches the kernels, each of which reads its arguments
+from there. Launch dimensions are those of the largest rows; threads beyond the present ones return
+at once.
 """
 
 import ast
@@ -26,16 +27,16 @@ from warp_lcp.kernels.launch_graph import (
     Command,
     CommandBuffer,
     DeviceCopy,
+    HostTask,
     Loop,
-    NotRecordable,
-    Task,
+    NotRecordableError,
 )
 from warp_lcp.kernels.layout import RowLayout, make_struct, native_of, offset_of, threads
-from warp_lcp.kernels.memory import (
+from warp_lcp.kernels.recorded_arguments import (
     ARRAY_BYTES,
     LAYOUT_BYTES,
-    Extent,
     KernelArgument,
+    LaunchDimensions,
     Scalar,
     slot_of,
     value_of,
@@ -78,7 +79,7 @@ def pass_from_memory(form: KernelVariant) -> tuple[DataType, wp.Kernel]:
     That kernel takes an array of such structs and reads the first element.
     """
     if form.pattern is not None and form.pattern.touch is not None:
-        raise NotRecordable(f"{form.declared.label}: a stencil of Warp functions")
+        raise NotRecordableError(f"{form.declared.label}: a stencil of Warp functions")
     run, Fields = form.run, form.fields
     Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
     pieces = wp.array(dtype=Piece)
@@ -161,7 +162,7 @@ class DeviceGraph(CommandBuffer):
         self._patches: list[tuple[int, int, int]] = []
         self._bytes = 0
         # Memory of rows, and the launch dimensions that have been captured.
-        self._extents: list[tuple[Extent, tuple[int, ...]]] = []
+        self._extents: list[tuple[LaunchDimensions, tuple[int, ...]]] = []
         self._buffer: np.ndarray | None = None
         self._copied: wp.Event | None = None  # event after which the buffer may be written
 
@@ -173,9 +174,9 @@ class DeviceGraph(CommandBuffer):
         """
         if isinstance(what, DeviceCopy):
             if any(slot_of(array) is not None for array in (what.to, what.source)):
-                raise NotRecordable("a copy of an array that is replaced")
-        elif isinstance(what, (Task, Operation)) or callable(what):
-            raise NotRecordable("a task of the host")
+                raise NotRecordableError("a copy of an array that is replaced")
+        elif isinstance(what, (HostTask, Operation)) or callable(what):
+            raise NotRecordableError("a task of the host")
         super().record(what)
 
     def extend(self, other: CommandBuffer) -> None:
@@ -204,7 +205,7 @@ class DeviceGraph(CommandBuffer):
         inputs: Sequence[KernelArgument],
         first: Patch | None,
         sized: int,
-        extent: Extent | None,
+        extent: LaunchDimensions | None,
     ) -> None:
         """Record a kernel launch with ranges of tasks.
 
@@ -237,7 +238,7 @@ class DeviceGraph(CommandBuffer):
         memory = bytes(native_of(layout)).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
         self._add(kernel, struct, room, memory, patches, bound)
 
-    def _hold(self, memory: Extent) -> tuple[int, ...]:
+    def _hold(self, memory: LaunchDimensions) -> tuple[int, ...]:
         """Return the launch dimensions for rows in memory.
 
         `fits` compares them with those of a later run.

@@ -66,7 +66,7 @@ SETTLING: tuple[tuple[ModuleType | type, tuple[str, ...]], ...] = (
 )
 
 
-class _Waiting(threading.local):
+class _StretchQueue(threading.local):
     """Queue of this thread's stretches, in the order of launching."""
 
     depth = 0  # nesting of `joined`
@@ -76,7 +76,7 @@ class _Waiting(threading.local):
         self.programs: list[DeviceGraph] = []
 
 
-WAITING = _Waiting()
+WAITING = _StretchQueue()
 # Weak references to the stretches, and their graph once there is one.
 _sequences: dict[tuple[int, ...], tuple[tuple[weakref.ref[DeviceGraph], ...], wp.Graph | None]] = {}
 

@@ -30,7 +30,7 @@ from warp_lcp.kernels.layout import (
     stencil_struct,
     threads,
 )
-from warp_lcp.kernels.memory import KernelArgument, value_of
+from warp_lcp.kernels.recorded_arguments import KernelArgument, value_of
 from warp_lcp.kernels.thread_pool import TableEntry
 from warp_lcp.kernels.types import DataType, FieldType, StructInstance
 

@@ -22,7 +22,14 @@ import warp as wp
 
 from warp_lcp.deadline import check_time, is_collective
 from warp_lcp.kernels.layout import offset_of
-from warp_lcp.kernels.memory import ARRAY_BYTES, Extent, KernelArgument, Scalar, slot_of, value_of
+from warp_lcp.kernels.recorded_arguments import (
+    ARRAY_BYTES,
+    KernelArgument,
+    LaunchDimensions,
+    Scalar,
+    slot_of,
+    value_of,
+)
 from warp_lcp.kernels.thread_pool import (
     ALONE,
     CELLS,
@@ -135,7 +142,7 @@ def launch_graph(graph: wp.Graph) -> None:
 
 
 @dataclass(frozen=True)
-class Task:
+class HostTask:
     """A task of the host between launches, such as a halo exchange.
 
     Args:
@@ -251,7 +258,7 @@ def launch_ranges(
     ordered: bool,
     first: Patch | None = None,
     sized: int = 0,
-    extent: Extent | None = None,
+    extent: LaunchDimensions | None = None,
 ) -> None:
     """Launch or record a kernel whose first argument begins with a range of tasks.
 
@@ -402,7 +409,9 @@ def _bytes_of(array: DeviceArray) -> int:
     return int(array.size * wp.types.type_size_in_bytes(array.dtype))
 
 
-Command: TypeAlias = "wp.Launch | Operation | Task | Conditional | Loop | DeviceCopy | DeviceCall"
+Command: TypeAlias = (
+    "wp.Launch | Operation | HostTask | Conditional | Loop | DeviceCopy | DeviceCall"
+)
 """Entry of a program: a launch, or what stands between launches."""
 
 
@@ -478,7 +487,7 @@ class CommandBuffer:
                 operation.only_if(what.condition) for operation in what.program._operations()
             ]
         else:
-            self._commands.append(Task(what) if callable(what) else what)
+            self._commands.append(HostTask(what) if callable(what) else what)
         self._forget_prepared()
 
     def _operations(self) -> list[Operation]:
@@ -584,7 +593,7 @@ class CommandBuffer:
 
     @property
     def _has_tasks(self) -> bool:
-        return any(isinstance(command, Task) for command in self._commands)
+        return any(isinstance(command, HostTask) for command in self._commands)
 
     def _prepared(self) -> list[Callable[[], object]]:
         """Return the stretches between host tasks, and the tasks.
@@ -592,10 +601,12 @@ class CommandBuffer:
         A stretch is a graph, a table or its launches.
         """
         functions: list[Callable[[], object]] = []
-        for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
+        for is_task, group in groupby(
+            self._commands, lambda command: isinstance(command, HostTask)
+        ):
             stretch = list(group)
             if is_task:
-                functions += [task.function for task in stretch if isinstance(task, Task)]
+                functions += [task.function for task in stretch if isinstance(task, HostTask)]
             elif self.device.is_cuda:
                 functions.append(partial(launch_graph, self._captured(stretch)))
             elif all(isinstance(command, Operation) for command in stretch):
@@ -632,7 +643,7 @@ class CommandBuffer:
         return ""
 
 
-class Identified:
+class KeyedArgument:
     """Argument of recorded launches that others replace: recordings know it by its key."""
 
     @property
@@ -653,13 +664,13 @@ def _identity(argument: object) -> Hashable:
         return tuple(map(_identity, argument))
     if isinstance(argument, dict):
         return tuple((name, _identity(value)) for name, value in argument.items())
-    return argument.identity if isinstance(argument, Identified) else argument
+    return argument.identity if isinstance(argument, KeyedArgument) else argument
 
 
 MOST_RECORDED = 32  # recordings of a graph
 
 
-class NotRecordable(Exception):
+class NotRecordableError(Exception):
     """A command that a CUDA graph cannot hold.
 
     It is a task of the host, or a copy of a replaced array.
@@ -748,7 +759,7 @@ class LaunchGraph:
         try:
             with recording(on_device):
                 self._record(*arguments)
-        except NotRecordable:
+        except NotRecordableError:
             return None
         on_device.finish()
         return on_device

@@ -21,7 +21,7 @@ from warp_lcp.kernels.fields import CPU_CHUNK, Layout, Padding
 from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
 
 if TYPE_CHECKING:
-    from warp_lcp.kernels.memory import RowsMemory
+    from warp_lcp.kernels.recorded_arguments import RowsMemory
 
 QUAD = 4  # cells of a row that a thread takes at a time on CUDA
 # Otherwise single cells, to compare both on a GPU.
@@ -432,7 +432,8 @@ class Rows:
         place: first stored cell of a box.
         ends: one past the last stored cell (k, j, i) of a box.
         weight: cost of a cell, in cells of a usual kernel.
-        memory: a `warp_lcp.kernels.memory.RowsMemory` that recorded launches read in each run;
+        memory: a `warp_lcp.kernels.recorded_arguments.RowsMemory` that recorded launches read in
+            each run;
             None: the rows never change.
         quads: their layout for a kernel on CUDA that does not sum and whose threads take quads of
             cells; threads that sum take as many there. None: threads take cells.

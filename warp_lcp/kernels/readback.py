@@ -58,7 +58,7 @@ class DeviceScalar:
         """Return the numbers after all launches so far; they are read-only."""
         if self._board is None:
             return self._view
-        return self._board.fetched(self._change)[self._slice].view(self._kind)
+        return self._board.fetch(self._change)[self._slice].view(self._kind)
 
 
 class ReadbackBuffer:
@@ -94,7 +94,7 @@ class ReadbackBuffer:
         self._changes += 1
         return self._changes
 
-    def fetched(self, change: int) -> np.ndarray:
+    def fetch(self, change: int) -> np.ndarray:
         """Return all bytes as they are after a change, or later."""
         if self._fetched < change:
             self._fetched, self._host = self._changes, self.memory[: self._end].numpy()

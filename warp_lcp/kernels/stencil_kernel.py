@@ -44,7 +44,13 @@ from warp_lcp.kernels.layout import (
     put,
     threads,
 )
-from warp_lcp.kernels.memory import ARRAY_BYTES, LAYOUT_BYTES, KernelArgument, Scalar, slot_of
+from warp_lcp.kernels.recorded_arguments import (
+    ARRAY_BYTES,
+    LAYOUT_BYTES,
+    KernelArgument,
+    Scalar,
+    slot_of,
+)
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 from warp_lcp.kernels.types import DataType, DeviceArray, FieldType, StructInstance
 

@@ -672,7 +672,7 @@ def _checked(value: int | str, name: str) -> int:
     return count
 
 
-class State:
+class PoolState:
     """Number of threads to use, and the pool once it is needed."""
 
     def __init__(self) -> None:
@@ -681,7 +681,7 @@ class State:
         self.lock = threading.Lock()
 
 
-STATE = State()
+STATE = PoolState()
 
 
 def get_threads() -> int:

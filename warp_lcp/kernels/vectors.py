@@ -21,8 +21,8 @@ from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.header_text import HEADERS, text
 from warp_lcp.kernels.kernel_file import KernelFile
 from warp_lcp.kernels.launch_graph import (
+    HostTask,
     Launch,
-    Task,
     as_one_table,
     copy,
     is_recording,
@@ -31,8 +31,8 @@ from warp_lcp.kernels.launch_graph import (
 )
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.layout import BoundOperands, KernelStencil
-from warp_lcp.kernels.memory import DeviceRows, KernelArgument, Scalar, value_of
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import DeviceRows, KernelArgument, Scalar, value_of
 from warp_lcp.kernels.thread_pool import Operation
 from warp_lcp.kernels.types import DeviceArray
 
@@ -122,7 +122,7 @@ class Communicator(Protocol):
     def sum(self, values: Entries) -> Entries:
         """Return sums over all parts, entry by entry."""
 
-    def adding(self, sums: np.ndarray) -> Operation:
+    def sum_operation(self, sums: np.ndarray) -> Operation:
         """Return an operation that replaces float64 sums by those over all ranks.
 
         It works in place and runs in the thread pool.
@@ -263,7 +263,7 @@ class Reduction:
         self.add_up(slot, launch=launch)
 
 
-class Sums(Reduction):
+class RowReduction(Reduction):
     """Sums of kernels over the same rows, read back by the host.
 
     Args:
@@ -332,7 +332,7 @@ class Sums(Reduction):
         self.reading.changed()
 
 
-class Tally:
+class DynamicReduction:
     """Sums and a maximum of a kernel over rows that change.
 
     They have the same bits in every run.
@@ -492,10 +492,10 @@ def sum_over_ranks(
     """
 
     def operation() -> Operation:
-        adding = comm.adding(scalars.numpy()[slots])
+        adding = comm.sum_operation(scalars.numpy()[slots])
         return adding if condition is None else adding.only_if(condition)
 
-    Task(
+    HostTask(
         partial(_sum_over_ranks, comm, scalars, slots, condition),
         operation if scalars.device.is_cpu else None,
     ).launch(launch)

@@ -17,8 +17,8 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, LaunchGraph, clear
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, Reduction, rows_of
 

@@ -12,7 +12,7 @@ from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.fields import zeros, zeros_like
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import ADD, Sums, rows_of
+from warp_lcp.kernels.vectors import ADD, RowReduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
@@ -60,7 +60,7 @@ class GMRES:
         # The first ones, preconditioned.
         self._images = zeros(min(KEPT, restart) * r.size, r.dtype, r.device)
         # Products with them, and a square in the last slot.
-        self._sums = Sums(rows_of(r), restart + 1, slots=restart + 2)
+        self._sums = RowReduction(rows_of(r), restart + 1, slots=restart + 2)
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
         self._increase = ADD.bind(rows_of(r), z=preconditioner.z, x=self.x)

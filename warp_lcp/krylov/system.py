@@ -9,7 +9,7 @@ import numpy as np
 
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Communicator, Sums, rows_of
+from warp_lcp.kernels.vectors import Communicator, RowReduction, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
 NORM = KERNELS["krylov.norm"]
@@ -49,7 +49,7 @@ class KrylovSystem:
         self._krylov, self.e, self._norms, self._weighted_by = (
             method,
             method.x,
-            Sums(rows or rows_of(self.r), comm=comm),
+            RowReduction(rows or rows_of(self.r), comm=comm),
             weight,
         )
 

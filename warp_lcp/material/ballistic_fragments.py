@@ -12,13 +12,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.part import BodyNumbers
+from warp_lcp.grid.grid_part import BodyNumbers
 from warp_lcp.grid.particle_loops import PARTICLE, ListMemory
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material import ballistic_fragments_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
@@ -78,7 +78,7 @@ class BallisticFragments:
             wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2)
         )
         self._count, self._found = DeviceScalar(grid.device, 2, wp.int32), False
-        self._flight = kernels.Flight()
+        self._flight = kernels.FragmentFields()
         self._flight.straight = not coheres
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._flight.origin = wp.vec3i(*grid.origin)

@@ -31,7 +31,7 @@ Vectors, Field = wp.array(dtype=wp.vec3), F32
 
 
 @wp.struct
-class Flight:
+class FragmentFields:
     """The particles of bodies, and sums over each body, for kernels."""
 
     planes: int
@@ -69,7 +69,9 @@ def put(sums: wp.array2d(dtype=wp.int64), body: int, column: int, quanta: wp.flo
 
 
 @wp.func
-def add_up(flight: Flight, rate: float, q: wp.float64, velocity: Vectors, n: int, x: wp.vec3):
+def add_up(
+    flight: FragmentFields, rate: float, q: wp.float64, velocity: Vectors, n: int, x: wp.vec3
+):
     """Add the n-th particle at x [cells] to its body's sums, in cells and steps.
 
     `rate` is cells a step in one m/s, and q of the sums' units are one cell or cell a step or
@@ -116,7 +118,7 @@ def board_kernel(
 def lift_kernel(
     i,
     who: Integers,
-    flight: Flight,
+    flight: FragmentFields,
     rate: float,
     quanta: wp.float64,
     velocity: Vectors,
@@ -182,7 +184,7 @@ def is_near(base: Kinds, touch: U8, planes: int, origin: wp.vec3i, x: wp.vec3):
 def fly_kernel(
     i,
     who: Integers,
-    flight: Flight,
+    flight: FragmentFields,
     h: float,
     velocity: Vectors,
     u: Field,
@@ -233,7 +235,7 @@ def fly_kernel(
 def arrive_kernel(
     i,
     who: Integers,
-    flight: Flight,
+    flight: FragmentFields,
     rate: float,
     quanta: wp.float64,
     velocity: Vectors,
@@ -253,7 +255,7 @@ def arrive_kernel(
 def land_kernel(
     i,
     who: Integers,
-    flight: Flight,
+    flight: FragmentFields,
     velocity: Vectors,
     gradient_u: Vectors,
     gradient_v: Vectors,

@@ -19,13 +19,13 @@ from warp_lcp.grid.domain_sides import PeriodicSides, continue_beyond, with_peri
 from warp_lcp.grid.level_set import whole_cell_capacity
 from warp_lcp.grid.motion import Motions, boxes_of, kinks
 from warp_lcp.grid.particle_loops import MARGIN
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.thin_walls import ThinWalls
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy, launch
-from warp_lcp.kernels.memory import Scalar
 from warp_lcp.kernels.readback import DeviceScalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.velocity_extrapolation import Join, extend_velocity, extend_velocity_cut
 

@@ -17,15 +17,15 @@ import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import LaunchGraph, launch
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 
@@ -89,7 +89,7 @@ class DensityMonitor:
             particles_a_cell,
             max_density,
         )
-        self._crowd = WindowTally(CROWD, grid, grid.part.owned)
+        self._crowd = WindowReduction(CROWD, grid, grid.part.owned)
         self._density: wp.array | None = None
         # Result of the last `measure`, once it has been read.
         self._known: tuple[float, float] | None = None
@@ -263,7 +263,7 @@ class DensityCorrection:
         )
         wp.copy(self._kind, boundary.base)
         self._displace = displacement_pass(bool(boundary.open))
-        self._over, self._lacking = WindowTally(PREPARE, grid), WindowTally(EVEN, grid)
+        self._over, self._lacking = WindowReduction(PREPARE, grid), WindowReduction(EVEN, grid)
         self._inside = self._lower = None
         self._counted = (
             wp.zeros(1, dtype=wp.float64, device=grid.device)
@@ -327,7 +327,7 @@ class DensityCorrection:
         self._over.changed()
         if self._inside is not None:
             self._lacking.changed()
-        result = self._solve_counting() if self._begins_ahead() else None
+        result = self._solve_counting() if self._begins_on_gpu() else None
         over_full, most = self._found()
         if over_full == 0:
             self.x.zero_()
@@ -421,12 +421,12 @@ class DensityCorrection:
         )
         return self._solved_to(criteria)
 
-    def _begins_ahead(self) -> bool:
+    def _begins_on_gpu(self) -> bool:
         """Return whether a GPU starts the solve before the host knows of overfull cells."""
         return (
             self._problem is not None
             and not self.grid.part.shared
-            and bool(getattr(self._work, "begins_ahead", False))
+            and bool(getattr(self._work, "begins_on_gpu", False))
         )
 
     def _solve_counting(self) -> wl.SolveResult:

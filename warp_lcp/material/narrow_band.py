@@ -47,7 +47,7 @@ from warp_lcp.grid.particles import MOST_A_CELL, Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, is_recording
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material import narrow_band_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.resample import PLASTIC
@@ -126,7 +126,7 @@ class NarrowBand:
             (*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device
         )
         self.held = self.fresh = 0
-        self._numbered = kernels.Numbered()
+        self._numbered = kernels.CellNumbering()
         self._numbered.origin, self._numbered.across = (
             wp.vec3i(*grid.origin),
             wp.vec2i(*(n + 2 for n in grid.domain_counts[:2])),
@@ -517,7 +517,7 @@ class NarrowBand:
 
     def _launch_seeds(self, particles: Particles) -> None:
         """Launch the placing of fresh particles on their sites."""
-        grid, sites = self.grid, kernels.Sites()
+        grid, sites = self.grid, kernels.JitteredLattice()
         sites.planes, sites.per_axis, sites.jitter, sites.seed = (
             grid.planes,
             self.per_axis,

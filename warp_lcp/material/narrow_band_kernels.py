@@ -136,7 +136,7 @@ def renewed(now: float, before: float, width: float):
 
 
 @wp.struct
-class Numbered:
+class CellNumbering:
     """Numbering of cells that is the same in all parts of a grid."""
 
     origin: wp.vec3i  # cells (x, y, z) of a larger grid before the first one of this
@@ -144,7 +144,7 @@ class Numbered:
 
 
 @wp.func
-def number_of(where: Numbered, k: int, j: int, i: int):
+def number_of(where: CellNumbering, k: int, j: int, i: int):
     """Return the number of a stored cell in the larger grid."""
     return (
         ((k + where.origin[2]) * where.across[1] + j + where.origin[1]) * where.across[0]
@@ -158,7 +158,7 @@ def quota_kernel(
     k,
     j,
     i,
-    where: Numbered,
+    where: CellNumbering,
     width: float,
     particles: float,
     seed: int,
@@ -196,7 +196,7 @@ def leave_kernel(
 
 
 @wp.struct
-class Sites:
+class JitteredLattice:
     """A jittered lattice of sites in a cell, with a number of sites along each axis."""
 
     planes: int
@@ -211,8 +211,8 @@ def seed_kernel(
     k,
     j,
     i,
-    S: Sites,
-    where: Numbered,
+    S: JitteredLattice,
+    where: CellNumbering,
     shift_x: float,
     shift_y: float,
     shift_z: float,

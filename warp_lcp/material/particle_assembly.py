@@ -17,11 +17,11 @@ import warp_lcp as wl
 from warp_lcp.grid.barriers import BARRIER, Barriers
 from warp_lcp.grid.cut_cells import DEEP, CutCells
 from warp_lcp.grid.domain_sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
-from warp_lcp.grid.part import subdomain_of
+from warp_lcp.grid.grid_part import subdomain_of
 from warp_lcp.grid.particles import Particles, seed
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
+from warp_lcp.grid.surface_mesh import SurfaceMesh, SurfaceObstacles
 from warp_lcp.grid.thin_walls import (
     SHEET,
     STRIDE_ROOM,
@@ -51,7 +51,7 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import Shape, SolidProperties
 
 if TYPE_CHECKING:
-    from warp_lcp.granular.solids import SandSolids
+    from warp_lcp.granular.wall_friction import SandSolids
 
 
 def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
@@ -266,7 +266,7 @@ def make_thin_walls(
 
 
 @dataclass(frozen=True)
-class Parts:
+class GridComponents:
     """Parts of a simulation that belong to one grid, and are made again for another.
 
     Attributes:
@@ -323,7 +323,7 @@ def make_surface_mesh(
         per_axis=scene.particles.per_axis,
         resolution=scene.output.surface_resolution,
         smoothing=scene.output.surface_smoothing,
-        obstacles=Obstacles(
+        obstacles=SurfaceObstacles(
             boundary.base, boundary.distance, boundary.moves, boundary.shapes, grid.barriers
         )
         if scene.solid

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warp_lcp.grid.part import subdomain_of
+from warp_lcp.grid.grid_part import subdomain_of
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.domain_window import DomainWindow, carry_over
 from warp_lcp.material.narrow_band import without_band

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import UNSORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.surface_mesh import Interior, SurfaceMesh, faces_from_particles, sample
+from warp_lcp.grid.surface_mesh import FilledInterior, SurfaceMesh, faces_from_particles, sample
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_volume import ParticleVolume
@@ -71,7 +71,7 @@ class ParticleFrames(ABC):
         band = self.band
         mesh = surface.find(
             position,
-            Interior(band.depth, band.full, self.boundary.base) if band is not None else None,
+            FilledInterior(band.depth, band.full, self.boundary.base) if band is not None else None,
         )
         if not self._faces_know:  # the next step overwrites what the faces are given here
             faces_from_particles(

@@ -69,7 +69,7 @@ def columns(
     )
 
 
-class Moved(NamedTuple):
+class CompletedStep(NamedTuple):
     """Data of a step that has been taken.
 
     Attributes:
@@ -97,7 +97,7 @@ def solve_row(result: wl.SolveResult) -> Row:
     }
 
 
-def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: float) -> Row:
+def totals_row(totals: ParticleTotals, moved: CompletedStep, particles: int, spacing: float) -> Row:
     """Return the log entries of the particles at the end of a step.
 
     Cells have the width `spacing` [m].
@@ -114,7 +114,7 @@ def totals_row(totals: ParticleTotals, moved: Moved, particles: int, spacing: fl
     }
 
 
-def _kinetic_energy(totals: ParticleTotals, moved: Moved) -> float:
+def _kinetic_energy(totals: ParticleTotals, moved: CompletedStep) -> float:
     """Return the kinetic energy per mass at the end of a step [m^2/s^2].
 
     The particles' velocities are those of the middle of the step. Gravity acts for half a step more

@@ -13,12 +13,12 @@ from pydantic import Field
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
 from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_volume import VOLUME_BYTES
-from warp_lcp.scene.models import Model, model_lines, prices
+from warp_lcp.scene.models import SceneModel, model_lines, prices
 from warp_lcp.scene.presets import preset_values
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import Drain, MaterialProperties, Source, SourceProperties
 from warp_lcp.scene.suspicious_settings import material_notes
-from warp_lcp.scene.table import Complaint, Table
+from warp_lcp.scene.table import CrossKeyError, Table
 from warp_lcp.settings import Count, CountOrZero, Part, Share
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
@@ -43,7 +43,7 @@ SITE_SLACK = 1e-3
 LATTICE_BYTES = 50  # a point of one plane of cells, while particles are selected
 
 
-class Reseed(Table):
+class ReseedingSettings(Table):
     """[particles.reseed]: reseeding inside the material; off without the table."""
 
     every: Count = Field(default=2, description="steps between reseedings")
@@ -75,12 +75,12 @@ class ParticleSettings(Table):
         default=0.25, description="random initial displacement [particle distances]"
     )
     seed: CountOrZero = Field(default=2015, description="seed of jitter")
-    reseed: Reseed | None = None
+    reseed: ReseedingSettings | None = None
     narrow_band: NarrowBandSettings | None = None
 
     def reseed_range(self, dimension: int) -> tuple[int, int]:
         """Return the range of particle numbers of cells that reseeding leaves alone."""
-        at_rest, given = self.per_axis**dimension, self.reseed or Reseed()
+        at_rest, given = self.per_axis**dimension, self.reseed or ReseedingSettings()
         return given.min or math.ceil(0.375 * at_rest), given.max or 2 * at_rest
 
 
@@ -138,7 +138,7 @@ class ParticleScene(Scene):
         """Return the number that particles of each material or source carry; None if none."""
         return None
 
-    def models(self) -> list[Model]:
+    def models(self) -> list[SceneModel]:
         """Return the models of the scene, and the models that it cannot need.
 
         Subclasses add their own.
@@ -167,7 +167,7 @@ class ParticleScene(Scene):
             "diagnostics": "output.diagnostics" if output.diagnostics else "",
         }
         return [
-            Model(name, why, count=len(bodies) if name == "rigid bodies" else 1)
+            SceneModel(name, why, count=len(bodies) if name == "rigid bodies" else 1)
             for name, why in used.items()
             if why
         ]
@@ -227,13 +227,13 @@ class ParticleScene(Scene):
         """
         return self.particles.narrow_band is None and not self.stays_full and not self.endless
 
-    def complaints(self) -> list[Complaint]:
+    def complaints(self) -> list[CrossKeyError]:
         """Return errors that concern several keys."""
         key, materials = self.materials()
         complaints = (
             []
             if materials or self.source
-            else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
+            else [CrossKeyError((key,), None, "is missing, and there is no [[source]] either")]
         )
         complaints += self.shape_complaints(key, materials, inside=True)
         complaints += self.shape_complaints(
@@ -241,13 +241,13 @@ class ParticleScene(Scene):
         ) + self.shape_complaints("drain", self.drain, inside=True)
         if self.particles.narrow_band is not None and not self.carried_by_grid:
             message = "is for liquids only: the state of sand is stored on its particles"
-            complaints.append(Complaint(("particles", "narrow_band"), None, message))
+            complaints.append(CrossKeyError(("particles", "narrow_band"), None, message))
         if self.output.forces and not self.carried_by_grid:
-            complaints.append(Complaint(("output", "forces"), True, "is for liquids only"))
+            complaints.append(CrossKeyError(("output", "forces"), True, "is for liquids only"))
         for number, source in enumerate(self.source if not self.carried_by_grid else []):
             if source.viscosity is not None:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("source", number, "viscosity"), source.viscosity, "is for liquids only"
                     )
                 )
@@ -257,14 +257,14 @@ class ParticleScene(Scene):
         """Return settings that look like mistakes."""
         return [*super().notes(), *material_notes(self, *self.materials())]
 
-    def _reseed_complaints(self) -> list[Complaint]:
+    def _reseed_complaints(self) -> list[CrossKeyError]:
         least, most = self.particles.reseed_range(self.dimension)
         at_rest = self.particles.per_axis**self.dimension
         if self.particles.reseed is None or least <= at_rest <= most:
             return []
         key, value, word = ("min", least, "most") if least > at_rest else ("max", most, "least")
         message = f"must be at {word} the {at_rest} particles of a cell at rest"
-        return [Complaint(("particles", "reseed", key), value, message)]
+        return [CrossKeyError(("particles", "reseed", key), value, message)]
 
     def particle_estimate(self, *, later: bool = True) -> int:
         """Return the largest number of particles of the scene.

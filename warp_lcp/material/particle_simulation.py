@@ -18,16 +18,16 @@ from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.kernels.launch_graph import LaunchGraph, copy
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.domain_window import DomainWindow, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.particle_assembly import (
-    Parts,
+    GridComponents,
     make_flights,
     make_particle_volume,
     make_surface_mesh,
 )
 from warp_lcp.material.particle_checkpoints import ParticleCheckpoints
-from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
+from warp_lcp.material.particle_log import CompletedStep, Row, columns, solve_row, totals_row
 from warp_lcp.material.particle_redistribution import ParticleRedistribution
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import particle_trouble
@@ -45,7 +45,7 @@ CONTACTS_MISSED = 1e-2
 class ParticleSimulationOptions(TypedDict, total=False):
     """Optional arguments of `ParticleSimulation`, see there."""
 
-    make_parts: Callable[[StaggeredGrid], Parts] | None
+    make_parts: Callable[[StaggeredGrid], GridComponents] | None
     outlets: Outlets | None
     bodies: RigidBodies | None
     coverage: DomainWindow | None
@@ -125,10 +125,10 @@ class ParticleSimulation(ParticleCheckpoints):
         self,
         scene: ParticleScene,
         grid: StaggeredGrid,
-        parts: Parts,
+        parts: GridComponents,
         particles: Particles,
         *,
-        make_parts: Callable[[StaggeredGrid], Parts] | None = None,
+        make_parts: Callable[[StaggeredGrid], GridComponents] | None = None,
         outlets: Outlets | None = None,
         bodies: RigidBodies | None = None,
         coverage: DomainWindow | None = None,
@@ -160,7 +160,7 @@ class ParticleSimulation(ParticleCheckpoints):
         particles.sort()
         particles.exchange.count()
 
-    def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
+    def allocate(self, grid: StaggeredGrid, parts: GridComponents) -> None:
         """Allocate the parts that belong to a grid; subclasses add theirs."""
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
@@ -773,7 +773,9 @@ class ParticleSimulation(ParticleCheckpoints):
         return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
-        moved = Moved(self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt)
+        moved = CompletedStep(
+            self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt
+        )
         density, flying = (
             self.band.mean_density if self.band is not None else None,
             self.spray.particles.count,

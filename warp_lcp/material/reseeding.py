@@ -13,7 +13,7 @@ from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.particles_kernels import offset_kernel
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, launch
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material import reseeding_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
@@ -94,9 +94,9 @@ class Reseeding:
             (d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d))
         )
 
-    def _settings(self) -> kernels.ReseedingSetting:
+    def _settings(self) -> kernels.ReseedingParameters:
         """Return the settings that are the same for all cells and steps, for kernels."""
-        grid, s = self.grid, kernels.ReseedingSetting()
+        grid, s = self.grid, kernels.ReseedingParameters()
         s.planes, s.dx, s.inverse_dx = grid.planes, grid.spacing, 1.0 / grid.spacing
         s.origin, s.across = (
             wp.vec3i(*grid.origin),

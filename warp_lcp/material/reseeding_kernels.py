@@ -19,7 +19,7 @@ _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 
 
 @wp.struct
-class ReseedingSetting:
+class ReseedingParameters:
     """Wanted numbers of particles of a cell, and other settings of a step."""
 
     planes: int
@@ -44,7 +44,7 @@ def find_kernel(
     k,
     j,
     i,
-    s: ReseedingSetting,
+    s: ReseedingParameters,
     count: I32,
     capacity: F32,
     base: I8,
@@ -110,7 +110,7 @@ def take_from(
     cell: int,
     way: wp.vec3i,
     seed: int,
-    s: ReseedingSetting,
+    s: ReseedingParameters,
     offsets: INTS,
     count: I32,
     position: POINTS,
@@ -178,7 +178,7 @@ def exchange_kernel(
     i,
     way: wp.vec3i,
     seed: int,
-    s: ReseedingSetting,
+    s: ReseedingParameters,
     takers: INTS,
     offsets: INTS,
     count: I32,

@@ -12,12 +12,12 @@ from warp_lcp.grid.cell_kernel import launch_list, list_kernel
 from warp_lcp.grid.domain_sides import mark_gone
 from warp_lcp.grid.particle_loops import MARGIN, ListMemory, launch
 from warp_lcp.grid.particles import GROWTH, Particles
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.host_array import HostArray
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
-from warp_lcp.kernels.memory import Slot
+from warp_lcp.kernels.recorded_arguments import Slot
 from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID

@@ -14,7 +14,7 @@ from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.launch_graph import LaunchGraph
-from warp_lcp.kernels.memory import Scalar
+from warp_lcp.kernels.recorded_arguments import Scalar
 
 EVERY = 8  # steps between searches for particles that have left the others
 TILE = 8  # cells of a tile; empty tiles separate clusters of particles

@@ -19,7 +19,7 @@ from pyamg.strength import classical_strength_of_connection, symmetric_strength_
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import CommandBuffer
-from warp_lcp.kernels.memory import KernelArgument
+from warp_lcp.kernels.recorded_arguments import KernelArgument
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.operators.sparse import SparseOperator

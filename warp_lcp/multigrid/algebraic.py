@@ -59,7 +59,7 @@ class DeviceMatrix:
             RowEntries(self.indptr, self.indices, self.values),
         )
 
-    def multiplying(self, x: DeviceArray, y: DeviceArray, *, add: bool = False) -> BoundKernel:
+    def product_kernel(self, x: DeviceArray, y: DeviceArray, *, add: bool = False) -> BoundKernel:
         """Return the kernel y = A x, or y + A x."""
         return PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y)
 
@@ -186,7 +186,7 @@ class AlgebraicLevel:
             self._legs[key] = [
                 *self.pair(self.weights, from_zero=from_zero),
                 residual,
-                self.R.multiplying(self.t, coarse.b),
+                self.R.product_kernel(self.t, coarse.b),
             ]
         return self._legs[key]
 
@@ -200,7 +200,7 @@ class AlgebraicLevel:
         if key not in self._legs:
             assert self.P is not None, "not the coarsest level"
             self._legs[key] = [
-                self.P.multiplying(coarse.x, self.x, add=True),
+                self.P.product_kernel(coarse.x, self.x, add=True),
                 *self.pair(self.weights[::-1]),
             ]
         return self._legs[key]
@@ -266,11 +266,11 @@ class AlgebraicHierarchy:
             scale=self.scale,
             weight=self.weight,
         ).launch()
-        self._coarsening.run()
+        self._coarsen_program.run()
 
     def product(self, p: DeviceArray, q: DeviceArray, *, launch: Launch = launch_now) -> None:
         """Compute q = M p on the finest level."""
-        self.levels[0].A.multiplying(p, q).launch(launch)
+        self.levels[0].A.product_kernel(p, q).launch(launch)
 
     @cached_property
     def program(self) -> CommandBuffer:
@@ -285,7 +285,7 @@ class AlgebraicHierarchy:
         self.program.run()
 
     @cached_property
-    def _coarsening(self) -> CommandBuffer:
+    def _coarsen_program(self) -> CommandBuffer:
         program = CommandBuffer(self.device)
         launch = program.launch
         for depth, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):

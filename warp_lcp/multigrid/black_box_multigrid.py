@@ -30,7 +30,7 @@ from warp_lcp.multigrid.dense_inverse import DenseInverse
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
-from warp_lcp.problem.protocol import HasStencil, Operator, has
+from warp_lcp.problem.operator_protocol import HasStencil, Operator, has
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/lines.h")
 FILL = KERNELS["lines.fill"]
@@ -121,7 +121,7 @@ class LineLevel:
             cells=COLUMNS if device.is_cpu else 2,
         )
 
-    def transferring(self) -> list[BoundKernel]:
+    def transfer_kernels(self) -> list[BoundKernel]:
         """Return the kernels that compute the transfer weights."""
         fx, fy = self.factors
         same = int(self.restricts is self.shares)
@@ -143,7 +143,7 @@ class LineLevel:
                 )
         return passes
 
-    def factoring(self) -> list[BoundKernel]:
+    def factor_kernels(self) -> list[BoundKernel]:
         """Return the kernels that factor the lines' tridiagonal systems."""
         _, ny, nx = self.padding.counts
         bound_kernels = []
@@ -164,7 +164,7 @@ class LineLevel:
             )
         return bound_kernels
 
-    def coarsening(self, coarse: LineLevel) -> BoundKernel:
+    def coarsen_kernel(self, coarse: LineLevel) -> BoundKernel:
         """Return the kernel that computes the next level's matrix."""
         fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
@@ -206,7 +206,7 @@ class LineLevel:
         ]
         return across, along
 
-    def smoothing(self, *, up: bool) -> list[BoundKernel]:
+    def smooth_kernels(self, *, up: bool) -> list[BoundKernel]:
         """Return the sweeps on the way down, rows first, or on the way up."""
         sweeps = [sweep for axis in self._zebras for sweep in axis]
         return sweeps[::-1] if up else sweeps
@@ -217,14 +217,18 @@ class LineLevel:
         key = "down", from_zero
         if key not in self._legs:
             zero = [ZERO.bind(Rows.flat(self.x.size, self.device), x=self.x)] if from_zero else []
-            self._legs[key] = [*zero, *self.smoothing(up=False), *self.restricting(coarse)]
+            self._legs[key] = [
+                *zero,
+                *self.smooth_kernels(up=False),
+                *self.restrict_kernels(coarse),
+            ]
         return self._legs[key]
 
-    def restricting(self, coarse: LineLevel) -> list[BoundKernel]:
+    def restrict_kernels(self, coarse: LineLevel) -> list[BoundKernel]:
         """Return the kernel that restricts the residual."""
         return [
             RESIDUAL.bind(self.rows, self.fields, stencil=self.stencil),
-            self.handing_down(coarse),
+            self.restrict_to_coarse_kernel(coarse),
         ]
 
     def coarsen_bounds(self, coarse: LineLevel) -> tuple[()]:
@@ -235,10 +239,10 @@ class LineLevel:
         """Return steps 5 and 6 of a cycle: the correction and line sweeps."""
         key = "up", projected
         if key not in self._legs:
-            self._legs[key] = [self.correcting(coarse), *self.smoothing(up=True)]
+            self._legs[key] = [self.correct_kernel(coarse), *self.smooth_kernels(up=True)]
         return self._legs[key]
 
-    def handing_down(self, coarse: LineLevel) -> BoundKernel:
+    def restrict_to_coarse_kernel(self, coarse: LineLevel) -> BoundKernel:
         """Return the kernel that restricts the residual to the coarse right-hand side."""
         fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
@@ -251,7 +255,7 @@ class LineLevel:
             fy=fy,
         )
 
-    def correcting(self, coarse: LineLevel, *, add: bool = True) -> BoundKernel:
+    def correct_kernel(self, coarse: LineLevel, *, add: bool = True) -> BoundKernel:
         """Return the kernel that adds the coarse correction, or sets x to it."""
         rows = self.rows.beside(coarse.rows, (-self.factors[0], -self.factors[1], -1))
         return UP.bind(rows, self.fields, coarse=coarse.x, shares=self.shares, add=add)
@@ -312,12 +316,12 @@ class BlackBoxMultigrid:
         `weight`.
         """
         self._fill(free, shift, weight)
-        self._building.run()
+        self._build_program.run()
 
     def take_all(self, free: DeviceArray) -> None:
         """Set a free set for transfers between the two finest levels only."""
         self._fill(free, None, None)
-        for made in self.finest.transferring():
+        for made in self.finest.transfer_kernels():
             made.launch()
 
     def _fill(
@@ -335,10 +339,14 @@ class BlackBoxMultigrid:
         ).launch()
 
     @cached_property
-    def _building(self) -> CommandBuffer:
+    def _build_program(self) -> CommandBuffer:
         program = CommandBuffer(self.device)
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
-            for made in (*fine.transferring(), *fine.factoring(), fine.coarsening(coarse)):
+            for made in (
+                *fine.transfer_kernels(),
+                *fine.factor_kernels(),
+                fine.coarsen_kernel(coarse),
+            ):
                 made.launch(program.launch)
         self._dense.record(program, by_block=False)
         return program

@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_lcp.kernels import BoundKernel, FusedKernel
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
-from warp_lcp.kernels.memory import KernelArgument
+from warp_lcp.kernels.recorded_arguments import KernelArgument
 
 
 class CycleStage(Protocol):

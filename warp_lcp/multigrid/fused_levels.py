@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warp_lcp.kernels import BoundKernel, PersistentKernel
-from warp_lcp.kernels.launch_graph import Task
+from warp_lcp.kernels.launch_graph import HostTask
 from warp_lcp.kernels.persistent_kernel import has_clusters
 from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle, CycleStage
 
@@ -42,7 +42,7 @@ class FusedCoarseLevels:
             level.in_one_launch = True
 
     @functools.cached_property
-    def coarsening(self) -> PersistentKernel:
+    def coarsen_kernel(self) -> PersistentKernel:
         """Stages that compute all levels from the first one."""
         stages = _kernels(
             s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)
@@ -61,7 +61,7 @@ class FusedCoarseLevels:
         return (self._sequences[key],)
 
 
-def _kernels(stages: Iterable[CycleStage | Task]) -> list[BoundKernel]:
+def _kernels(stages: Iterable[CycleStage | HostTask]) -> list[BoundKernel]:
     """Return stages, all of which are kernels: small levels lie in one process."""
     kernels = []
     for stage in stages:

@@ -95,7 +95,7 @@ def share_changes(level: StencilLevel, launch: Launch) -> None:
         sides.append((axis, at, row, wp.empty(across, dtype=s.d.dtype, device=s.device)))
     for axis, at, _, known in sides:
         launch(keep_side_kernel, known.shape, [d, axis, at, known], device=s.device)
-    s.ghosts.filling(s.d).launch(launch)
+    s.ghosts.fill_task(s.d).launch(launch)
     for axis, at, row, known in sides:
         launch(
             mark_side_kernel, known.shape, [d, axis, at, row, known, level.changed], device=s.device
@@ -132,7 +132,7 @@ def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> It
         yield from level.stencil.fillings(field)
     s, (first, second) = level.stencil, level.settings.weights
     all_rows, inside = Rows.stored(s.padding, s.device), s.rows.after_ghosts()
-    into_ring = level.sweeping(
+    into_ring = level.sweep_kernel(
         level.t,
         level.x,
         first,
@@ -141,13 +141,13 @@ def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> It
         kind=passes.SWEEP_INTO_RING,
         rows=all_rows,
     )
-    out_of_ring = level.sweeping(
+    out_of_ring = level.sweep_kernel(
         level.x, level.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING, rows=inside
     )
-    yield Leg(passes.DESCEND_FROM_GHOSTS, (into_ring, out_of_ring, level.restricting(coarse)))
-    yield from level.filling("x")
+    yield Leg(passes.DESCEND_FROM_GHOSTS, (into_ring, out_of_ring, level.restrict_kernel(coarse)))
+    yield from level.fill_task("x")
     for low, high in beside_cuts(coarse.stencil, 1):
-        yield level.restricting(coarse, _coarser_part(level, coarse, low, high))
+        yield level.restrict_kernel(coarse, _coarser_part(level, coarse, low, high))
 
 
 def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
@@ -165,18 +165,18 @@ def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Ite
         )
         factors = [1 if a == axis else f for a, f in enumerate(coarse.factors)]
         rows = ours.beside(theirs, (-factors[0], -factors[1], -factors[2]))
-        yield level.correcting(coarse, scale, projected=projected, rows=rows)
+        yield level.correct_kernel(coarse, scale, projected=projected, rows=rows)
         yield CONVERT.bind(ours, a=level.x, b=near)
     for low, high in beside_cuts(s, BESIDE):
         yield CONVERT.bind(Rows.part(s.padding, s.device, low, high), a=level.x, b=near)
-        yield level.correcting(
+        yield level.correct_kernel(
             coarse, scale, projected=projected, rows=_finer_part(level, coarse, low, high), x=near
         )
     yield from _sweeps_beside(level, level.t, near, 2, projected=projected)
     # The ring uses that for the plane above the last one, too.
     yield passes.CLEAR.bind(Rows.beyond(s.padding, s.device, 2, 0), x=near)
-    yield from level.filling("t")
-    correcting = level.correcting(coarse, scale, projected=projected)
+    yield from level.fill_task("t")
+    correcting = level.correct_kernel(coarse, scale, projected=projected)
     yield Leg(
         passes.ASCEND,
         (
@@ -196,7 +196,7 @@ def _sweeps_beside(
     """
     for low, high in beside_cuts(level.stencil, depth):
         rows = Rows.part(level.stencil.padding, level.stencil.device, low, high)
-        yield level.sweeping(
+        yield level.sweep_kernel(
             y, x, level.settings.weights[depth - 1], projected=projected, rows=rows
         )
 

@@ -157,7 +157,7 @@ class Hierarchy:
         """
         last, (nz, ny, nx) = self.levels[-1], whole_counts(self.levels[-1].stencil)
         assert last.stencil.ghosts is not None
-        gathering, strength = last.stencil.ghosts.gathering, tuple(self._strength)
+        gathering, strength = last.stencil.ghosts.field_gather, tuple(self._strength)
         stencil = _whole_stencil(last.stencil, (nz, ny, nx), strength)  # type: ignore[arg-type]
         bounds = None
         if bounded and last.upper.size == 0:
@@ -180,8 +180,8 @@ class Hierarchy:
         )
         return GatheredLevel(
             whole=whole.cycles.__getitem__,
-            gather=[gathering.collecting(last.b, finest.b)],
-            gather_bounds=[gathering.collecting(mine, theirs) for mine, theirs in sides],
+            gather=[gathering.collect_task(last.b, finest.b)],
+            gather_bounds=[gathering.collect_task(mine, theirs) for mine, theirs in sides],
             take=Launches(partial(gathering.take, finest.x, last.x)),
         ).solve
 
@@ -231,9 +231,9 @@ class Hierarchy:
                     coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device
                 )
         for level in self.levels if self.finest.stencil.spans is not None else []:
-            level.renewing(keeps_weights=level is self.finest).launch(program.launch)
+            level.clear_kernel(keeps_weights=level is self.finest).launch(program.launch)
         if self._signs is not None:
-            self.finest.signing(self._signs).launch(program.launch)
+            self.finest.mark_changes_kernel(self._signs).launch(program.launch)
         return program
 
     def hold(self, d: DeviceArray, free: DeviceArray) -> None:
@@ -258,10 +258,10 @@ class Hierarchy:
         that writes the finest diagonal must mark the rows, as `hold` does. The result is bitwise
         that of a complete rebuild.
         """
-        self.rebuilding.run()
+        self.rebuild_program.run()
 
     @cached_property
-    def rebuilding(self) -> CommandBuffer:
+    def rebuild_program(self) -> CommandBuffer:
         """Launches of `rebuild_changed`."""
         program = CommandBuffer(self.device)
         alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
@@ -271,7 +271,7 @@ class Hierarchy:
             for stage in fine.coarsened(coarse):
                 stage.launch(program.launch)
         if self._small is not None and alone < len(self.levels):
-            self._small.coarsening.launch(program.launch)
+            self._small.coarsen_kernel.launch(program.launch)
         if len(self.levels) > 1:
             flags = self.finest.changed
             passes.CLEAR.bind(Rows.flat(flags.size, self.device), x=flags).launch(program.launch)
@@ -286,15 +286,15 @@ class Hierarchy:
         assert self._gathered is not None
         ours, finest = self.levels[-1].stencil, self._gathered.finest
         assert ours.ghosts is not None
-        gathering = ours.ghosts.gathering
+        gathering = ours.ghosts.field_gather
         theirs = finest.stencil
         for mine, whole in zip(
             (ours.d, *(ours.weights or ())), (theirs.d, *(theirs.weights or ())), strict=True
         ):
-            gathering.collecting(mine, whole).launch(program.launch)
+            gathering.collect_task(mine, whole).launch(program.launch)
         with recording(program):
             copy(finest.changed, wp.full_like(finest.changed, 1))
-        program.extend(self._gathered.rebuilding)
+        program.extend(self._gathered.rebuild_program)
 
     @cached_property
     def cycle(self) -> CommandBuffer:
@@ -321,7 +321,7 @@ class Hierarchy:
         The sweep never increases the energy.
         """
         program, L = CommandBuffer(self.device), self.finest
-        L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(
+        L.sweep_kernel(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(
             program.launch
         )
         return program

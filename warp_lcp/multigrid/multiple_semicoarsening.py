@@ -96,7 +96,7 @@ class MultipleSemicoarsening(Hierarchy):
         wp.copy(self._marks, self.finest.changed)
         for part in (self, *self.companions):
             wp.copy(self.finest.changed, self._marks)
-            part.rebuilding.run()
+            part.rebuild_program.run()
 
     def _last_leg(self) -> tuple[CycleStage, ...]:
         """Return the stages of the last leg of a linear cycle."""

@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_lcp.kernels import BoundKernel, Rows, StencilKernel
 from warp_lcp.kernels.fields import nothing, zeros
-from warp_lcp.kernels.launch_graph import Task
-from warp_lcp.kernels.memory import KernelArgument
+from warp_lcp.kernels.launch_graph import HostTask
+from warp_lcp.kernels.recorded_arguments import KernelArgument
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid import halo_levels
@@ -80,7 +80,7 @@ class StencilLevel:
         # Spans that the fields' contents have.
         self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)
 
-    def renewing(self, *, keeps_weights: bool) -> BoundKernel:
+    def clear_kernel(self, *, keeps_weights: bool) -> BoundKernel:
         """Return the kernel that clears fields outside the rows' new spans.
 
         It also marks rows whose span has changed.
@@ -108,7 +108,7 @@ class StencilLevel:
             changed=self.changed,
         )
 
-    def signing(self, signs: DeviceArray) -> BoundKernel:
+    def mark_changes_kernel(self, signs: DeviceArray) -> BoundKernel:
         """Return the kernel that marks rows whose weights hash to other 64 bits."""
         s = self.stencil
         assert s.weights is not None
@@ -123,7 +123,7 @@ class StencilLevel:
             changed=self.changed,
         )
 
-    def coarsening(self, coarse: StencilLevel, stiffen: float, held: float) -> BoundKernel:
+    def coarsen_kernel(self, coarse: StencilLevel, stiffen: float, held: float) -> BoundKernel:
         """Return the kernel that updates rows of the coarser level.
 
         They are those that depend on changed rows of this level.
@@ -147,7 +147,7 @@ class StencilLevel:
             self._coarser_rows(coarse), shared, stencil=s, coarse_wx=wx, coarse_wy=wy, coarse_wz=wz
         )
 
-    def restricting(self, coarse: StencilLevel, rows: Rows | None = None) -> BoundKernel:
+    def restrict_kernel(self, coarse: StencilLevel, rows: Rows | None = None) -> BoundKernel:
         """Return the kernel that sums the residual over aggregates, by default all."""
         there = rows or self._coarser_rows(coarse)
 
@@ -158,7 +158,7 @@ class StencilLevel:
 
         return self._once(("restrict", coarse, id(rows)), make)
 
-    def correcting(
+    def correct_kernel(
         self,
         coarse: StencilLevel,
         scale: float,
@@ -186,7 +186,7 @@ class StencilLevel:
         # The kernel keeps the rows alive, so that their id stays unique.
         return self._once((coarse, projected, id(rows)), make)
 
-    def filling(self, name: str) -> list[BoundKernel | Task]:
+    def fill_task(self, name: str) -> list[BoundKernel | HostTask]:
         """Return the exchange that fills the ghost cells of x or t."""
         return self._once(name, lambda: self.stencil.fillings({"x": self.x, "t": self.t}[name]))
 
@@ -213,15 +213,17 @@ class StencilLevel:
 
     def pair(
         self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False
-    ) -> Iterator[BoundKernel | Task]:
+    ) -> Iterator[BoundKernel | HostTask]:
         """Yield two sweeps, x to t and back; x is taken as 0 if from_zero."""
         if from_zero and self.joins_sweeps:
             yield self._two_sweeps(weights, projected=projected)
             return
-        yield from () if from_zero else self.filling("x")
-        yield self.sweeping(self.t, self.x, weights[0], projected=projected, from_zero=from_zero)
-        yield from self.filling("t")
-        yield self.sweeping(self.x, self.t, weights[1], projected=projected)
+        yield from () if from_zero else self.fill_task("x")
+        yield self.sweep_kernel(
+            self.t, self.x, weights[0], projected=projected, from_zero=from_zero
+        )
+        yield from self.fill_task("t")
+        yield self.sweep_kernel(self.x, self.t, weights[1], projected=projected)
 
     def ring_pair(
         self,
@@ -236,7 +238,7 @@ class StencilLevel:
         Values between the sweeps lie in a ring of planes, by default of t.
         """
         between = self.t if ring is None else ring
-        into = self.sweeping(
+        into = self.sweep_kernel(
             between,
             self.x,
             weights[0],
@@ -244,7 +246,7 @@ class StencilLevel:
             from_zero=from_zero,
             kind=passes.SWEEP_INTO_RING,
         )
-        return into, self.sweeping(
+        return into, self.sweep_kernel(
             self.x, between, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING
         )
 
@@ -288,13 +290,13 @@ class StencilLevel:
         weights, across = self.settings.weights, self.stencil.ghosts is not None
         if not self.fuses or (across and not from_zero):
             yield from self.pair(weights, projected=projected, from_zero=from_zero)
-            yield from self.filling("x")
-            yield self.restricting(coarse)
+            yield from self.fill_task("x")
+            yield self.restrict_kernel(coarse)
         elif across:
             yield from halo_levels.descent(self, coarse, projected=projected)
         else:
             sweeps = self.ring_pair(weights, projected=projected, from_zero=from_zero)
-            yield Leg(passes.DESCEND, (*sweeps, self.restricting(coarse)))
+            yield Leg(passes.DESCEND, (*sweeps, self.restrict_kernel(coarse)))
 
     def coarsen_bounds(self, coarse: StencilLevel) -> tuple[BoundKernel]:
         """Return step 3 of a cycle, for the bounds of aggregates.
@@ -329,9 +331,9 @@ class StencilLevel:
             return
         if self.joins_sweeps:
             yield self._correct_and_sweep(coarse, weights[0], projected=projected)
-            yield self.sweeping(self.x, self.t, weights[1], projected=projected)
+            yield self.sweep_kernel(self.x, self.t, weights[1], projected=projected)
             return
-        correcting = self.correcting(coarse, self.settings.over_correction, projected=projected)
+        correcting = self.correct_kernel(coarse, self.settings.over_correction, projected=projected)
         if self.fuses:
             yield Leg(passes.ASCEND, (correcting, *self.ring_pair(weights, projected=projected)))
         else:
@@ -374,9 +376,9 @@ class StencilLevel:
         )
         return self._once(("correct and sweep", coarse, omega, projected), make)
 
-    def coarsened(self, coarse: StencilLevel) -> Iterator[BoundKernel | Task]:
+    def coarsened(self, coarse: StencilLevel) -> Iterator[BoundKernel | HostTask]:
         """Yield the stages that compute the next level."""
-        yield self.coarsening(
+        yield self.coarsen_kernel(
             coarse, self.settings.over_correction, self.settings.dirichlet_scaling
         )
         for w in coarse.stencil.weights or ():
@@ -399,7 +401,7 @@ class StencilLevel:
         fx, fy, fz = coarse.factors
         return self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
 
-    def sweeping(
+    def sweep_kernel(
         self,
         y: DeviceArray,
         x: DeviceArray,

@@ -7,7 +7,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.sum import SumOperator
-from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.operator_protocol import Operator
 
 __all__ = [
     "AIR",

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_lcp.kernels.fields import real_array
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.problem.operator_protocol import AIR, FLUID, SOLID
 
 TOGETHER = 1 << 20  # cells of a list that are processed together
 

@@ -20,7 +20,7 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import Launch, clear, together
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.protocol import FLUID
+from warp_lcp.problem.operator_protocol import FLUID
 
 options: dict[str, str] = {"module": "warp_lcp.components"}
 F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)

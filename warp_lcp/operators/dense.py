@@ -21,8 +21,8 @@ from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.problem.data_types import Matrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
-from warp_lcp.problem.protocol import Derivatives
+from warp_lcp.problem.operator_protocol import Derivatives
+from warp_lcp.problem.pickling import HostPickling, Reduced, rebuilt_from
 from warp_lcp.problem.residual_scaling import scale_of_matrix
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
@@ -46,7 +46,7 @@ def is_rounding(difference: np.ndarray, one: np.ndarray, other: np.ndarray) -> b
     return bool((np.abs(difference) <= SYMMETRIC * np.minimum(one, other)).all())
 
 
-class DenseOperator(Pickled):
+class DenseOperator(HostPickling):
     """Dense square matrix as an operator.
 
     Args:

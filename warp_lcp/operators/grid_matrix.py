@@ -9,7 +9,7 @@ import scipy.sparse
 
 from warp_lcp.kernels.layout import Pattern
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.operator_protocol import HasStencil
 
 
 def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:

@@ -32,10 +32,10 @@ from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Communicator
 from warp_lcp.operators.cell_lists import cells_of
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents
-from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
+from warp_lcp.operators.padded_stencil import SPAN_CELLS, GhostExchange, PaddedStencil
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import Pickled
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.problem.operator_protocol import AIR, FLUID, SOLID
+from warp_lcp.problem.pickling import HostPickling
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COPY_CELLS = KERNELS["grid_poisson.copy_cells"]
@@ -44,7 +44,7 @@ FIND_SPANS = KERNELS.kernel(
 )
 
 
-class GridOperator(Pickled):
+class GridOperator(HostPickling):
     """Matrix-free operator on the FLUID cells of a grid; subclasses define its rows.
 
     They store the coefficients for `_fill_stencil` in `_take_coefficients`, return the memory of
@@ -73,7 +73,7 @@ class GridOperator(Pickled):
     _finder: ComponentFinder | None = None
     _found: tuple[int, FloatingComponents | None] | None = None
     stencil: PaddedStencil
-    _ghosts: Ghosts | None = None  # of a box of cells among others
+    _ghosts: GhostExchange | None = None  # of a box of cells among others
     _comm: Communicator | None = None
     _rounding = 0.0  # largest relative rounding of coefficients that were given as arrays
     outside = SOLID  # cell type beyond the array

@@ -17,7 +17,7 @@ import warp as wp
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Array, overwrite, real_array
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.operators.components import (
     ComponentFinder,
     FaceCoefficients,
@@ -27,8 +27,8 @@ from warp_lcp.operators.components import (
 from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import CellDecomposition, PaddedStencil
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import OnHost, Reduced, rebuilt_from
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID, Derivatives
+from warp_lcp.problem.operator_protocol import AIR, FLUID, SOLID, Derivatives
+from warp_lcp.problem.pickling import HostArrayPickle, Reduced, rebuilt_from
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COUNT_FACES = KERNELS["grid_poisson.count_faces"]
@@ -159,7 +159,7 @@ class GridPoisson(GridOperator):
         cells = self.cells_around.flatten()
         derivatives: Derivatives = {}
         if len(arrays) < len(self._given):
-            totals = Sums(Rows.of(self.layout.padding, self.device), 4)
+            totals = RowReduction(Rows.of(self.layout.padding, self.device), 4)
             values = totals.of(
                 FACE_GRADIENT,
                 cells=cells,
@@ -306,7 +306,7 @@ class GridPoisson(GridOperator):
         """Pickle cells and coefficients; arrays are restored in the padded shape."""
         cells, options = self._pickled()
         given = {
-            name: OnHost(v) if isinstance(v, wp.array) else v
+            name: HostArrayPickle(v) if isinstance(v, wp.array) else v
             for name, v in self._arguments().items()
         }
         return rebuilt_from(GridPoisson, cells, device=self.device, **given, **options)

@@ -16,19 +16,19 @@ import warp as wp
 
 from warp_lcp.kernels.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.problem.data_types import HasShape, Matrix, Multiplies, Values
+from warp_lcp.problem.data_types import HasShape, Matrix, SupportsMatmul, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
-from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.operator_protocol import Operator
+from warp_lcp.problem.pickling import HostPickling, Reduced, rebuilt_from
 from warp_lcp.problem.residual_scaling import NoTranspose, estimated_scale
 
 Product: TypeAlias = Callable[[np.ndarray], npt.ArrayLike]
-Factor: TypeAlias = Product | Multiplies  # by which A x is computed
+Factor: TypeAlias = Product | SupportsMatmul  # by which A x is computed
 ASYMMETRY = 1e-5  # relative to ||u|| ||A v||: larger than float32 products leave of u'Av = v'Au
 
 
 @runtime_checkable
-class HasType(Protocol):
+class HasDataType(Protocol):
     """An object whose products have a type; None: not known."""
 
     dtype: npt.DTypeLike
@@ -43,14 +43,14 @@ class HasAdjoint(Protocol):
 
 
 @runtime_checkable
-class Transposes(Protocol):
+class HasTranspose(Protocol):
     """A matrix that has a transpose."""
 
     @property
-    def T(self) -> Multiplies: ...  # noqa: D102, N802
+    def T(self) -> SupportsMatmul: ...  # noqa: D102, N802
 
 
-class LinearOperator(Pickled, Operator):
+class LinearOperator(HostPickling, Operator):
     """Operator given by products alone: a function or a SciPy LinearOperator.
 
     A x comes from the function, or from `A @ x`; rows and entries are not available.
@@ -201,12 +201,12 @@ class LinearOperator(Pickled, Operator):
 def _shape_of(A: Factor, shape: tuple[int, ...] | None) -> tuple[int, ...]:
     """Return the shape of A's fields, checked against A's own shape."""
     matrix_shape = A.shape if isinstance(A, HasShape) else None
-    if isinstance(A, Operator) or not (callable(A) or isinstance(A, Multiplies)):
+    if isinstance(A, Operator) or not (callable(A) or isinstance(A, SupportsMatmul)):
         raise ValueError(
             f"A is a {type(A).__name__}: expected a function, or a "
             "scipy.sparse.linalg.LinearOperator"
         )
-    if not isinstance(A, Multiplies):
+    if not isinstance(A, SupportsMatmul):
         matrix_shape = None
     elif (
         matrix_shape is None
@@ -234,7 +234,7 @@ def _shape_of(A: Factor, shape: tuple[int, ...] | None) -> tuple[int, ...]:
             f"shape = {shape!r}: expected integers >= 1"
             + ("" if matrix_shape is None else f" whose product is {matrix_shape[0]}")
         )
-    if isinstance(A, HasType) and np.dtype(A.dtype or np.float64).kind not in "biuf":
+    if isinstance(A, HasDataType) and np.dtype(A.dtype or np.float64).kind not in "biuf":
         raise ValueError(f"A has type {A.dtype}: expected real numbers")
     return field_shape
 
@@ -248,9 +248,9 @@ def _products_of(
     """
     if not (transpose is None or callable(transpose)):
         raise ValueError(f"transpose is a {type(transpose).__name__}: expected a function")
-    if not isinstance(A, Multiplies):
+    if not isinstance(A, SupportsMatmul):
         return A, transpose
-    factor: Multiplies = A
+    factor: SupportsMatmul = A
 
     def product(x: np.ndarray) -> np.ndarray:
         return np.asarray(factor @ x.ravel()).reshape(shape)
@@ -258,7 +258,7 @@ def _products_of(
     if transpose is not None:
         return product, transpose
     if not isinstance(A, HasAdjoint):
-        return product, _by_transpose(A, shape) if isinstance(A, Transposes) else None
+        return product, _by_transpose(A, shape) if isinstance(A, HasTranspose) else None
     matvec = A.rmatvec
 
     def adjoint(x: np.ndarray) -> np.ndarray:
@@ -271,7 +271,7 @@ def _products_of(
     return product, adjoint
 
 
-def _by_transpose(A: Transposes, shape: tuple[int, ...]) -> Product:
+def _by_transpose(A: HasTranspose, shape: tuple[int, ...]) -> Product:
     return lambda x: np.asarray(A.T @ x.ravel()).reshape(shape)
 
 

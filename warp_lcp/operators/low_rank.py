@@ -22,8 +22,8 @@ from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.kernels.vectors import Communicator, Reduction, sum_over_ranks
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
-from warp_lcp.problem.protocol import Operator, layout_of
+from warp_lcp.problem.operator_protocol import Operator, layout_of
+from warp_lcp.problem.pickling import HostPickling, Reduced, rebuilt_from
 
 
 @no_type_check
@@ -248,7 +248,7 @@ class BlockColumns:
         return ColumnEntries(self.rows, self.blocks, self.values, self.count, self.width)
 
 
-class LowRankOperator(Pickled):
+class LowRankOperator(HostPickling):
     """Low-rank operator U W U' with few columns U and a small matrix W.
 
     Usually a term of a SumOperator, A + U W U'.

@@ -18,7 +18,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import version_of
+from warp_lcp.problem.operator_protocol import version_of
 from warp_lcp.problem.result import SolveResult
 
 MOST_DENSE = 600  # up to so many unknowns LAPACK factors a dense matrix in 10 ms

@@ -17,11 +17,11 @@ from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import Padding, zeros
 from warp_lcp.kernels.layout import Pattern
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import StoredStencil
-from warp_lcp.problem.protocol import FLUID
+from warp_lcp.problem.operator_protocol import FLUID
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 RECOGNIZE = KERNELS["matrix_stencil.recognize"]
@@ -105,7 +105,7 @@ def _as_stencil(
     stored_offsets = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
     where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
     sums, matrix, on_device = (
-        Sums(where, 4),
+        RowReduction(where, 4),
         RowEntries(rows.indptr, rows.indices, rows.values),
         wp.array(middle, device=device),
     )

@@ -25,7 +25,7 @@ import warp as wp
 from warp_lcp.kernels import BoundKernel, KernelFile, Rows
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.fields import Padding
-from warp_lcp.kernels.launch_graph import Launch, Task, launch_now
+from warp_lcp.kernels.launch_graph import HostTask, Launch, launch_now
 from warp_lcp.kernels.layout import Pattern, check_memory, put, stencil_struct
 from warp_lcp.kernels.types import DataType, DeviceArray, StructInstance
 from warp_lcp.kernels.vectors import Communicator
@@ -77,17 +77,17 @@ def coarsen_spans_kernel(
     spans[k, j] = whole_span(first, last, n)
 
 
-class GathersFields(Protocol):
+class FieldGather(Protocol):
     """Collects a field of all processes' boxes, with ghost cells, on every process."""
 
-    def collecting(self, mine: DeviceArray, whole: DeviceArray) -> Task:
+    def collect_task(self, mine: DeviceArray, whole: DeviceArray) -> HostTask:
         """Return the task that writes all processes' cells to the whole grid's field."""
 
     def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = ...) -> None:
         """Write this process's part of the whole grid's field to its own."""
 
 
-class Ghosts(Protocol):
+class GhostExchange(Protocol):
     """Fills the ghost cells that represent cells of another process.
 
     Attributes:
@@ -102,15 +102,15 @@ class Ghosts(Protocol):
     @property
     def cuts(self) -> list[tuple[int, int]]: ...  # noqa: D102
     @property
-    def gathering(self) -> GathersFields: ...  # noqa: D102
+    def field_gather(self) -> FieldGather: ...  # noqa: D102
 
     def fill(self, field: DeviceArray) -> None:
         """Fill the ghost cells of a stored field."""
 
-    def filling(self, field: DeviceArray) -> Task:
+    def fill_task(self, field: DeviceArray) -> HostTask:
         """Return the task that fills ghost cells, now or in a program."""
 
-    def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
+    def coarser(self, factors: tuple[int, int, int]) -> GhostExchange | None:
         """Return the ghost cells of aggregates, None if aggregates would be cut.
 
         `factors` are cells of an aggregate along x, y, z.
@@ -141,7 +141,7 @@ class CellDecomposition(Protocol):
     """
 
     @property
-    def ghosts(self) -> Ghosts | None: ...  # noqa: D102
+    def ghosts(self) -> GhostExchange | None: ...  # noqa: D102
     @property
     def comm(self) -> Communicator | None: ...  # noqa: D102
 
@@ -188,7 +188,7 @@ class PaddedStencil:
     periodic: tuple[bool, bool, bool] = (False, False, False)
     spans: DeviceArray | None = None
     strength: tuple[float, float, float] | None = None
-    ghosts: Ghosts | None = None
+    ghosts: GhostExchange | None = None
     pattern: Pattern | None = None
 
     def __post_init__(self) -> None:
@@ -254,14 +254,14 @@ class PaddedStencil:
         for filling in self.fillings(x):
             filling.launch(launch)
 
-    def fillings(self, x: DeviceArray) -> list[BoundKernel | Task]:
+    def fillings(self, x: DeviceArray) -> list[BoundKernel | HostTask]:
         """Return the launches of `wrap`."""
         strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
         axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
-        made: list[BoundKernel | Task] = [
+        made: list[BoundKernel | HostTask] = [
             WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes
         ]
-        return made if self.ghosts is None else [*made, self.ghosts.filling(x)]
+        return made if self.ghosts is None else [*made, self.ghosts.fill_task(x)]
 
     @cached_property
     def _edges(self) -> list[Rows]:

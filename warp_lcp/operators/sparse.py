@@ -26,14 +26,14 @@ from warp_lcp.kernels.fields import (
 )
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.reordering import Renumbering, renumbering
 from warp_lcp.problem.data_types import Matrix, SparseMatrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced, rebuilt_from
-from warp_lcp.problem.protocol import Derivatives
+from warp_lcp.problem.operator_protocol import Derivatives
+from warp_lcp.problem.pickling import HostPickling, Reduced, rebuilt_from
 from warp_lcp.problem.residual_scaling import scale_of_matrix
 
 INDICES = wp.array(dtype=wp.int32)
@@ -96,7 +96,7 @@ class MatrixSweep:
     forward: bool
 
 
-class SparseOperator(Pickled):
+class SparseOperator(HostPickling):
     """Sparse square matrix as an operator.
 
     Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does;
@@ -558,7 +558,7 @@ def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]
     parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, wp.float64)
     ptr, col, a = (wp.array(v, dtype=t, device="cpu", copy=False) for v, t in parts)
     largest, diagonal = (zeros(host.shape[0], wp.float64, wp.get_device("cpu")) for _ in range(2))
-    found = Sums(Rows.flat(largest.size, largest.device), 2).of(
+    found = RowReduction(Rows.flat(largest.size, largest.device), 2).of(
         SURVEY, ptr=ptr, col=col, a=a, largest=largest, diagonal=diagonal
     )
     return largest.numpy(), diagonal.numpy(), not found.any()

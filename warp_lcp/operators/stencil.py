@@ -20,14 +20,14 @@ from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import check_kept, check_storable, real_array
 from warp_lcp.kernels.layout import Pattern
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.pickling import OnHost, Reduced, rebuilt_from
-from warp_lcp.problem.protocol import AIR, FLUID, SOLID, Derivatives, Scratch
+from warp_lcp.problem.operator_protocol import AIR, FLUID, SOLID, Derivatives, Scratch
+from warp_lcp.problem.pickling import HostArrayPickle, Reduced, rebuilt_from
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 DIAGONAL = KERNELS["stencil.diagonal"]
@@ -234,7 +234,7 @@ class Stencil(GridOperator):
             step, row, plane = (
                 0 if axis in self._around_itself else step for axis, step in enumerate(offset)
             )
-            total = Sums(rows, 1).of(
+            total = RowReduction(rows, 1).of(
                 GRADIENT,
                 cells=cells,
                 multiplier=multiplier,
@@ -558,7 +558,7 @@ class Stencil(GridOperator):
             else f
             for o, f in self.given.items()
         }
-        shift = OnHost(self.shift) if self.shift.size else None
+        shift = HostArrayPickle(self.shift) if self.shift.size else None
         return rebuilt_from(
             Stencil,
             cells,

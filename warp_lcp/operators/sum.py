@@ -11,26 +11,26 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.data_types import Matrix, Values
 from warp_lcp.problem.lcp import as_operator
-from warp_lcp.problem.pickling import Pickled, Reduced
-from warp_lcp.problem.protocol import (
-    AppliesPlus,
+from warp_lcp.problem.operator_protocol import (
+    HasApplyPlus,
     HasCells,
-    HasColumns,
+    HasFloatingComponents,
+    HasLowRankTerm,
+    HasPrincipalSystem,
     HasStencil,
-    Masks,
-    NamesComponents,
+    HasStorageRounding,
     Operator,
     Scratch,
-    StoresRounded,
     has,
     layout_of,
     version_of,
 )
+from warp_lcp.problem.pickling import HostPickling, Reduced
 
 FELT = 1e-5  # relative to a column's sizes over a component: open fractions are float32
 
 
-class SumOperator(Pickled):
+class SumOperator(HostPickling):
     """Sum of two operators: (A + B) x = A x + B x.
 
     It has no sweep: use methods that need only products (Newton types, gradient methods). With a
@@ -125,7 +125,7 @@ class SumOperator(Pickled):
     def apply_plus(self, x: DeviceArray, b: DeviceArray, out: DeviceArray) -> None:
         """Evaluate out = A x + B x + b; flat stored fields of one type."""
         plain, low = self._plain, self._low
-        if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
+        if isinstance(low, LowRankOperator) and has(plain, HasApplyPlus):
             plain.apply_plus(x, b, out)
             low.add(x, out, out)
             return
@@ -142,7 +142,7 @@ class SumOperator(Pickled):
         them: a body that closes off a chamber as a piston does is moved by the pressure in it.
         """
         plain, low = self._plain, self._low
-        if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
+        if not (isinstance(low, LowRankOperator) and has(plain, HasFloatingComponents)):
             return None
         floating = plain.floating_components(scratch)
         return (
@@ -161,7 +161,7 @@ class SumOperator(Pickled):
     def storage_rounding(self) -> float:
         """Return the larger relative rounding of the terms."""
         return max(
-            (A.storage_rounding() for A in (self.first, self.second) if has(A, StoresRounded)),
+            (A.storage_rounding() for A in (self.first, self.second) if has(A, HasStorageRounding)),
             default=0.0,
         )
 
@@ -171,7 +171,9 @@ class SumOperator(Pickled):
         `free` has non-zero entries on the rows that stay; all terms need `masked`.
         """
         first, second = self.first, self.second
-        assert has(first, Masks) and has(second, Masks), "all terms need `masked`"
+        assert has(first, HasPrincipalSystem) and has(second, HasPrincipalSystem), (
+            "all terms need `masked`"
+        )
         if isinstance(first, LowRankOperator):  # it cannot take a shift
             return SumOperator(first.masked(free), second.masked(free, shift))
         return SumOperator(first.masked(free, shift), second.masked(free))
@@ -207,7 +209,7 @@ def grid_and_low_rank(A: Matrix) -> tuple[HasStencil, LowRankOperator] | None:
 
     None if A is another operator.
     """
-    return (A.grid, A.low) if has(A, HasColumns) and A.symmetric else None
+    return (A.grid, A.low) if has(A, HasLowRankTerm) and A.symmetric else None
 
 
 def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool) -> np.ndarray:

@@ -19,10 +19,10 @@ from warp_lcp.kernels.fields import LARGE, Array, Layout, nothing, overwrite, re
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.problem.affine_bounds import AffineBounds, affine_fields
 from warp_lcp.problem.data_types import BoundValues
-from warp_lcp.problem.pickling import OnHost
+from warp_lcp.problem.pickling import HostArrayPickle
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 # A bound of this magnitude is infinite in files and for users of SciPy and qpsolvers, as in OSQP
@@ -38,7 +38,7 @@ CODE_ROWS = KERNELS["bounds.code_rows"]
 DECODE = KERNELS["bounds.decode"]
 
 
-GivenSide: TypeAlias = "float | np.ndarray | OnHost | AffineBounds"  # of a pickle
+GivenSide: TypeAlias = "float | np.ndarray | HostArrayPickle | AffineBounds"  # of a pickle
 
 
 class Bounds:
@@ -164,7 +164,7 @@ class Bounds:
             sides.append(
                 self.values[side]
                 if field is None
-                else OnHost(field)
+                else HostArrayPickle(field)
                 if held
                 else field.numpy().copy()
             )
@@ -188,7 +188,7 @@ class Bounds:
             return
         if self._memory is None:
             self._memory = self.layout.zeros(wp.uint8)
-            self._others = Sums(Rows.of_fields(self.layout))
+            self._others = RowReduction(Rows.of_fields(self.layout))
         least, most = (
             0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True)
         )

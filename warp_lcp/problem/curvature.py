@@ -9,7 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasColumns, HasHostDiagonal, HasRows, HasStencil, has
+from warp_lcp.problem.operator_protocol import (
+    HasHostDiagonal,
+    HasLowRankTerm,
+    HasRows,
+    HasStencil,
+    has,
+)
 
 NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is not rounding of products
 
@@ -27,7 +33,7 @@ def has_negative_curvature(problem: LCP) -> bool:
     positive definite or a diagonally dominant A.
     """
     A = problem.A
-    if has(A, HasStencil) or has(A, HasColumns):  # these have positive diagonals
+    if has(A, HasStencil) or has(A, HasLowRankTerm):  # these have positive diagonals
         return False
     by_rows = has(A, HasRows)
     if by_rows:

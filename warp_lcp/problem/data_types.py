@@ -12,7 +12,7 @@ from warp_lcp.kernels.types import DataFrame, DeviceArray, Values
 
 if TYPE_CHECKING:
     from warp_lcp.problem.affine_bounds import AffineBounds
-    from warp_lcp.problem.protocol import Operator
+    from warp_lcp.problem.operator_protocol import Operator
 
 SparseMatrix: TypeAlias = scipy.sparse.csr_array | scipy.sparse.csr_matrix
 Matrix: TypeAlias = SparseMatrix | np.ndarray  # on the host
@@ -27,7 +27,7 @@ Indices: TypeAlias = "Values"
 
 
 @runtime_checkable
-class ConvertsToArray(Protocol):
+class SupportsArray(Protocol):
     """An object that NumPy converts to an array."""
 
     def __array__(self) -> np.ndarray:
@@ -35,7 +35,7 @@ class ConvertsToArray(Protocol):
 
 
 @runtime_checkable
-class Multiplies(Protocol):
+class SupportsMatmul(Protocol):
     """An object with products M @ v: a matrix, or an operator of SciPy or PyAMG."""
 
     def __matmul__(self, other: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ class Multiplies(Protocol):
 class HasPreconditioner(Protocol):
     """A hierarchy of PyAMG, which makes a preconditioner."""
 
-    def aspreconditioner(self) -> Multiplies:
+    def aspreconditioner(self) -> SupportsMatmul:
         """Return the cycle as an operator."""
 
 
@@ -70,15 +70,15 @@ def dense(A: Matrix) -> np.ndarray:
 __all__ = [
     "Array",
     "BoundValues",
-    "ConvertsToArray",
     "HasPreconditioner",
     "HasShape",
     "Indices",
     "Matrix",
     "MatrixData",
-    "Multiplies",
     "OperatorLike",
     "SparseMatrix",
+    "SupportsArray",
+    "SupportsMatmul",
     "Values",
     "dense",
     "is_sparse",

@@ -9,7 +9,7 @@ import warp as wp
 from scipy.sparse import bsr_array, csr_array
 
 from warp_lcp.problem.data_types import Values
-from warp_lcp.problem.solve import VariationalInequality
+from warp_lcp.problem.solve_loop import VariationalInequality
 
 
 class FrictionalContact(VariationalInequality):

@@ -18,26 +18,26 @@ from warp_lcp.kernels.fields import LARGE, Layout, overwrite, real_array
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DataFrame, DataType, DeviceArray
-from warp_lcp.kernels.vectors import ADD, Sums, rows_of
+from warp_lcp.kernels.vectors import ADD, RowReduction, rows_of
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.data_types import (
     BoundValues,
-    ConvertsToArray,
-    Multiplies,
     OperatorLike,
+    SupportsArray,
+    SupportsMatmul,
     Values,
 )
-from warp_lcp.problem.pickling import OnHost, Pickled, Reduced
-from warp_lcp.problem.preconditioner import Preconditioner
-from warp_lcp.problem.protocol import (
-    AppliesPlus,
+from warp_lcp.problem.operator_protocol import (
+    HasApplyPlus,
     HasCells,
+    HasReplica,
     Operator,
-    Replicates,
     has,
     layout_of,
     missing,
 )
+from warp_lcp.problem.pickling import HostArrayPickle, HostPickling, Reduced
+from warp_lcp.problem.preconditioner import Preconditioner
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 CHECK = KERNELS["problem.check"]
@@ -66,7 +66,7 @@ def as_operator(
     """
     if has(A, Operator):
         return A
-    if isinstance(A, (ConvertsToArray, DataFrame)):
+    if isinstance(A, (SupportsArray, DataFrame)):
         return as_operator(real_array(A, "A"), device, dtype)
     if "apply" not in (lacks := missing(A, Operator)):
         without = f"A is a {type(A).__name__} without {', '.join(lacks)}"
@@ -74,7 +74,7 @@ def as_operator(
             f"{without}: an operator needs them; a subclass of wl.Operator must define only shape, "
             "device and apply"
         )
-    if isinstance(A, Multiplies) or callable(A):
+    if isinstance(A, SupportsMatmul) or callable(A):
         raise ValueError(
             f"A is a {type(A).__name__}: pass wl.LinearOperator(A, ...), which needs only products"
         )
@@ -83,7 +83,7 @@ def as_operator(
     )
 
 
-class LCP(Pickled):
+class LCP(HostPickling):
     """A linear complementarity problem ([Book] 1.2).
 
     y = A x + b, l <= x <= u, and for every i: y_i > 0 => x_i = l_i; y_i < 0 => x_i = u_i; y_i = 0
@@ -130,7 +130,7 @@ class LCP(Pickled):
         lower: BoundValues = 0.0,
         upper: BoundValues = np.inf,
         *,
-        preconditioner: Multiplies | None = None,
+        preconditioner: SupportsMatmul | None = None,
     ) -> None:
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
@@ -155,7 +155,7 @@ class LCP(Pickled):
         Fields that are used in place are restored as device arrays.
         """
         b = (
-            OnHost(self.b.reshape(self.layout.stored_shape))
+            HostArrayPickle(self.b.reshape(self.layout.stored_shape))
             if self.in_place
             else self.b.numpy().copy()
         )
@@ -189,7 +189,7 @@ class LCP(Pickled):
         None if the problem has no copies: only problems of a `GridPoisson` on the CPU have, whose
         fields are not used in place.
         """
-        form = self.A.form if has(self.A, Replicates) else None
+        form = self.A.form if has(self.A, HasReplica) else None
         if (
             form is None
             or self.bounds.form is None
@@ -205,14 +205,14 @@ class LCP(Pickled):
         twin = copy.copy(self)
         for cached in ("lower", "upper", "_counts"):
             twin.__dict__.pop(cached, None)
-        assert has(self.A, Replicates), "its form exists"
+        assert has(self.A, HasReplica), "its form exists"
         twin.A, twin.b, twin.bounds = self.A.replica(), wp.clone(self.b), self.bounds.replica()
         twin.unknown = _unknown(twin.A, twin.layout)
         return twin
 
     def take(self, other: LCP) -> None:
         """Copy the data of a problem of the same form."""
-        assert has(self.A, Replicates), "its form exists"
+        assert has(self.A, HasReplica), "its form exists"
         self.A.take(other.A)
         self.bounds.take(other.bounds)
         overwrite(self.b, other.b)
@@ -224,7 +224,7 @@ class LCP(Pickled):
 
         One kernel does it where the operator has a fused product.
         """
-        if has(self.A, AppliesPlus):
+        if has(self.A, HasApplyPlus):
             self.A.apply_plus(x, b, out)
             return
         self.A.apply(x.reshape(self.layout.stored_shape), out.reshape(self.layout.stored_shape))
@@ -270,8 +270,8 @@ class LCP(Pickled):
         )
 
     @cached_property
-    def _counts(self) -> Sums:
-        return Sums(Rows.of_fields(self.layout), len(CHECK.sums))
+    def _counts(self) -> RowReduction:
+        return RowReduction(Rows.of_fields(self.layout), len(CHECK.sums))
 
     def _totals(self, found: np.ndarray) -> list[int]:
         return [
@@ -298,7 +298,7 @@ def _made(
     b: Values,
     lower: BoundValues,
     upper: BoundValues,
-    preconditioner: Multiplies | None,
+    preconditioner: SupportsMatmul | None,
 ) -> LCP:
     return LCP(A, b, lower, upper, preconditioner=preconditioner)
 

@@ -21,7 +21,7 @@ TYPES = {
 }
 
 
-class OnHost:
+class HostArrayPickle:
     """Wrapper of a device array in the arguments of `__reduce__`.
 
     It is restored as a wp.array.
@@ -39,7 +39,7 @@ class OnHost:
         )
 
 
-class Pickled:
+class HostPickling:
     """Base of classes with a `__reduce__` of host arrays.
 
     For pickles and `copy.deepcopy`; `copy.copy` shares all attributes.
@@ -52,7 +52,7 @@ class Pickled:
         return twin
 
 
-class FieldsOnHost(Pickled):
+class DataclassPickling(HostPickling):
     """A dataclass that pickles its fields, device arrays as host arrays."""
 
     def __reduce__(self) -> Reduced:
@@ -65,7 +65,9 @@ class FieldsOnHost(Pickled):
             vars(self)[field.name] if field.metadata.get("pickled", True) else None
             for field in fields
         ]
-        return type(self), tuple(OnHost(v) if isinstance(v, wp.array) else v for v in values)
+        return type(self), tuple(
+            HostArrayPickle(v) if isinstance(v, wp.array) else v for v in values
+        )
 
 
 def rebuilt_from(

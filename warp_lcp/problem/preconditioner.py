@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warp_lcp.kernels.fields import Layout
-from warp_lcp.problem.data_types import HasPreconditioner, HasShape, Multiplies
+from warp_lcp.problem.data_types import HasPreconditioner, HasShape, SupportsMatmul
 
 # Relative to ||u|| ||M v||: a larger asymmetry than rounding leaves, with which conjugate gradients
 # fail sooner or later.
@@ -29,9 +29,9 @@ class Preconditioner:
             or fields are stored with ghost cells.
     """
 
-    def __init__(self, M: Multiplies, layout: Layout) -> None:
+    def __init__(self, M: SupportsMatmul, layout: Layout) -> None:
         n, shape = layout.size, M.shape if isinstance(M, HasShape) else None
-        if not isinstance(M, Multiplies):
+        if not isinstance(M, SupportsMatmul):
             hint = ": PyAMG's is ml.aspreconditioner()" if isinstance(M, HasPreconditioner) else ""
             raise ValueError(
                 f"preconditioner is a {type(M).__name__}: expected an object with products M @ "

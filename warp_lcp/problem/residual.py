@@ -19,9 +19,9 @@ from warp_lcp.kernels import KernelFile, PrecomputedProduct, Rows
 from warp_lcp.kernels.launch_graph import Launch, launch_now
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
+from warp_lcp.problem.operator_protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.residual_scaling import estimated_scale
 
 EPS = float(np.finfo(np.float64).eps)
@@ -57,7 +57,7 @@ class NaturalResidual:
         self.unit = float(stencil.unit) if stencil else 1.0
         # Of an operator whose scale is a copy.
         self._diagonal_of = None if stencil else version_of(problem.A)
-        self._sums = Sums(Rows.of_fields(layout), comm=layout.comm)
+        self._sums = RowReduction(Rows.of_fields(layout), comm=layout.comm)
         if not stencil:
             self.rescale()
 

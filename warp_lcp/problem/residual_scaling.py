@@ -29,7 +29,7 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.data_types import Matrix, dense, is_sparse
 
 if TYPE_CHECKING:
-    from warp_lcp.problem.protocol import Operator
+    from warp_lcp.problem.operator_protocol import Operator
 
 # Relative excess of entries over those of the diagonal that storage in float32 causes in
 # semi-definite matrices of low rank.

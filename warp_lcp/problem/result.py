@@ -7,12 +7,12 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.pickling import FieldsOnHost, Reduced
+from warp_lcp.problem.pickling import DataclassPickling, Reduced
 
 if TYPE_CHECKING:
     from warp_lcp.problem.lcp import LCP
     from warp_lcp.problem.merits import Merits
-    from warp_lcp.problem.solve import VariationalInequality
+    from warp_lcp.problem.solve_loop import VariationalInequality
 
 
 class SolveStatus(Enum):
@@ -100,7 +100,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class SolveResult(FieldsOnHost):
+class SolveResult(DataclassPickling):
     """Result of `wl.solve`; true if the recomputed residual meets the criteria.
 
     Attributes:

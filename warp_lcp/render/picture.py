@@ -28,7 +28,7 @@ from warp_lcp.render.recording import (
     Color,
     RecordedFrame,
     Recording,
-    Show,
+    VisiblePart,
 )
 from warp_lcp.render.solid_meshes import (
     FlatSolids,
@@ -90,12 +90,12 @@ class Picture:
         scene = self.scene = recording.scene
         self.recording = recording
         self.flat = scene.dimension == 2
-        share = SMALL if recording.show is Show.BOTH else 0.6 if self.flat else 0.8
+        share = SMALL if recording.show is VisiblePart.BOTH else 0.6 if self.flat else 0.8
         self.spacing = recording.particle_spacing()
         self.radius = share * self.spacing
         self.grainy = (
             scene.palette == "sand"
-            and recording.show is Show.PARTICLES
+            and recording.show is VisiblePart.PARTICLES
             and recording.color in (Color.SPEED, Color.PLAIN)
         )
         self.samples = 1 if plotter else SAMPLES

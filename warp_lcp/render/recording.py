@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
-from warp_lcp.frames.frames import FRAME_FILE
+from warp_lcp.frames.frame_folder import FRAME_FILE
 from warp_lcp.frames.meshio_format import WRITTEN_ONLY
 from warp_lcp.frames.read_frame import READABLE, read_part
-from warp_lcp.frames.vtu import Mesh
+from warp_lcp.frames.vtu import VtuMesh
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.simulation import Cells, InputError, Points, Surface
@@ -48,7 +48,7 @@ class Color(StrEnum):
     PLAIN = "plain"
 
 
-class Show(StrEnum):
+class VisiblePart(StrEnum):
     """Part of the material in images."""
 
     PARTICLES = "particles"
@@ -57,11 +57,18 @@ class Show(StrEnum):
     BODIES = "bodies"  # no material
 
 
-WITH_PARTICLES, WITH_SURFACE = (Show.PARTICLES, Show.BOTH), (Show.SURFACE, Show.BOTH)
+WITH_PARTICLES, WITH_SURFACE = (
+    (VisiblePart.PARTICLES, VisiblePart.BOTH),
+    (VisiblePart.SURFACE, VisiblePart.BOTH),
+)
 
 
 # Parts that frames must have.
-PARTS = {Show.PARTICLES: "particles", Show.SURFACE: "surface", Show.BODIES: "bodies"}
+PARTS = {
+    VisiblePart.PARTICLES: "particles",
+    VisiblePart.SURFACE: "surface",
+    VisiblePart.BODIES: "bodies",
+}
 # Further quantities of sand's particles.
 LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}
 
@@ -87,7 +94,7 @@ class RecordedFrame:
     cells: Cells | None = None
 
 
-ContentT = TypeVar("ContentT", Mesh, Cells)
+ContentT = TypeVar("ContentT", VtuMesh, Cells)
 
 
 @dataclass(frozen=True)
@@ -147,7 +154,7 @@ class Recording:
         self,
         folder: Path,
         color: Color | None = None,
-        show: Show | None = None,
+        show: VisiblePart | None = None,
         overrides: Sequence[str] = (),
         *,
         cells: bool = False,
@@ -184,7 +191,11 @@ class Recording:
             and bool(self._numbers("bodies"))
         )
         self.show = show or (
-            Show.BODIES if bodies_alone else Show.SURFACE if smooth else Show.PARTICLES
+            VisiblePart.BODIES
+            if bodies_alone
+            else VisiblePart.SURFACE
+            if smooth
+            else VisiblePart.PARTICLES
         )
         if self.show not in WITH_PARTICLES and color not in (None, Color.PLAIN):
             raise RenderError(
@@ -251,7 +262,7 @@ class Recording:
         Raises:
             RenderError: the file cannot be read.
         """
-        mesh = _read(self._file("particles", number), Mesh)
+        mesh = _read(self._file("particles", number), VtuMesh)
         finite = np.isfinite(mesh.points).all(axis=1)
         return Points(
             "particles",
@@ -359,7 +370,7 @@ class Recording:
         Raises:
             RenderError: there is none.
         """
-        parts = ("surface", "particles") if self.show is Show.BOTH else (PARTS[self.show],)
+        parts = ("surface", "particles") if self.show is VisiblePart.BOTH else (PARTS[self.show],)
         part_numbers = {part: self._numbers(part) for part in parts}
         for part, numbers in part_numbers.items():
             if not numbers:
@@ -384,7 +395,7 @@ class Recording:
     def _surface(self, name: str, number: int) -> Surface:
         """Return the triangles or segments of a surface with finite points."""
         file = self._file(name, number)
-        mesh = _read(file, Mesh)
+        mesh = _read(file, VtuMesh)
         corners = (
             mesh.corners
             if len(mesh.corners)
@@ -408,7 +419,7 @@ class Recording:
         file = self._file("grid", number)
         if file.suffix in (".vti", ".pvti"):
             cells = _read(file, Cells)
-        elif not len((mesh := _read(file, Mesh)).corners):
+        elif not len((mesh := _read(file, VtuMesh)).corners):
             return None
         else:
             low = np.nan_to_num(
@@ -425,10 +436,10 @@ class Recording:
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame's particles or surface, and bodies."""
         parts = {
-            Show.PARTICLES: ["particles"],
-            Show.SURFACE: ["surface"],
-            Show.BOTH: ["particles", "surface"],
-            Show.BODIES: [],
+            VisiblePart.PARTICLES: ["particles"],
+            VisiblePart.SURFACE: ["surface"],
+            VisiblePart.BOTH: ["particles", "surface"],
+            VisiblePart.BODIES: [],
         }
         files = [self._file(part, number) for part in [*parts[self.show], "bodies"]]
         # Files of ranks.

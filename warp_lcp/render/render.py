@@ -18,7 +18,7 @@ import numpy as np
 from warp_lcp.files.atomic import make_folder, replacing
 from warp_lcp.render.film import Film, film_suffix
 from warp_lcp.render.page import Page, Painter
-from warp_lcp.render.recording import Color, Recording, RenderError, Show, spread
+from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart, spread
 
 INSTALL = "pip install 'pyvista>=0.45'"
 INSTALL_MATPLOTLIB = "pip install 'matplotlib>=3.9'"
@@ -33,7 +33,7 @@ PACKING = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Looks:
+class ImageStyle:
     """Appearance of a run's images.
 
     Args:
@@ -47,7 +47,7 @@ class Looks:
 
     size: tuple[int, int] = (1280, 720)
     color: Color | None = None
-    show: Show | None = None
+    show: VisiblePart | None = None
     cut: bool = False
     at: float | None = None
     overrides: Sequence[str] = ()
@@ -57,7 +57,7 @@ def render_run(
     folder: Path,
     *,
     frames: Sequence[int] = (),
-    looks: Looks | None = None,
+    looks: ImageStyle | None = None,
     out: Path | None = None,
     sheet: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, of: None,
@@ -82,7 +82,7 @@ def render_run(
         RenderError: a package is missing, there are no such frames, or an image cannot be written.
         SceneError: the run's scene cannot be read.
     """
-    looks = looks or Looks()
+    looks = looks or ImageStyle()
     with ExitStack() as stack:
         painter = _painter(looks, stack)
         recording = Recording(folder, looks.color, looks.show, looks.overrides, cells=looks.cut)
@@ -111,7 +111,7 @@ def film_run(
     folder: Path,
     film: Path,
     *,
-    looks: Looks | None = None,
+    looks: ImageStyle | None = None,
     rate: float | None = None,
     on_progress: Callable[[int, int], None] = lambda done, of: None,
     estimated: Callable[[float], None] = lambda seconds: None,
@@ -131,7 +131,7 @@ def film_run(
         RenderError: a package is missing, there are no frames, or the film cannot be written.
         SceneError: the run's scene cannot be read.
     """
-    looks = looks or Looks()
+    looks = looks or ImageStyle()
     film_suffix(film)
     with ExitStack() as stack:
         painter = _painter(looks, stack)
@@ -150,7 +150,7 @@ def film_run(
             yield number
 
 
-def expected_seconds(recording: Recording, numbers: Sequence[int], looks: Looks) -> float:
+def expected_seconds(recording: Recording, numbers: Sequence[int], looks: ImageStyle) -> float:
     """Return the estimated time of drawing frames on one core [s].
 
     It is based on the content of the middle frame.
@@ -170,7 +170,9 @@ def expected_seconds(recording: Recording, numbers: Sequence[int], looks: Looks)
     return len(numbers) * (each + 1e-6 * (pixels * math.prod(looks.size) + held * points))
 
 
-def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, int]], Painter]:
+def _painter(
+    looks: ImageStyle, stack: ExitStack
+) -> Callable[[Recording, tuple[int, int]], Painter]:
     """Return the constructor of the renderer of a page's pictures.
 
     Raises:

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.signed_distance import Geometry, TriangleMesh
 from warp_lcp.render.actors import Drawn, MeshStyle
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import (

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.grid.part import ONE_PROCESS
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.grid_part import ONE_PROCESS
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.rigid.body import STATE, BodyMotion, BodyStates, RigidBody, lengths
 from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
@@ -24,7 +24,7 @@ IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
 
 
 @dataclass(frozen=True)
-class _Begun:
+class _StepStart:
     """Values of `begin_step` that the rest of the step needs.
 
     Args:
@@ -109,7 +109,7 @@ class RigidBodies:
         )
         self.joints = self._solve.joints
         self._surfaces: list[BodySurface] | None = None
-        self._begun: _Begun | None = None
+        self._begun: _StepStart | None = None
         self.contacts, self.contact_residual, self.contact_iterations = 0, 0.0, 0
         self.exits: tuple[Sequence[float], int] = ((), 0)
         self.material = True
@@ -151,7 +151,7 @@ class RigidBodies:
             self._solve.residual,
             self._solve.iterations,
         )
-        self._begun = _Begun(
+        self._begun = _StepStart(
             states,
             free,
             contacts,
@@ -189,7 +189,7 @@ class RigidBodies:
                 self._solve.residual,
                 self._solve.iterations,
             )
-        self._begun = _Begun(
+        self._begun = _StepStart(
             pending.states,
             pending.free,
             pending.contacts,

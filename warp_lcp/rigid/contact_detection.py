@@ -72,7 +72,7 @@ class ContactPoints:
         )
 
 
-class Place(NamedTuple):
+class UncheckedPose(NamedTuple):
     """Pose of a body: p becomes rotation @ p + translation.
 
     A `Pose` without checks.
@@ -87,7 +87,11 @@ class Place(NamedTuple):
 
 
 def on_plane(
-    shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float
+    shape: ContactShape,
+    pose: Pose | UncheckedPose,
+    point: np.ndarray,
+    normal: np.ndarray,
+    margin: float,
 ) -> ContactPoints:
     """Return the contact points of a shape with a plane.
 
@@ -107,9 +111,9 @@ def on_plane(
 
 def between(
     one: ContactShape,
-    at: Pose | Place,
+    at: Pose | UncheckedPose,
     other: ContactShape,
-    other_pose: Pose | Place,
+    other_pose: Pose | UncheckedPose,
     margin: float,
     dimension: int,
 ) -> ContactPoints:
@@ -157,9 +161,9 @@ def between(
 
 def _nearest_of(
     one: ContactShape,
-    at: Pose | Place,
+    at: Pose | UncheckedPose,
     other: ContactShape,
-    other_pose: Pose | Place,
+    other_pose: Pose | UncheckedPose,
     margin: float,
 ) -> np.ndarray:
     """Return the points of one shape's edges that are nearest to the other.
@@ -175,9 +179,9 @@ def _nearest_of(
 
 def _points_of(
     one: ContactShape,
-    at: Pose | Place,
+    at: Pose | UncheckedPose,
     other: ContactShape,
-    other_pose: Pose | Place,
+    other_pose: Pose | UncheckedPose,
     margin: float,
     points: np.ndarray,
 ) -> ContactPoints:
@@ -202,7 +206,7 @@ def _points_of(
     )
 
 
-def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
+def _moved(box: OrientedBox, pose: Pose | UncheckedPose) -> OrientedBox:
     return OrientedBox(pose.apply(box.center[None])[0], pose.rotation @ box.rotation, box.half)
 
 
@@ -284,7 +288,7 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 @dataclass(frozen=True, eq=False)
-class FoundContacts:
+class DetectedContacts:
     """Contact points of bodies, k of them.
 
     Args:
@@ -303,16 +307,16 @@ class FoundContacts:
         """Return the number of points."""
         return len(self.first)
 
-    def where(self, chosen: np.ndarray) -> FoundContacts:
+    def where(self, chosen: np.ndarray) -> DetectedContacts:
         """Return selected contacts, by a mask or indices."""
-        return FoundContacts(
+        return DetectedContacts(
             self.first[chosen],
             self.second[chosen],
             self.obstacle[chosen],
             self.points.where(chosen),
         )
 
-    def without(self, pairs: Collection[tuple[int, int]]) -> FoundContacts:
+    def without(self, pairs: Collection[tuple[int, int]]) -> DetectedContacts:
         """Return the contacts without those of some pairs, smaller number first."""
         if not pairs:
             return self
@@ -327,7 +331,7 @@ class FoundContacts:
         second: Sequence[int] | np.ndarray,
         obstacle: int,
         points: Sequence[ContactPoints],
-    ) -> FoundContacts:
+    ) -> DetectedContacts:
         """Join the contact points of pairs; first, second: shape (pairs,)."""
         counts = [len(each) for each in points]
         one, other = (
@@ -336,7 +340,7 @@ class FoundContacts:
         return cls(one, other, np.full(len(one), obstacle), ContactPoints.joined(points))
 
     @classmethod
-    def joined(cls, several: Sequence[FoundContacts]) -> FoundContacts:
+    def joined(cls, several: Sequence[DetectedContacts]) -> DetectedContacts:
         """Return several objects as one."""
         some = [contacts for contacts in several if len(contacts.first)]
         if len(some) < 2:
@@ -384,7 +388,7 @@ class ContactDetection:
 
     def find(
         self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0
-    ) -> FoundContacts:
+    ) -> DetectedContacts:
         """Return the contacts: obstacle by obstacle, then pairs of bodies, in order.
 
         Args:
@@ -395,7 +399,7 @@ class ContactDetection:
         """
         turns, at = self.bodies.rotation, self.bodies.position
         shifts = at - (turns @ self.bodies.center[:, :, None])[:, :, 0]
-        poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        poses = [UncheckedPose(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
         half = (np.abs(turns) @ self._half[:, :, None])[:, :, 0] + self._radius[:, None]
         contacts = [
@@ -417,15 +421,15 @@ class ContactDetection:
                         min(one.size, other.size),
                     )
                 )
-            touching = FoundContacts.joined(
-                [touching, FoundContacts.of(first, second, NONE, points)]
+            touching = DetectedContacts.joined(
+                [touching, DetectedContacts.of(first, second, NONE, points)]
             )
             touching = touching.where(np.lexsort((touching.second, touching.first)))
-        return FoundContacts.joined([*contacts, touching])
+        return DetectedContacts.joined([*contacts, touching])
 
     def _balls(
         self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray
-    ) -> FoundContacts:
+    ) -> DetectedContacts:
         """Return the contacts of balls i with balls j.
 
         Each is the point between the balls on the line of their centers.
@@ -437,7 +441,7 @@ class ContactDetection:
         i, j, gap = i[near], j[near], gap[near]
         normal = way[near] / length[near, None]
         point = centers[i] - (self._radius[i] + 0.5 * gap)[:, None] * normal
-        return FoundContacts(i, j, np.full(len(i), NONE), ContactPoints(point, normal, gap))
+        return DetectedContacts(i, j, np.full(len(i), NONE), ContactPoints(point, normal, gap))
 
     def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
         return points if self.every else spread(points, size, self.dimension)
@@ -446,11 +450,11 @@ class ContactDetection:
         self,
         number: int,
         obstacle_pose: Pose,
-        poses: list[Place],
+        poses: list[UncheckedPose],
         middle: np.ndarray,
         half: np.ndarray,
         margins: np.ndarray,
-    ) -> FoundContacts:
+    ) -> DetectedContacts:
         """Return the contacts of bodies with an obstacle."""
         shape, n = self.obstacles[number].shape, len(poses)
         if shape is None:
@@ -468,17 +472,17 @@ class ContactDetection:
                 self.shapes[i], poses[i], shape, obstacle_pose, float(margins[i]), self.dimension
             )
             points.append(self._kept(touch, min(self.shapes[i].size, shape.size)))
-        return FoundContacts.of(first, np.full(len(first), n), number, points)
+        return DetectedContacts.of(first, np.full(len(first), n), number, points)
 
     def _with_planes(
         self,
         number: int,
         obstacle_pose: Pose,
-        poses: list[Place],
+        poses: list[UncheckedPose],
         middle: np.ndarray,
         half: np.ndarray,
         margins: np.ndarray,
-    ) -> FoundContacts:
+    ) -> DetectedContacts:
         """Return the contacts of bodies with the planes of an obstacle.
 
         All balls, with one point each, are tested at once.
@@ -497,7 +501,7 @@ class ContactDetection:
         touch = ContactPoints(
             middle[ball] - (self._radius[ball] + 0.5 * gap)[:, None] * normal, normal, gap
         )
-        contacts = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
+        contacts = DetectedContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
         if balls.all():
             return contacts
         i, m = i[~balls], m[~balls]
@@ -508,7 +512,7 @@ class ContactDetection:
             )
             for a, b in zip(i.tolist(), m.tolist(), strict=True)
         ]
-        contacts = FoundContacts.joined(
-            [contacts, FoundContacts.of(i, np.full(len(i), n), number, each)]
+        contacts = DetectedContacts.joined(
+            [contacts, DetectedContacts.of(i, np.full(len(i), n), number, each)]
         )
         return contacts.where(np.argsort(contacts.first, kind="stable"))

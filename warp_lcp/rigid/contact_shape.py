@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Sphere, TriangleMesh
 from warp_lcp.rigid.body import lengths
 from warp_lcp.rigid.box_contacts import OrientedBox
 from warp_lcp.rigid.outline import mesh_outline

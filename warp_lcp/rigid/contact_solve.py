@@ -12,7 +12,13 @@ import numpy as np
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, cross, in_space, lengths, rotation_by
-from warp_lcp.rigid.contact_detection import NONE, ContactDetection, FoundContacts, Place, between
+from warp_lcp.rigid.contact_detection import (
+    NONE,
+    ContactDetection,
+    DetectedContacts,
+    UncheckedPose,
+    between,
+)
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, JointPart
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
@@ -290,7 +296,7 @@ class ContactSolve:
         places = []
         for body, velocity, position in zip(bodies, six, at, strict=True):
             R = rotation_by(t * velocity[3:]) @ body.rotation
-            places.append(Place(R, position - R @ body.properties.center))
+            places.append(UncheckedPose(R, position - R @ body.properties.center))
         margin = abs(float(contacts.gap[k])) + NEAR * float(contacts.size[k])
         found = between(shapes[0], places[0], shapes[1], places[1], margin, self.dimension)
         point, normal = contacts.point[k] + (at - now).mean(axis=0), contacts.frames[k, 0]
@@ -553,12 +559,12 @@ class ContactSolve:
             rows, one=rows.one @ roots[rows.first], other=rows.other @ roots[rows.second]
         )
 
-    def _apart(self, found: FoundContacts) -> FoundContacts:
+    def _apart(self, found: DetectedContacts) -> DetectedContacts:
         """Return the contacts of pairs that are not connected by joints."""
         return found.without(self._joined)
 
     def assembled(
-        self, detected: FoundContacts, time: float, dt: float, gravity: np.ndarray | None
+        self, detected: DetectedContacts, time: float, dt: float, gravity: np.ndarray | None
     ) -> Contacts:
         """Return the contacts with their rows.
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Sphere, TriangleMesh
+from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Placement, Sphere, TriangleMesh
 from warp_lcp.rigid.outline import mesh_outline
 
 ROUND = 1e-9  # relative asymmetry up to which an inertia counts as symmetric

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warp_lcp.grid.motion import Motion, Pose
-from warp_lcp.grid.solids import Box, Plane
+from warp_lcp.grid.signed_distance import Box, Plane
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rigid.contact_shape import ContactShape
 

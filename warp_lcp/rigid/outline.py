@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
+from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
 
 NO_LENGTH = 1e-9  # relative to a mesh's size
 AROUND = 48  # points around a disc or ball; even

@@ -28,7 +28,7 @@ from warp_lcp.rigid.contact_detection import (
     SAME,
     ContactDetection,
     ContactPoints,
-    FoundContacts,
+    DetectedContacts,
 )
 from warp_lcp.rigid.contact_problem import YIELDS
 from warp_lcp.rigid.contact_shape import ON_SURFACE
@@ -206,7 +206,7 @@ class PlanarContacts:
 
     def find(
         self, time: float, dt: float, falls: float, near: float, brought: Sequence[float]
-    ) -> tuple[FoundContacts, Contacts] | None:
+    ) -> tuple[DetectedContacts, Contacts] | None:
         """Return the contacts, and the same with rows for obstacles at rest.
 
         Args:
@@ -254,7 +254,7 @@ class PlanarContacts:
             for rows in fields[7:9]
         )
         wall, target, friction, restitution, size = fields[9].reshape(k, 2), *fields[10:]
-        found = FoundContacts(first, second, which, ContactPoints(point, normal, gap))
+        found = DetectedContacts(first, second, which, ContactPoints(point, normal, gap))
         return found, Contacts(
             first,
             second,

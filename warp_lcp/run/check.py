@@ -7,7 +7,7 @@ from pathlib import Path
 
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.size_limits import one_line
-from warp_lcp.frames.meshio_format import Dress, holds
+from warp_lcp.frames.meshio_format import MeshConversion, holds
 from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
@@ -155,7 +155,7 @@ def check_output(scene: Scene) -> list[str]:
                 )
             ],
         )
-    bare = [name for name, held in support.items() if held.dress is Dress.BARE]
+    bare = [name for name, held in support.items() if held.dress is MeshConversion.BARE]
     return (
         [
             f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, '

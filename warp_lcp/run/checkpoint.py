@@ -121,7 +121,7 @@ class CheckpointFolder:
     ) -> None:
         self.folder, self.collective, self._in_pieces = (
             folder,
-            collective or Collective.of_one(),
+            collective or Collective.for_one_process(),
             collective is not None,
         )
         # Reasons why the parts of a step cannot be used, as found by its ranks.
@@ -168,7 +168,7 @@ class CheckpointFolder:
             make_folder(self.folder, within=self.folder.parent)
             file = self.of_rank(self.collective.ranks.rank)._write(checkpoint)
         checksums = self.collective.exchange(checkpoint.checksum)
-        with self.collective.led():
+        with self.collective.root_only():
             if self.collective.ranks.is_root:
                 self._write(
                     Checkpoint(checkpoint.step, checkpoint.time, {PIECES: np.array(checksums)})

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.frames.frames import frame_bytes
+from warp_lcp.frames.frame_folder import frame_bytes
 from warp_lcp.grid.particles import lattice
 from warp_lcp.grid.voxelize import inside
 from warp_lcp.material.particle_scene import ParticleScene

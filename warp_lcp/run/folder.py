@@ -30,7 +30,7 @@ from warp_lcp.files.atomic import (
 )
 from warp_lcp.files.size_limits import one_line
 from warp_lcp.files.tables import Tables
-from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.frames.frame_folder import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import (
     CHECKPOINT_FILE,
@@ -158,7 +158,10 @@ class RunFolder:
     def __init__(self, path: Path, scene: Scene, collective: Collective | None = None) -> None:
         """Inspect a folder, which need not exist; nothing is written yet."""
         self.path, self.scene, self.log = path, scene, path / "log.csv"
-        self.collective, self._shared = collective or Collective.of_one(), collective is not None
+        self.collective, self._shared = (
+            collective or Collective.for_one_process(),
+            collective is not None,
+        )
         with self.collective.together():
             self.mesh_files = mesh_digests(scene)
         output = scene.output

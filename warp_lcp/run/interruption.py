@@ -22,7 +22,7 @@ GRACE = 1.0  # seconds for native code to return before a process without result
 FAILED = 1
 
 
-class Interrupted(KeyboardInterrupt):
+class RunInterrupted(KeyboardInterrupt):
     """A signal arrived before the end of the first step; the text is its name."""
 
 
@@ -32,7 +32,7 @@ class Interruption:
     Called after each step, it returns the name of the signal, "" without one.
 
     Before the first call no result can be lost, and the compilation of kernels may take long: there
-    a signal raises `Interrupted`. Python handles a signal only after the compiler has returned,
+    a signal raises `RunInterrupted`. Python handles a signal only after the compiler has returned,
     which may take many seconds. A separate thread therefore reports the signal at once and, if
     `last` is given, ends the process when Python does not handle it soon. Ignored signals, such as
     SIGHUP under nohup, stay ignored. A second Ctrl-C does not wait for the end of the step.
@@ -101,7 +101,7 @@ class Interruption:
         if not self.name:
             self.name = number.name
             if self._early:
-                raise Interrupted(number.name)
+                raise RunInterrupted(number.name)
 
     def _announce(self) -> None:
         """Report the signal, once."""

@@ -10,7 +10,7 @@ from warp_lcp.files.tables import TableView
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.loop import RunRequest, run_scene
-from warp_lcp.run.profile import Profile
+from warp_lcp.run.profile import Profiler
 from warp_lcp.run.progress import Observer
 from warp_lcp.run.resolve_scene import ResolvedScene, resolve_scene, scene_to_resume
 from warp_lcp.run.terminal import Terminal
@@ -103,7 +103,7 @@ class Launcher:
         *,
         observer: Observer,
         stop: Callable[[], bool | str],
-        profile: Profile | None,
+        profile: Profiler | None,
     ) -> RunRecord:
         """Simulate a scene that `load` returned, as `run_scene` does.
 

@@ -51,7 +51,7 @@ class Log:
             OSError: the file cannot be written.
             OutputError: the existing file has other columns.
         """
-        self.columns, self.collective = columns, collective or Collective.of_one()
+        self.columns, self.collective = columns, collective or Collective.for_one_process()
         self._open(path, columns, after_step)
 
     @on_root

@@ -14,15 +14,15 @@ from typing import cast
 import numpy as np
 
 from warp_lcp.distributed.collective import Collective, RankFailed
-from warp_lcp.frames.frames import FrameWriter, frame_bytes
+from warp_lcp.frames.frame_folder import FrameWriter, frame_bytes
 from warp_lcp.run.check import check_memory, check_output, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
 from warp_lcp.run.devices import Engine
 from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
-from warp_lcp.run.interruption import Interrupted
+from warp_lcp.run.interruption import RunInterrupted
 from warp_lcp.run.log import Log, Value
 from warp_lcp.run.problem_folder import ProblemFolder
-from warp_lcp.run.profile import Profile
+from warp_lcp.run.profile import Profiler
 from warp_lcp.run.progress import Observer, missed, residual_of
 from warp_lcp.run.rank_simulation import RankSimulation
 from warp_lcp.run.stepping import stable_dt, take_step
@@ -30,14 +30,14 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import (
     Cells,
-    Joined,
-    Measured,
+    HasPieces,
+    HasRecordedProblems,
+    HasResampling,
+    HasStages,
+    HasTables,
     NoStopwatch,
     Part,
     Points,
-    Profiled,
-    Recorded,
-    Resampled,
     Simulation,
     SimulationFailed,
     StepFailed,
@@ -85,7 +85,7 @@ def run_scene(
     *,
     observer: Observer,
     stop: Callable[[], bool | str] = lambda: False,
-    profile: Profile | None = None,
+    profile: Profiler | None = None,
     collective: Collective | None = None,
 ) -> RunRecord:
     """Simulate a scene into a folder; collective if ranks share the run.
@@ -107,7 +107,7 @@ def running_scene(
     *,
     observer: Observer,
     stop: Callable[[], bool | str] = lambda: False,
-    profile: Profile | None = None,
+    profile: Profiler | None = None,
     collective: Collective | None = None,
 ) -> Generator[RunLoop, None, RunRecord]:
     """Simulate a scene as far as frames are requested; collective on ranks.
@@ -134,7 +134,7 @@ def running_scene(
         OutputError: the folder cannot be used for the run; on all ranks, like all errors here.
         SceneError: the scene cannot be simulated, or not on ranks.
     """
-    scene, group = request.scene, collective or Collective.of_one()
+    scene, group = request.scene, collective or Collective.for_one_process()
     if collective is not None and request.record_problems is not None:
         raise OutputError(
             "--record-problems cannot be combined with --engine petsc: each rank has only a part "
@@ -210,7 +210,7 @@ def _simulation(
     notes = simulation.notes() + notes
     if collective is None:
         return simulation, notes
-    return RankSimulation(cast(Joined, simulation), collective), notes
+    return RankSimulation(cast(HasPieces, simulation), collective), notes
 
 
 def _go_on(
@@ -227,12 +227,12 @@ def _go_on(
         folder.scene.scene.simulator,
         continued.resampled_from is not None,
     )
-    if PIECES in state and not isinstance(simulation, Joined):
+    if PIECES in state and not isinstance(simulation, HasPieces):
         raise ValueError(
             "the checkpoint was written on several ranks: continue with --engine petsc, on any "
             "number of ranks"
         )
-    if other_grid and (on_ranks or PIECES in state or not isinstance(simulation, Resampled)):
+    if other_grid and (on_ranks or PIECES in state or not isinstance(simulation, HasResampling)):
         who = "--engine petsc" if on_ranks else name
         why = (
             "the checkpoint was written on several ranks"
@@ -240,9 +240,9 @@ def _go_on(
             else f"{who} cannot change grids"
         )
         raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: {why}")
-    if PIECES in state and isinstance(simulation, Joined):
+    if PIECES in state and isinstance(simulation, HasPieces):
         simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
-    elif other_grid and isinstance(simulation, Resampled):
+    elif other_grid and isinstance(simulation, HasResampling):
         return simulation.resample(state)
     else:
         simulation.restore(state)
@@ -251,7 +251,7 @@ def _go_on(
 
 def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:
     """Let a simulation write the problem of each step into a folder."""
-    if not isinstance(simulation, Recorded):
+    if not isinstance(simulation, HasRecordedProblems):
         raise OutputError(
             f"--record-problems: the simulator {scene.scene.simulator} has no problems to record"
         )
@@ -283,7 +283,7 @@ class RunLoop:
         folder: RunFolder | None,
         record: RunRecord,
         observer: Observer,
-        profile: Profile | None,
+        profile: Profiler | None,
         collective: Collective,
     ) -> None:
         """Store the simulation and the settings; nothing is written yet."""
@@ -296,7 +296,7 @@ class RunLoop:
         self.profile = profile
         self.collective = collective
         self.watch: Stopwatch = profile or NoStopwatch()
-        if isinstance(simulation, Profiled):
+        if isinstance(simulation, HasStages):
             simulation.watch = self.watch
         self.writer = folder.frame_writer(self.watch) if folder else None
         # Facts that one process knows hold for the run if they do on any rank.
@@ -345,7 +345,7 @@ class RunLoop:
                 self._write_checkpoint()
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = stopped or f"frame {last} of {count} reached"
-        except Interrupted as error:  # the checkpoint before the first step exists
+        except RunInterrupted as error:  # the checkpoint before the first step exists
             self.record.status, self.record.reason = "stopped", f"interrupted by {error} {BEFORE}"
         except (StepFailed, SimulationFailed) as error:
             self._fail(str(error))
@@ -424,7 +424,7 @@ class RunLoop:
             self._logs[name] = stack.enter_context(closing(log))
 
     def _table_columns(self) -> Mapping[str, tuple[str, ...]]:
-        return self.simulation.tables() if isinstance(self.simulation, Measured) else {}
+        return self.simulation.tables() if isinstance(self.simulation, HasTables) else {}
 
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
@@ -445,7 +445,7 @@ class RunLoop:
             with self._keeping_step():
                 for name, log in self._logs.items():
                     log.append(
-                        row if name == "log" else cast(Measured, self.simulation).measured[name]
+                        row if name == "log" else cast(HasTables, self.simulation).measured[name]
                     )
                 self.observer.step(row)
                 if missed(row):
@@ -596,7 +596,7 @@ class RunLoop:
         folder.checkpoints.prune(self.output.checkpoints_kept)
         return [file]
 
-    def _write_profile(self, profile: Profile, folder: RunFolder) -> None:
+    def _write_profile(self, profile: Profiler, folder: RunFolder) -> None:
         profile.write(
             folder.path, self.simulation.step_count - self._first_step, self.record.seconds
         )

@@ -7,7 +7,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.run.checkpoint import CheckpointError, CheckpointFolder
 from warp_lcp.run.log import rows_until
 from warp_lcp.simulation import Part

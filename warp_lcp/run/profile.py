@@ -48,7 +48,7 @@ class ProfileStage:
         self.seconds += seconds
 
 
-class LoadedKernels:
+class KernelLoadTimes:
     """Warp logger that sums compile and load times of kernels.
 
     All messages are forwarded.
@@ -85,7 +85,7 @@ class LoadedKernels:
         self._logger.error(message)
 
 
-class Profile:
+class Profiler:
     """Timer of stages; the device is synchronized at the begin and end of each.
 
     Args:
@@ -103,7 +103,7 @@ class Profile:
     @contextmanager
     def kernels_apart(self) -> Iterator[None]:
         """Count compile and load times of kernels as a separate stage."""
-        kernels = LoadedKernels()
+        kernels = KernelLoadTimes()
         self.stages[KERNELS] = self._loads = kernels.loads
         with wp.ScopedLogger(kernels), wp.ScopedLogLevel(min(wp.config.log_level, wp.LOG_INFO)):
             yield

@@ -50,7 +50,7 @@ def time_left(progress: Progress) -> str:
     return f"{timedelta(seconds=left) if left is not None else '-:--:--'} left"
 
 
-class Lines:
+class ProgressLines:
     """Progress as plain lines, one per frame."""
 
     def __init__(self, console: Console) -> None:
@@ -96,7 +96,7 @@ class Lines:
         say(self._console, text)
 
 
-class Bar:
+class ProgressBar:
     """Progress bar of simulated time, with the last step's numbers and time left."""
 
     def __init__(self, console: Console) -> None:
@@ -148,7 +148,7 @@ class Bar:
         """Do nothing: the bar shows the time."""
 
 
-class Count:
+class ProgressCounter:
     """Counter of finished items: a changing line on a terminal, else plain lines.
 
     Plain lines are printed every few seconds.

@@ -9,7 +9,7 @@ from typing import Self
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.atomic import make_folder
-from warp_lcp.frames.frames import FrameFolder, FrameWriter
+from warp_lcp.frames.frame_folder import FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import WHOLE, Kind, VtkPiece, describe, rank_folder, write_whole
 from warp_lcp.simulation import Cells, Part, Stopwatch, Volume
 

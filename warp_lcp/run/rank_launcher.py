@@ -24,7 +24,7 @@ from warp_lcp.run.devices import DeviceError, EngineError, devices
 from warp_lcp.run.folder import OutputError, RunRecord, mark_ended
 from warp_lcp.run.launcher import Launcher
 from warp_lcp.run.loop import RunRequest
-from warp_lcp.run.profile import Profile
+from warp_lcp.run.profile import Profiler
 from warp_lcp.run.progress import Observer
 from warp_lcp.run.resolve_scene import ResolvedScene
 from warp_lcp.run.terminal import Terminal, say, tell
@@ -104,7 +104,7 @@ class RankLauncher(Launcher):
         *,
         observer: Observer,
         stop: Callable[[], bool | str],
-        profile: Profile | None,
+        profile: Profiler | None,
     ) -> RunRecord:
         """Simulate a scene on all ranks, as `run_scene` does.
 

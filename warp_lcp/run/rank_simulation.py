@@ -12,12 +12,12 @@ from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.run.log import Value
 from warp_lcp.simulation import (
     Cells,
-    Joined,
-    Measured,
+    HasEvents,
+    HasPieces,
+    HasStages,
+    HasTables,
     NoStopwatch,
     Part,
-    Profiled,
-    Scheduled,
     SimulationFailed,
     StepFailed,
     Stopwatch,
@@ -38,7 +38,7 @@ class RankSimulation:
         step_count: number of steps.
     """
 
-    def __init__(self, simulation: Joined, collective: Collective) -> None:
+    def __init__(self, simulation: HasPieces, collective: Collective) -> None:
         self._simulation, self._collective = simulation, collective
         self.time, self.step_count = simulation.time, simulation.step_count
         self._watch: Stopwatch = NoStopwatch()
@@ -51,17 +51,17 @@ class RankSimulation:
     @watch.setter
     def watch(self, watch: Stopwatch) -> None:
         self._watch = watch
-        if isinstance(self._simulation, Profiled):
+        if isinstance(self._simulation, HasStages):
             self._simulation.watch = watch
 
     @property
     def measured(self) -> Mapping[str, Mapping[str, Value]]:
         """The last step's row of each table."""
-        return self._simulation.measured if isinstance(self._simulation, Measured) else {}
+        return self._simulation.measured if isinstance(self._simulation, HasTables) else {}
 
     def tables(self) -> Mapping[str, tuple[str, ...]]:
         """Return the columns of each table."""
-        return self._simulation.tables() if isinstance(self._simulation, Measured) else {}
+        return self._simulation.tables() if isinstance(self._simulation, HasTables) else {}
 
     def stable_dt(self) -> float:
         """Return the largest time step [s] that all ranks allow."""
@@ -71,7 +71,7 @@ class RankSimulation:
 
     def events(self, until: float) -> list[float]:
         """Return the times of starts and stops, up to `until` [s]; equal on all ranks."""
-        return self._simulation.events(until) if isinstance(self._simulation, Scheduled) else []
+        return self._simulation.events(until) if isinstance(self._simulation, HasEvents) else []
 
     def step(self, dt: float) -> dict[str, Value]:
         """Advance by dt [s] and return a row of the log.

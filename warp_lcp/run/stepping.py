@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from warp_lcp.run.log import Value
 from warp_lcp.scene.scene import Time
-from warp_lcp.simulation import Scheduled, Simulation, SimulationFailed, StepFailed
+from warp_lcp.simulation import HasEvents, Simulation, SimulationFailed, StepFailed
 
 # Halvings of dt: if a step 64 times shorter fails, its length is not the reason.
 RETRIES = 6
@@ -70,7 +70,7 @@ def take_step(
         SimulationFailed: the run cannot continue.
     """
     now, retries = simulation.time, 0
-    events = simulation.events(end) if isinstance(simulation, Scheduled) else []
+    events = simulation.events(end) if isinstance(simulation, HasEvents) else []
     dt = plan_dt(stable, end - now, time, [event - now for event in events])
     while True:
         try:

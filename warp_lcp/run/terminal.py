@@ -52,14 +52,14 @@ class Terminal(Console):
             force_terminal=force_terminal,
             color_system=color_system,
         )
-        self.push_render_hook(_Harmless())
+        self.push_render_hook(_EscapeHook())
 
     def on_broken_pipe(self) -> None:
         """Print no more after the reader has closed the pipe; the run continues."""
         self.quiet = True
 
 
-class Commands(TyperGroup):
+class CommandGroup(TyperGroup):
     """Command group with the same error messages for wrong usage."""
 
     def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
@@ -144,15 +144,15 @@ def table_lines(
     return "\n".join(line.rstrip() for line in text.get().splitlines())
 
 
-class _Harmless(RenderHook):
+class _EscapeHook(RenderHook):
     """Render hook that escapes the text of a console."""
 
     def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
         """Return renderables whose text is visible."""
-        return [_Visible(renderable) for renderable in renderables]
+        return [_EscapedRenderable(renderable) for renderable in renderables]
 
 
-class _Visible:
+class _EscapedRenderable:
     """Renderable with escaped text."""
 
     def __init__(self, renderable: ConsoleRenderable) -> None:

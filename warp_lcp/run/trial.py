@@ -29,7 +29,7 @@ BIN = 2.0
 
 
 @dataclass(frozen=True)
-class Look:
+class MaterialSnapshot:
     """Mass distribution, energy and front of the material at one time.
 
     Attributes:
@@ -69,7 +69,7 @@ class Trial:
     steps: int
     iterations: int
     linear_iterations: int
-    looks: tuple[Look, ...]
+    looks: tuple[MaterialSnapshot, ...]
     residual: float
     volume: tuple[float, float] | None = None
     packing: float | None = None
@@ -160,14 +160,14 @@ def trial(
         SimulationFailed: the run cannot continue.
     """
     simulation = start(scene, device)
-    ran = _Trial(scene, simulation, device, box or BIN * scene.spacing)
+    ran = _TrialRun(scene, simulation, device, box or BIN * scene.spacing)
     found = ran.run(look_times(scene, frames), min(frames, scene.time.frame_count))
     if inspect is not None:
         inspect(simulation)
     return found
 
 
-class _Trial:
+class _TrialRun:
     """Timed simulation of the first frames."""
 
     def __init__(self, scene: Scene, simulation: Simulation, device: str, box: float) -> None:
@@ -177,7 +177,7 @@ class _Trial:
 
     def run(self, times: Sequence[float], frames: int) -> Trial:
         """Step to the last frame and record the values at `times` [s]."""
-        looks: list[Look] = []
+        looks: list[MaterialSnapshot] = []
         for frame in range(1, frames + 1):
             end = self.scene.time.frame_time(frame)
             while end - self.simulation.time > SAME_TIME / self.scene.time.frames_per_second:
@@ -212,13 +212,13 @@ class _Trial:
         wp.synchronize_device(self.device)
         self.seconds += clock_of() - begun
 
-    def _look(self) -> Look:
+    def _look(self) -> MaterialSnapshot:
         """Return mass distribution, energy and front at the current time."""
         row, points = self.rows[-1], self._points()
         energy = float(row.get("kinetic_energy") or 0.0) + float(row.get("potential_energy") or 0.0)
         front = float(np.percentile(points[:, 0], FRONT)) if len(points) else 0.0
         dimension, size = self.scene.dimension, self.scene.domain.size
-        return Look(
+        return MaterialSnapshot(
             self.simulation.time,
             float(row.get("mass") or 0.0) * spread(points[:, :dimension], size, self.box),
             energy,
@@ -293,7 +293,7 @@ def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Differences:
+class RunDifferences:
     """Largest differences from a reference run.
 
     Args:
@@ -310,18 +310,18 @@ class Differences:
             own.distance(reference) / self.distance, own.volume_error(reference) / self.volume
         )
 
-    def beside(self, noise: Differences) -> Differences:
+    def beside(self, noise: RunDifferences) -> RunDifferences:
         """Return the bounds for a difference plus an independent noise.
 
         Both add in quadrature: the squared distance from one run of the reference's accuracy is
         that from the mean of such runs plus the noise squared.
         """
-        return Differences(
+        return RunDifferences(
             math.hypot(self.distance, noise.distance), math.hypot(self.volume, noise.volume)
         )
 
 
-def spread_of(references: Sequence[Trial]) -> Differences:
+def spread_of(references: Sequence[Trial]) -> RunDifferences:
     """Return the largest differences between equally accurate runs; 0 for one run.
 
     Smaller differences cannot be resolved.
@@ -331,7 +331,7 @@ def spread_of(references: Sequence[Trial]) -> Differences:
         max((of(b, a) for a, b in pairs), default=0.0)
         for of in (Trial.distance, Trial.volume_error)
     )
-    return Differences(distance, volume)
+    return RunDifferences(distance, volume)
 
 
 def step_seconds(scene: Scene, *, device: str) -> tuple[float, int]:

@@ -10,8 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from warp_lcp.files.atomic import write_text
-from warp_lcp.run.trial import Differences, Trial, spread_of, trial
-from warp_lcp.scene.presets import Preset, PresetName, PresetPrices, changed, price_table, table_of
+from warp_lcp.run.trial import RunDifferences, Trial, spread_of, trial
+from warp_lcp.scene.presets import (
+    Preset,
+    PresetName,
+    SimulatorPresets,
+    changed,
+    price_table,
+    table_of,
+)
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene
 from warp_lcp.scene.table import KeyFault, SceneError
@@ -53,7 +60,7 @@ class Candidate:
 
 
 @dataclass
-class Tuning:
+class TuningResult:
     """Result of a tuning.
 
     Attributes:
@@ -75,9 +82,9 @@ class Tuning:
     scene: Scene
     chosen: Candidate
     preset: Preset
-    bounds: Differences
+    bounds: RunDifferences
     limit: float
-    noise: Differences | None
+    noise: RunDifferences | None
     reference: Trial
     tried: list[Candidate]
     failed: list[str]
@@ -196,7 +203,7 @@ def tune(
     device: str,
     frames: int = FRAMES,
     say: Callable[[str], object] = lambda text: None,
-) -> Tuning:
+) -> TuningResult:
     """Find the settings with the shortest run time for an accuracy.
 
     An accuracy bounds the distance from a reference run at the same resolution, and the difference
@@ -231,7 +238,7 @@ def tune(
     ).run()
 
 
-def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
+def write_tuned(path: Path, tuning: TuningResult, accuracy: str, device: str) -> None:
     """Write the tuned scene, with the measurements in comments above it.
 
     Raises:
@@ -251,7 +258,7 @@ class _Search:
     """Search for the fastest settings."""
 
     scene: Scene
-    prices: PresetPrices
+    prices: SimulatorPresets
     preset: Preset
     device: str
     frames: int
@@ -260,12 +267,12 @@ class _Search:
     failed: list[str] = field(default_factory=list)
     _known: dict[tuple[tuple[str, float], ...], Candidate | None] = field(default_factory=dict)
 
-    def run(self) -> Tuning:
+    def run(self) -> TuningResult:
         """Find the fastest settings within the bounds, or the fastest of the nearest."""
         self.reference = self._reference_run()
         self.say(f"reference: {self.reference.seconds:.3g} s, {self.reference.steps} steps")
         self.bounds, self.limit, noise = (
-            Differences(self.preset.distance, self.preset.volume),
+            RunDifferences(self.preset.distance, self.preset.volume),
             1.0,
             None,
         )
@@ -291,7 +298,7 @@ class _Search:
             settings = self._loosest(settings, key, values)
         chosen = self._fastest([c for c in self.tried if self._miss(c) <= self.limit])
         tuned = changed(self.scene, chosen.settings)
-        return Tuning(
+        return TuningResult(
             tuned,
             chosen,
             self.preset,
@@ -323,7 +330,7 @@ class _Search:
         settings |= {key: part * settings[key] for key in ("time.cfl", "time.dt_max")}
         return trial(changed(self.scene, settings), device=self.device, frames=self.frames)
 
-    def _noise(self) -> Differences:
+    def _noise(self) -> RunDifferences:
         """Return the differences between runs of the reference's accuracy."""
         self.say("no settings are within the bounds; measuring how accurate the reference is")
         references = [self.reference]

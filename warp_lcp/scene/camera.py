@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from warp_lcp.scene.table import Complaint, Table, Vector
+from warp_lcp.scene.table import CrossKeyError, Table, Vector
 
 if TYPE_CHECKING:
     from warp_lcp.scene.scene import Scene
@@ -51,7 +51,7 @@ class Camera(Table):
         description="upper corner of the image [m], 2-D; default: the domain's",
     )
 
-    def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
+    def complaints(self, dimension: int, size: list[float]) -> list[CrossKeyError]:
         """Return errors of the camera in a domain of two or three sides [m]."""
         wrong, right = (ROOM_KEYS, WINDOW_KEYS) if dimension == 2 else (WINDOW_KEYS, ROOM_KEYS)
         complaints = []
@@ -60,7 +60,7 @@ class Camera(Table):
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
                 message = f"cannot be used in {dimension}-D; allowed are {allowed}"
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         (type(self).model_fields[key].alias or key,), getattr(self, key), message
                     )
                 )
@@ -68,7 +68,7 @@ class Camera(Table):
             value = getattr(self, key)
             if isinstance(value, list) and len(value) != dimension:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         (type(self).model_fields[key].alias or key,),
                         value,
                         f"must have {dimension} entries",
@@ -78,36 +78,38 @@ class Camera(Table):
             return complaints
         return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
 
-    def _window_complaints(self, size: list[float]) -> list[Complaint]:
+    def _window_complaints(self, size: list[float]) -> list[CrossKeyError]:
         """Return errors of the window of a 2-D domain."""
         low, high = self.low or [0.0, 0.0], self.high or size
         if all(a < b for a, b in zip(low, high, strict=True)):
             return []
         return [
-            Complaint(
+            CrossKeyError(
                 ("max",) if self.high else ("min",),
                 self.high or self.low,
                 f"min = {low} must be less than max = {high} along both axes",
             )
         ]
 
-    def _room_complaints(self, size: list[float]) -> list[Complaint]:
+    def _room_complaints(self, size: list[float]) -> list[CrossKeyError]:
         """Return errors of the view of a 3-D domain."""
         if self.position is None:
             given = [key for key in ("look_at", "up") if getattr(self, key) is not None]
-            return [Complaint((key,), getattr(self, key), "needs camera.position") for key in given]
+            return [
+                CrossKeyError((key,), getattr(self, key), "needs camera.position") for key in given
+            ]
         toward = np.subtract(self.position, self.look_at or np.multiply(size, 0.5))
         far = np.linalg.norm(toward)
         if far < 1e-6 * max(size):
             return [
-                Complaint(
+                CrossKeyError(
                     ("position",), self.position, "must not be the point that the camera looks at"
                 )
             ]
         up = np.array(self.up or Y_AXIS)
         if np.linalg.norm(np.cross(up, toward)) <= 1e-3 * np.linalg.norm(up) * far:
             return [
-                Complaint(
+                CrossKeyError(
                     ("up",),
                     self.up,
                     "must be given, and not be the direction that the camera looks in"

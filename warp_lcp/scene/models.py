@@ -12,7 +12,7 @@ TABLE = "models.toml"
 
 
 @dataclass(frozen=True)
-class Model:
+class SceneModel:
     """Part of a simulation that a scene turns on.
 
     Args:
@@ -29,7 +29,7 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Price:
+class ModelCost:
     """Cost of a model, measured on one processor core.
 
     Args:
@@ -56,20 +56,20 @@ class Price:
 
 
 @cache
-def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
+def prices(simulator: str, dimension: int) -> Mapping[str, ModelCost]:
     """Return the costs of models by name; `base`: the cost of every scene.
 
     Empty if nothing was measured.
     """
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     return {
-        name: Price(**price)
+        name: ModelCost(**price)
         for name, price in read.get(simulator, {}).get(f"{dimension}d", {}).items()
     }
 
 
 def predicted_seconds(
-    models: Iterable[Model], listed: Mapping[str, Price], cells: int, particles: int
+    models: Iterable[SceneModel], listed: Mapping[str, ModelCost], cells: int, particles: int
 ) -> float:
     """Return the estimated time of a step from the cost table [s]; 0: unknown."""
     counts = {"base": 1, **{model.name: model.count for model in models if model.built}}
@@ -85,8 +85,8 @@ def predicted_seconds(
 
 
 def model_lines(
-    models: Sequence[Model],
-    listed: Mapping[str, Price],
+    models: Sequence[SceneModel],
+    listed: Mapping[str, ModelCost],
     cells: int,
     particles: int,
     *,

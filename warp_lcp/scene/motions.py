@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from warp_lcp.scene.table import Angles, Complaint, Table, Vector, counted
+from warp_lcp.scene.table import Angles, CrossKeyError, Table, Vector, counted
 from warp_lcp.settings import Positive
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class PrescribedMotion(Table):
             ValueError: a value is not allowed.
         """
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the motion in a scene of 2 or 3 dimensions."""
         complaints = self._size_complaints(dimension)
         if complaints:
@@ -44,13 +44,13 @@ class PrescribedMotion(Table):
         try:
             self.to_motion(dimension)
         except ValueError as error:
-            complaints.append(Complaint((), None, str(error)))
+            complaints.append(CrossKeyError((), None, str(error)))
         return complaints
 
-    def _size_complaints(self, dimension: int) -> list[Complaint]:
+    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the number of entries, and missing or superfluous keys."""
         return [
-            Complaint((name,), value, f"must have {dimension} entries in {dimension}-D")
+            CrossKeyError((name,), value, f"must have {dimension} entries in {dimension}-D")
             for name, value in self
             if name in ("velocity", "center", "amplitude")
             and value is not None
@@ -97,7 +97,7 @@ class RotationMotion(PrescribedMotion):
             stop=_or_never(self.stop),
         )
 
-    def _size_complaints(self, dimension: int) -> list[Complaint]:
+    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
         return super()._size_complaints(dimension) + _axis_complaints(self.axis, dimension)
 
 
@@ -130,17 +130,17 @@ class SinusoidMotion(PrescribedMotion):
             axis=_or_z(self.axis),
         )
 
-    def _size_complaints(self, dimension: int) -> list[Complaint]:
+    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
         complaints = super()._size_complaints(dimension)
         if self.angle is not None:
             complaints += _center_complaints(self.center, "angle") + _axis_complaints(
                 self.axis, dimension
             )
         elif self.amplitude is None:
-            complaints.append(Complaint((), None, "a sinusoid needs amplitude, angle or both"))
+            complaints.append(CrossKeyError((), None, "a sinusoid needs amplitude, angle or both"))
         else:
             complaints += [
-                Complaint((name,), value, "has no effect without angle")
+                CrossKeyError((name,), value, "has no effect without angle")
                 for name, value in (("center", self.center), ("axis", self.axis))
                 if value is not None
             ]
@@ -181,28 +181,30 @@ class KeyframesMotion(PrescribedMotion):
             smooth=self.interpolation == "smooth",
         )
 
-    def _size_complaints(self, dimension: int) -> list[Complaint]:
+    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
         complaints = super()._size_complaints(dimension)
         if not (np.diff(self.times) > 0.0).all():
-            complaints.append(Complaint(("times",), self.times, "must increase"))
+            complaints.append(CrossKeyError(("times",), self.times, "must increase"))
         if self.translate is None and self.rotate is None:
-            complaints.append(Complaint((), None, "keyframes need translate, rotate or both"))
+            complaints.append(CrossKeyError((), None, "keyframes need translate, rotate or both"))
         if self.rotate is not None:
             complaints += _center_complaints(self.center, "rotate")
         elif self.center is not None:
-            complaints.append(Complaint(("center",), self.center, "has no effect without rotate"))
+            complaints.append(
+                CrossKeyError(("center",), self.center, "has no effect without rotate")
+            )
         for name, rows, width in (
             ("translate", self.translate, dimension),
             ("rotate", self.rotate, 1 if dimension == 2 else 3),
         ):
             if rows is not None and len(rows) != len(self.times):
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         (name,), rows, f"must have {len(self.times)} entries, one for each time"
                     )
                 )
             complaints += [
-                Complaint((name, index), row, f"must {counted(width)} in {dimension}-D")
+                CrossKeyError((name, index), row, f"must {counted(width)} in {dimension}-D")
                 for index, row in enumerate(rows or ())
                 if len(row) != width
             ]
@@ -223,16 +225,18 @@ def _or_z(axis: list[float] | None) -> list[float]:
     return axis or [0.0, 0.0, 1.0]
 
 
-def _axis_complaints(axis: list[float] | None, dimension: int) -> list[Complaint]:
+def _axis_complaints(axis: list[float] | None, dimension: int) -> list[CrossKeyError]:
     if dimension == 2:
         return (
             []
             if axis is None
-            else [Complaint(("axis",), axis, "must be left out in 2-D, where solids turn about z")]
+            else [
+                CrossKeyError(("axis",), axis, "must be left out in 2-D, where solids turn about z")
+            ]
         )
     return (
         [
-            Complaint(
+            CrossKeyError(
                 ("axis",), None, "is missing: the direction to turn about, such as [0.0, 1.0, 0.0]"
             )
         ]
@@ -241,10 +245,10 @@ def _axis_complaints(axis: list[float] | None, dimension: int) -> list[Complaint
     )
 
 
-def _center_complaints(center: list[float] | None, key: str) -> list[Complaint]:
+def _center_complaints(center: list[float] | None, key: str) -> list[CrossKeyError]:
     return (
         [
-            Complaint(
+            CrossKeyError(
                 ("center",), None, f"is missing: the point [m] to turn about, since there is {key}"
             )
         ]

@@ -39,7 +39,7 @@ class Preset:
 
 
 @dataclass(frozen=True)
-class PresetPrices:
+class SimulatorPresets:
     """Presets and trial settings of one simulator.
 
     Attributes:
@@ -56,7 +56,7 @@ class PresetPrices:
 
 
 @cache
-def price_table() -> Mapping[str, PresetPrices]:
+def price_table() -> Mapping[str, SimulatorPresets]:
     """Return the entries of `presets.toml` by simulator."""
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     entries = {}
@@ -66,7 +66,7 @@ def price_table() -> Mapping[str, PresetPrices]:
             for name in PRESETS
         }
         steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
-        entries[simulator] = PresetPrices(
+        entries[simulator] = SimulatorPresets(
             presets, _flat(part["reference"]), steps, tuple(part["tolerances"])
         )
     return entries

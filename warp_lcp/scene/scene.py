@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError
 from warp_lcp.frames.meshio_format import FrameFormat
 from warp_lcp.grid.domain_sides import SIDES
 from warp_lcp.grid.voxelize import STRAY
-from warp_lcp.problem.solve import PrecisionName
+from warp_lcp.problem.solve_loop import PrecisionName
 from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
 from warp_lcp.scene.shapes import (
@@ -37,7 +37,15 @@ from warp_lcp.scene.shapes import (
     Wall,
 )
 from warp_lcp.scene.suspicious_settings import scene_notes
-from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector, refuse, validate
+from warp_lcp.scene.table import (
+    CrossKeyError,
+    KeyFault,
+    SceneError,
+    Table,
+    Vector,
+    refuse,
+    validate,
+)
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solvers.registry import grid_methods
 
@@ -48,7 +56,7 @@ MOST_CELLS = 8192  # along an axis: float32 positions there are rounded to a tho
 FAR_SIDES = ("right", "top", "front")
 
 __all__ = [
-    "Complaint",
+    "CrossKeyError",
     "KeyFault",
     "Liquid",
     "Scene",
@@ -114,7 +122,7 @@ def file_name(text: str) -> str:
     return kept or "scene"
 
 
-class About(Table):
+class SceneHeader(Table):
     """[scene]: simulator, name and description."""
 
     simulator: str = Field(description="fluids, granular, contacts or another plug-in")
@@ -234,13 +242,13 @@ class Domain(Table):
         """Return whether the domain is unbounded."""
         return self.spacing is not None
 
-    def spacing_complaints(self) -> list[Complaint]:
+    def spacing_complaints(self) -> list[CrossKeyError]:
         """Return errors of `spacing` and `dimension`."""
         place, axes = ("domain", "spacing"), int(self.dimension or 0)
         if self.spacing is None:
             return (
                 [
-                    Complaint(
+                    CrossKeyError(
                         ("domain", "dimension"),
                         axes,
                         "is only for a domain with spacing; otherwise size gives it",
@@ -251,7 +259,7 @@ class Domain(Table):
             )
         if (self.size, self.resolution) != ([MOST_CELLS * self.spacing] * axes, MOST_CELLS):
             return [
-                Complaint(
+                CrossKeyError(
                     place,
                     self.spacing,
                     "replaces size and resolution: give either spacing or these",
@@ -261,7 +269,7 @@ class Domain(Table):
             []
             if self.follow
             else [
-                Complaint(
+                CrossKeyError(
                     ("domain", "follow"),
                     False,
                     "must be true with spacing: no grid covers an unbounded domain",
@@ -335,7 +343,7 @@ class Scene(Table):
 
     elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction", "gauge"), "granular")
     palette: ClassVar[Literal["water", "sand"]] = "water"  # color scheme of its images
-    scene: About
+    scene: SceneHeader
     time: Time
     domain: Domain
     physics: Physics
@@ -441,7 +449,7 @@ class Scene(Table):
         ]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
-    def complaints(self) -> list[Complaint]:
+    def complaints(self) -> list[CrossKeyError]:
         """Return errors that involve several keys.
 
         Subclasses add theirs to `super().complaints()`.
@@ -449,22 +457,22 @@ class Scene(Table):
         complaints = self._grid_complaints()
         if len(self.physics.gravity) != self.dimension:
             message = f"must have {self.dimension} entries, as domain.size has"
-            complaints.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
+            complaints.append(CrossKeyError(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("time", "dt_min"),
                     self.time.dt_min,
                     f"must not exceed time.dt_max = {self.time.dt_max}",
                 )
             )
         complaints += [
-            Complaint(("camera", *c.place), c.value, c.message)
+            CrossKeyError(("camera", *c.place), c.value, c.message)
             for c in self.camera.complaints(self.dimension, self.domain.size)
         ]
         if self.output.volume and self.dimension == 2:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"
                 )
             )
@@ -477,7 +485,7 @@ class Scene(Table):
 
     def shape_complaints(
         self, key: str, shapes: Sequence[Shape], *, inside: bool = False
-    ) -> list[Complaint]:
+    ) -> list[CrossKeyError]:
         """Return errors of an array of shapes.
 
         Args:
@@ -490,7 +498,7 @@ class Scene(Table):
             own_complaints = shape.complaints(self.dimension)
             if inside and not own_complaints and self.enclosed_volume(shape) == 0.0:
                 own_complaints = [
-                    Complaint(
+                    CrossKeyError(
                         (),
                         None,
                         "lies outside the domain, which extends from the origin to "
@@ -498,7 +506,7 @@ class Scene(Table):
                     )
                 ]
             complaints += [
-                Complaint((key, index, *complaint.place), complaint.value, complaint.message)
+                CrossKeyError((key, index, *complaint.place), complaint.value, complaint.message)
                 for complaint in own_complaints
             ]
         return complaints
@@ -605,15 +613,15 @@ class Scene(Table):
             ),
         ]
 
-    def _side_complaints(self) -> list[Complaint]:
+    def _side_complaints(self) -> list[CrossKeyError]:
         """Return errors of the domain's open sides."""
         complaints = []
         for index, side in enumerate(self.domain.open):
             if side in self.domain.open[:index]:
-                complaints.append(Complaint(("domain", "open", index), side, "is named twice"))
+                complaints.append(CrossKeyError(("domain", "open", index), side, "is named twice"))
             if side in SIDES[2 * self.dimension :]:
                 complaints.append(
-                    Complaint(
+                    CrossKeyError(
                         ("domain", "open", index),
                         side,
                         "is a side of a 3-D domain; domain.size has 2 entries",
@@ -621,13 +629,13 @@ class Scene(Table):
                 )
         return complaints
 
-    def _outside_complaints(self) -> list[Complaint]:
+    def _outside_complaints(self) -> list[CrossKeyError]:
         """Return errors of rigid bodies that lie wholly outside the domain.
 
         As far as their keys tell, without mesh files.
         """
         return [
-            Complaint(
+            CrossKeyError(
                 ("solid", index),
                 None,
                 f"lies outside the domain, which extends from the origin to {self.domain.size} m",
@@ -638,13 +646,13 @@ class Scene(Table):
             and self.enclosed_volume(solid) == 0.0
         ]
 
-    def _motion_complaints(self) -> list[Complaint]:
+    def _motion_complaints(self) -> list[CrossKeyError]:
         """Return errors of moving solids that fill whole cells."""
         if self.domain.solids == "cut-cell":
             return []
         message = 'needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
         return [
-            Complaint(("solid", index, key), None, message)
+            CrossKeyError(("solid", index, key), None, message)
             for index, solid in enumerate(self.solid)
             for key in ("motion", "mass", "density")
             if getattr(solid, key) is not None
@@ -657,12 +665,12 @@ class Scene(Table):
             f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3"
         )
 
-    def _grid_complaints(self) -> list[Complaint]:
+    def _grid_complaints(self) -> list[CrossKeyError]:
         """Return errors of the grid: spacing, periodic axes."""
         complaints = self.domain.spacing_complaints()
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("domain", "periodic"),
                     self.domain.periodic,
                     f"must have {self.dimension} entries",

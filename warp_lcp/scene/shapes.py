@@ -20,11 +20,11 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.scene.motions import Motion
-from warp_lcp.scene.table import Angles, Complaint, Table, Vector, counted
+from warp_lcp.scene.table import Angles, CrossKeyError, Table, Vector, counted
 from warp_lcp.settings import NonNegative, Part, Positive
 
 if TYPE_CHECKING:
-    from warp_lcp.grid.solids import Geometry, Placement
+    from warp_lcp.grid.signed_distance import Geometry, Placement
 
 BUILTIN = "builtin:"  # prefix of the names of meshes that the project generates
 
@@ -52,7 +52,7 @@ STICKS = 1e6
 BODY_FRICTION = 0.5  # default of a rigid body
 
 
-class _Boxes:
+class _BoundsCache:
     """Cache of a shape's bounding boxes by dimension.
 
     Caches compare by identity; shapes are compared by their keys only.
@@ -96,7 +96,7 @@ class Shape(Table):
 
     def placement(self, dimension: int) -> Placement:
         """Return scale, rotation and translation in a scene of 2 or 3 dimensions."""
-        from warp_lcp.grid.solids import Placement
+        from warp_lcp.grid.signed_distance import Placement
 
         zeros = [0.0] * dimension
         placement = Placement.from_degrees(
@@ -136,10 +136,10 @@ class Shape(Table):
         return known[dimension]
 
     @cached_property
-    def _boxes(self) -> _Boxes:
-        return _Boxes()
+    def _boxes(self) -> _BoundsCache:
+        return _BoundsCache()
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the shape in a scene of 2 or 3 dimensions."""
         lengths = {name: dimension for name, value in self if isinstance(value, list)}
         lengths |= {
@@ -148,7 +148,7 @@ class Shape(Table):
             if name in lengths
         }
         return [
-            Complaint(
+            CrossKeyError(
                 (type(self).model_fields[name].alias or name,),
                 value,
                 f"must {counted(count)} in {dimension}-D",
@@ -156,7 +156,7 @@ class Shape(Table):
             for name, count in lengths.items()
             if len(value := getattr(self, name)) != count
         ] + (
-            [Complaint(("about",), self.about, "has no effect without rotate or scale")]
+            [CrossKeyError(("about",), self.about, "has no effect without rotate or scale")]
             if self._about_idles
             else []
         )
@@ -178,20 +178,20 @@ class BoxTable(Shape):
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the box; in 2-D it extends along z without limit."""
-        from warp_lcp.grid import solids
+        from warp_lcp.grid import signed_distance
 
-        return solids.Box(
+        return signed_distance.Box(
             lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert
         )
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the box in a scene of 2 or 3 dimensions."""
         complaints = super().complaints(dimension)
         if not complaints and any(
             low >= high for low, high in zip(self.min, self.max, strict=True)
         ):
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("max",), self.max, f"must be greater than min = {self.min} along every axis"
                 )
             )
@@ -207,9 +207,9 @@ class SphereTable(Shape):
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the ball, a disk in 2-D."""
-        from warp_lcp.grid import solids
+        from warp_lcp.grid import signed_distance
 
-        return solids.Sphere(
+        return signed_distance.Sphere(
             center=self.center,
             radius=self.radius,
             placement=self.placement(dimension),
@@ -227,9 +227,9 @@ class CapsuleTable(Shape):
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the capsule around its axis."""
-        from warp_lcp.grid import solids
+        from warp_lcp.grid import signed_distance
 
-        return solids.Capsule(
+        return signed_distance.Capsule(
             start=self.start,
             end=self.end,
             radius=self.radius,
@@ -237,12 +237,12 @@ class CapsuleTable(Shape):
             invert=self.invert,
         )
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the capsule in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if self.start == self.end:
             found.append(
-                Complaint(("to",), self.end, 'must differ from "from"; use a sphere otherwise')
+                CrossKeyError(("to",), self.end, 'must differ from "from"; use a sphere otherwise')
             )
         return found
 
@@ -256,20 +256,20 @@ class PlaneTable(Shape):
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the half space on the side opposite to the normal."""
-        from warp_lcp.grid import solids
+        from warp_lcp.grid import signed_distance
 
-        return solids.Plane(
+        return signed_distance.Plane(
             point=self.point,
             normal=self.normal,
             placement=self.placement(dimension),
             invert=self.invert,
         )
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the plane in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if not any(self.normal):
-            found.append(Complaint(("normal",), self.normal, "must not be zero"))
+            found.append(CrossKeyError(("normal",), self.normal, "must not be zero"))
         return found
 
 
@@ -293,9 +293,9 @@ class MeshTable(Shape):
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the inside of the mesh."""
-        from warp_lcp.grid import solids
+        from warp_lcp.grid import signed_distance
 
-        return solids.TriangleMesh.from_file(
+        return signed_distance.TriangleMesh.from_file(
             self.file,
             folder=folder,
             placement=self.placement(dimension),
@@ -331,10 +331,10 @@ def shaped(properties: type[Properties], shape: type[Shape]) -> type[Properties]
 
 
 if TYPE_CHECKING:
-    OfAnyShape = Annotated[Properties, "of any shape"]
+    ShapeUnion = Annotated[Properties, "of any shape"]
 else:
 
-    class OfAnyShape:
+    class ShapeUnion:
         """Union of the tables of all shapes with the same properties, chosen by the key `shape`."""
 
         def __class_getitem__(cls, properties: type[Shape]) -> Any:
@@ -393,29 +393,29 @@ class SolidProperties(Shape):
         """Return whether it moves."""
         return self.is_body or self.motion is not None
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the solid in a scene of 2 or 3 dimensions."""
         moves = self.motion.complaints(dimension) if self.motion else []
         found = super().complaints(dimension) + [
-            Complaint(("motion", *c.place), c.value, c.message) for c in moves
+            CrossKeyError(("motion", *c.place), c.value, c.message) for c in moves
         ]
         if self.drag is not None and self.rubs:
-            found.append(Complaint(("drag",), self.drag, "is for liquids; sand uses friction"))
+            found.append(CrossKeyError(("drag",), self.drag, "is for liquids; sand uses friction"))
         return found + (self._body_complaints() if self.is_body else self._still_complaints())
 
-    def _body_complaints(self) -> list[Complaint]:
+    def _body_complaints(self) -> list[CrossKeyError]:
         """Return errors of a rigid body."""
         key = "mass" if self.mass is not None else "density"
         complaints = []
         if self.mass is not None and self.density is not None:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("density",), self.density, "cannot be combined with mass: give one of them"
                 )
             )
         if self.motion is not None:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("motion",),
                     None,
                     f"cannot be combined with {key}: a rigid body is moved by forces",
@@ -423,7 +423,7 @@ class SolidProperties(Shape):
             )
         if self.invert:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("invert",),
                     True,
                     f"cannot be combined with {key}: the outside of a shape has no mass",
@@ -431,11 +431,13 @@ class SolidProperties(Shape):
             )
         if self.shape == "plane":
             complaints.append(
-                Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass")
+                CrossKeyError(
+                    (key,), getattr(self, key), "not for a plane: a half space has no mass"
+                )
             )
         return complaints
 
-    def _still_complaints(self) -> list[Complaint]:
+    def _still_complaints(self) -> list[CrossKeyError]:
         """Return errors of keys that need a rigid body."""
         body_keys: dict[str, object] = {
             "velocity": self.velocity,
@@ -444,13 +446,13 @@ class SolidProperties(Shape):
         }
         message = "needs mass or density, which make the solid a rigid body"
         complaints = [
-            Complaint((name,), value, message)
+            CrossKeyError((name,), value, message)
             for name, value in body_keys.items()
             if value is not None
         ]
         if self.friction is not None and not self.rubs:
             complaints.append(
-                Complaint(
+                CrossKeyError(
                     ("friction",), self.friction, f"{message}: a liquid has no friction with solids"
                 )
             )
@@ -482,10 +484,12 @@ class Schedule(Table):
     begin: NonNegative = Field(alias="start", default=0.0, description="start time [s]")
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
-    def schedule_complaints(self) -> list[Complaint]:
+    def schedule_complaints(self) -> list[CrossKeyError]:
         """Return errors of the times."""
         if self.stop is not None and self.stop <= self.begin:
-            return [Complaint(("stop",), self.stop, f"must be later than start = {self.begin:g}")]
+            return [
+                CrossKeyError(("stop",), self.stop, f"must be later than start = {self.begin:g}")
+            ]
         return []
 
 
@@ -502,12 +506,14 @@ class SourceProperties(Schedule, Shape):
         description="viscosity [Pa s]; default: viscosity.value",
     )
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the source in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension) + self.schedule_complaints()
         if not any(self.velocity):
             found.append(
-                Complaint(("velocity",), self.velocity, "must not be zero: nothing would come out")
+                CrossKeyError(
+                    ("velocity",), self.velocity, "must not be zero: nothing would come out"
+                )
             )
         return found
 
@@ -517,12 +523,12 @@ class DrainProperties(Schedule, Shape):
 
     noun: ClassVar[str] = "Drain"
 
-    def complaints(self, dimension: int) -> list[Complaint]:
+    def complaints(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the drain in a scene of 2 or 3 dimensions."""
         return super().complaints(dimension) + self.schedule_complaints()
 
 
-Solid = OfAnyShape[SolidProperties]
-Liquid = OfAnyShape[LiquidProperties]
-Source = OfAnyShape[SourceProperties]
-Drain = OfAnyShape[DrainProperties]
+Solid = ShapeUnion[SolidProperties]
+Liquid = ShapeUnion[LiquidProperties]
+Source = ShapeUnion[SourceProperties]
+Drain = ShapeUnion[DrainProperties]

@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeGuard, TypeVar, runtime_checkable
 
-from warp_lcp.simulation import Joined, Simulation
+from warp_lcp.simulation import HasPieces, Simulation
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
@@ -42,7 +42,7 @@ class Simulator(Protocol):
 class RankedSimulator(Protocol):
     """Simulator plug-in whose simulations run on several MPI ranks."""
 
-    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks) -> Joined:
+    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks) -> HasPieces:
         """Build this rank's part of the simulation of a scene; collective."""
 
 
@@ -50,7 +50,7 @@ def runs_on_ranks(simulator: Simulator) -> TypeGuard[RankedSimulator]:
     """Return whether a plug-in's simulations run on several MPI ranks.
 
     Its `create` then has an argument `ranks`, is collective with the same scene on all ranks, and
-    returns this rank's part, a `warp_lcp.simulation.Joined`.
+    returns this rank's part, a `warp_lcp.simulation.HasPieces`.
     """
     return "ranks" in inspect.signature(simulator.create).parameters
 

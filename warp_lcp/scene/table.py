@@ -108,7 +108,7 @@ class SceneError(InputError):
 
 
 @dataclass(frozen=True)
-class Complaint:
+class CrossKeyError:
     """Error of a check across keys: key, value, and what is allowed.
 
     The value is included if it helps.
@@ -119,7 +119,7 @@ class Complaint:
     message: str
 
 
-def refuse(title: str, complaints: Iterable[Complaint]) -> None:
+def refuse(title: str, complaints: Iterable[CrossKeyError]) -> None:
     """Raise pydantic's error for the complaints, if any, each with its place.
 
     Raises:
@@ -156,7 +156,7 @@ def validate(model: type[ModelT], data: TableView, source: str) -> ModelT:
 
 
 @dataclass
-class _Place:
+class _ErrorLocation:
     """Location of an error: path in the file, table of the last key, and field."""
 
     path: str
@@ -166,9 +166,9 @@ class _Place:
     below: tuple[type[Table], ...] = ()
 
 
-def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
+def _locate(model: type[Table], location: tuple[str | int, ...]) -> _ErrorLocation:
     """Return the location of an error from pydantic's path."""
-    place = _Place(path="", below=(model,))
+    place = _ErrorLocation(path="", below=(model,))
     for part in location:
         if isinstance(part, int):
             place.path += f"[{part}]"
@@ -179,7 +179,9 @@ def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
             owner = place.below[0] if len(place.below) == 1 else None
             found = _keys(owner).get(part) if owner else None
             path = f"{place.path}.{part}" if place.path else part
-            place = _Place(path, part, owner, found, _tables(found.annotation) if found else ())
+            place = _ErrorLocation(
+                path, part, owner, found, _tables(found.annotation) if found else ()
+            )
     return place
 
 
@@ -213,7 +215,7 @@ def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
     return KeyFault(place.path, f"{message} ({hint})" if hint else message, value)
 
 
-def _unknown_variant(place: _Place, key: str, tag: object) -> KeyFault:
+def _unknown_variant(place: _ErrorLocation, key: str, tag: object) -> KeyFault:
     variants = _variants(place.below)
     if tag is None:
         return KeyFault(

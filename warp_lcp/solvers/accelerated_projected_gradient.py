@@ -11,10 +11,10 @@ import warp as wp
 
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import version_of
-from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
+from warp_lcp.problem.operator_protocol import version_of
+from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.sweeps.spectrum import positive_diagonal, scaled_spectrum
 
@@ -108,7 +108,7 @@ class AcceleratedWorkspace(WorkspaceBase):
         self.lipschitz = settings.lipschitz or 1.0
         self._version: object = object()
         self._d = zeros(wp.float64)
-        self._sums = Sums(rows_of(self.x), len(PROGRESS.sums))
+        self._sums = RowReduction(rows_of(self.x), len(PROGRESS.sums))
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Reset the momentum; estimate L again if the operator has changed."""

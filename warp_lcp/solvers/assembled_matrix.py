@@ -13,8 +13,8 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, check_taken, has
-from warp_lcp.problem.solve import (
+from warp_lcp.problem.operator_protocol import HasStencil, check_taken, has
+from warp_lcp.problem.solve_loop import (
     Solver,
     Step,
     WorkspaceBase,

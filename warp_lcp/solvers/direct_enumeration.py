@@ -12,11 +12,16 @@ from warp_lcp.kernels.fields import Array, checked_device, real_array
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.pickling import FieldsOnHost
+from warp_lcp.problem.pickling import DataclassPickling
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Step
-from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent
-from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
+from warp_lcp.problem.solve_loop import Step
+from warp_lcp.subproblems.dense_problem import (
+    DenseProblem,
+    DenseWorkspace,
+    check_size,
+    inconsistent,
+)
+from warp_lcp.subproblems.enumeration_kernels import enumeration_kernels
 
 MOST = 4  # largest number of unknowns: 3^4 = 81 sets
 # Largest measure of a solution: natural residual over the terms of y, for cond(A) < 1e5.
@@ -103,7 +108,7 @@ class DirectEnumeration:
 
 
 @dataclass(frozen=True)
-class BatchResult(FieldsOnHost):
+class BatchResult(DataclassPickling):
     """Result of `enumerate_batch`.
 
     Attributes:

@@ -13,19 +13,19 @@ import warp as wp
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.operator_protocol import MethodChain, declared, takes
 from warp_lcp.problem.pickling import Reduced
-from warp_lcp.problem.protocol import Chain, declared, takes
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve import (
+from warp_lcp.problem.solve_loop import (
     FLOOR_MARGIN,
-    OptionalMembers,
     Precision,
+    ReusableWorkspace,
     Solver,
-    Spare,
     Step,
     VariationalInequality,
     Workspace,
+    WorkspaceDefaults,
     evaluate_unless_current,
     is_method,
     method_name,
@@ -125,7 +125,7 @@ def slow_linear_solves(progress: Progress) -> bool:
 
 
 @runtime_checkable
-class StartsAfter(Protocol):
+class HasInitAfter(Protocol):
     """A method that can reuse the workspace of the method before it.
 
     For example its multigrid hierarchy.
@@ -161,7 +161,7 @@ class FallbackEntry:
 EntryLike: TypeAlias = "Solver | tuple[Solver, Condition] | FallbackEntry"
 
 
-class Fallback(Chain):
+class Fallback(MethodChain):
     """Chain of methods, each of which takes over as soon as its condition holds.
 
     Before each step the condition of the next method that takes the problem is evaluated. Methods
@@ -253,14 +253,14 @@ class Fallback(Chain):
         """
         return FallbackWorkspace(problem, self.entries, self.entries[0].method.init(problem))
 
-    def spare(self, problem: LCP) -> SpareChain | None:
+    def spare(self, problem: LCP) -> CachedChain | None:
         """Return the workspace of an earlier solve, if the first method keeps one."""
         first = self.entries[0].method
         lent = spare_of(first, problem)
         return (
             None
             if lent is None
-            else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
+            else CachedChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
         )
 
     def step(
@@ -271,7 +271,7 @@ class Fallback(Chain):
 
 
 @dataclass(frozen=True)
-class SpareChain:
+class CachedChain:
     """A chain's workspace around one that the first method keeps between solves.
 
     Args:
@@ -279,7 +279,7 @@ class SpareChain:
         work: of the chain.
     """
 
-    lent: Spare
+    lent: ReusableWorkspace
     work: FallbackWorkspace
 
     def give_back(self, result: SolveResult) -> None:
@@ -287,7 +287,7 @@ class SpareChain:
         self.lent.give_back(result)
 
 
-class FallbackWorkspace(OptionalMembers):
+class FallbackWorkspace(WorkspaceDefaults):
     """Workspace of a chain for one problem.
 
     Attributes that are not its own are those of the first method's workspace. While that method is
@@ -319,8 +319,11 @@ class FallbackWorkspace(OptionalMembers):
             if isinstance(first.precision, Precision)
             else Precision(first.precision)
         )
-        self._optional = first if isinstance(first, OptionalMembers) else OptionalMembers()
-        self.scratch, self.device_begins = self._optional.scratch, self._optional.device_begins
+        self._optional = first if isinstance(first, WorkspaceDefaults) else WorkspaceDefaults()
+        self.scratch, self.begins_on_device = (
+            self._optional.scratch,
+            self._optional.begins_on_device,
+        )
         # Workspaces by position in the chain; None: the method does not take the problem.
         self._works: dict[int, Workspace | None] = {0: first}
         # By position: whether a method takes such a problem, before it has a workspace.
@@ -342,19 +345,19 @@ class FallbackWorkspace(OptionalMembers):
         return getattr(self._first, name)
 
     @property
-    def is_ahead(self) -> bool:
+    def has_device_steps(self) -> bool:
         """Whether the first method's device has already taken the next step."""
-        return self._optional.is_ahead
+        return self._optional.has_device_steps
 
     def solution(self) -> DeviceArray | None:
         """Return x as the first method's workspace does."""
         return self._optional.solution()
 
-    def begin_ahead(
+    def begin_on_device(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
     ) -> float | None:
         """Begin a solve on the device by the first method."""
-        return self._optional.begin_ahead(guess, criteria, steps)
+        return self._optional.begin_on_device(guess, criteria, steps)
 
     def start(
         self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None
@@ -406,7 +409,7 @@ class FallbackWorkspace(OptionalMembers):
         progress, first, at_first = self._progress, self._first, self._place == 0
         progress.record(self.residual.norm)
         # No hand-over while the device has already taken the step.
-        ahead = at_first and self._optional.is_ahead
+        ahead = at_first and self._optional.has_device_steps
         if not ahead and (place := self._due()) is not None:
             self._hand_over(place)
             at_first = False
@@ -499,7 +502,7 @@ class FallbackWorkspace(OptionalMembers):
         try:
             return (
                 method.init_after(self.problem, before)
-                if isinstance(method, StartsAfter)
+                if isinstance(method, HasInitAfter)
                 else method.init(self.problem)
             )
         except ValueError:

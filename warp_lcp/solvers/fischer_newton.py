@@ -23,12 +23,14 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.residual_scaling import NoTranspose
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Precision, PrecisionName, Step, WorkspaceBase
-from warp_lcp.reduced.dense_problem import DenseWorkspace
-from warp_lcp.reduced.energy_monitor import DECREASE, NonmonotoneSearch
-from warp_lcp.reduced.grid_system import GridSystem
-from warp_lcp.reduced.multigrid_workspace import ColdStart
-from warp_lcp.reduced.nonsmooth_map import (
+from warp_lcp.problem.solve_loop import Precision, PrecisionName, Step, WorkspaceBase
+from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
+from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
+from warp_lcp.subproblems.dense_problem import DenseWorkspace
+from warp_lcp.subproblems.energy_monitor import DECREASE, NonmonotoneSearch
+from warp_lcp.subproblems.grid_system import GridSystem
+from warp_lcp.subproblems.multigrid_workspace import ColdStart
+from warp_lcp.subproblems.nonsmooth_map import (
     FiniteDifferenceSystem,
     HostMap,
     Kink,
@@ -36,10 +38,8 @@ from warp_lcp.reduced.nonsmooth_map import (
     MapForm,
     NonsmoothMap,
 )
-from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.reduced.settings import NewtonSettings
-from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
-from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
+from warp_lcp.subproblems.principal_system import principal_system
+from warp_lcp.subproblems.settings import NewtonSettings
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # limit of the regularized stage: the solves that succeed need 5 to 27 steps

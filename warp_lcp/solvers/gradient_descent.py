@@ -16,10 +16,10 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
-from warp_lcp.reduced.energy_monitor import NonmonotoneSearch
-from warp_lcp.reduced.nonsmooth_map import MapForm, MapName, NonsmoothMap
+from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
+from warp_lcp.subproblems.energy_monitor import NonmonotoneSearch
+from warp_lcp.subproblems.nonsmooth_map import MapForm, MapName, NonsmoothMap
 
 LEAST = 1e-12  # a smaller relative decrease of the merit counts as no step
 LONGEST = 1e6  # longest length that is tried

@@ -16,8 +16,9 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Step
-from warp_lcp.reduced.dense_problem import (
+from warp_lcp.problem.solve_loop import Step
+from warp_lcp.settings import Count, Settings
+from warp_lcp.subproblems.dense_problem import (
     RANK,
     DenseWorkspace,
     assemble,
@@ -27,7 +28,6 @@ from warp_lcp.reduced.dense_problem import (
     pivots_of,
     semidefinite,
 )
-from warp_lcp.settings import Count, Settings
 
 # A rate below this part of the terms of its sum is rounding: nothing changes there.
 ZERO = 1e-11

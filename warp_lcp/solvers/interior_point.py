@@ -23,19 +23,19 @@ from warp_lcp.kernels import FusedKernel, KernelFile, PrecomputedProduct
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.layout import KernelStencil
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import Step, WorkspaceBase
-from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
-from warp_lcp.reduced.grid_system import GridSystem
-from warp_lcp.reduced.multigrid_workspace import ColdStart
-from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.reduced.settings import NewtonSettings
+from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.settings import Count, Positive, Share
+from warp_lcp.subproblems.equilibration import EquilibratedWorkspace
+from warp_lcp.subproblems.grid_system import GridSystem
+from warp_lcp.subproblems.multigrid_workspace import ColdStart
+from warp_lcp.subproblems.principal_system import principal_system
+from warp_lcp.subproblems.settings import NewtonSettings
 
 LARGEST_START = 1e6  # times the residual's norm: largest ||b|| that sets the size of the start
 
@@ -239,11 +239,11 @@ class InteriorPointWorkspace(WorkspaceBase):
             fused and problem.bounded and settings.mehrotra and self._rounded is None,
         )
         self._sums, self._longest = (
-            Sums(rows_of(self.x), 3),
+            RowReduction(rows_of(self.x), 3),
             wp.zeros(1, dtype=wp.float64, device=problem.device),
         )
         self._grid_sums = (
-            Sums(problem.A.stencil.rows, 3)  # type: ignore[attr-defined]
+            RowReduction(problem.A.stencil.rows, 3)  # type: ignore[attr-defined]
             if self._fusable
             else self._sums
         )
@@ -406,7 +406,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         return ComplementaryPairs(self._w, self._v, self._s, self._t)
 
     @property
-    def _pass_sums(self) -> Sums:
+    def _pass_sums(self) -> RowReduction:
         """Sums of the kernels: over a grid's rows where passes are fused."""
         return self._grid_sums if self._fused else self._sums
 

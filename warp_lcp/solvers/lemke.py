@@ -22,15 +22,15 @@ from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Step
-from warp_lcp.reduced.dense_problem import (
+from warp_lcp.problem.solve_loop import Step
+from warp_lcp.settings import Count, Settings
+from warp_lcp.subproblems.dense_problem import (
     DenseProblem,
     DenseWorkspace,
     check_size,
     inconsistent,
     pivots_of,
 )
-from warp_lcp.settings import Count, Settings
 
 REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
 

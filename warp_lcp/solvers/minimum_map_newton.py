@@ -13,10 +13,10 @@ from typing import ClassVar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve import OptionalMembers, Step
-from warp_lcp.reduced.reduced_system import ReducedSystem, reduced_system
-from warp_lcp.reduced.settings import NewtonSettings
+from warp_lcp.problem.solve_loop import Step, WorkspaceDefaults
 from warp_lcp.settings import Count, CountOrZero
+from warp_lcp.subproblems.reduced_system import ReducedSystem, reduced_system
+from warp_lcp.subproblems.settings import NewtonSettings
 
 DECREASE = 1e-4  # share of a step by which the residual must fall
 
@@ -98,7 +98,7 @@ class MinimumMapNewton(NewtonSettings):
         return work.step()
 
 
-class NewtonWorkspace(OptionalMembers):
+class NewtonWorkspace(WorkspaceDefaults):
     """Workspace of the method for one problem.
 
     It holds the reduced system, and the residuals of the last steps.

@@ -14,7 +14,7 @@ from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.fields import zeros_like
 from warp_lcp.kernels.types import DataType, DeviceArray
-from warp_lcp.kernels.vectors import Sums
+from warp_lcp.kernels.vectors import RowReduction
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.stencil_level import StencilLevel
@@ -22,18 +22,18 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.operator_protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Precision, PrecisionName, Step, Workspace, WorkspaceBase
-from warp_lcp.reduced import grid_step_kernels as engine
-from warp_lcp.reduced.active_set_kernels import projected_move
-from warp_lcp.reduced.diagonal_system import DiagonalSystem
-from warp_lcp.reduced.energy_monitor import Descent
-from warp_lcp.reduced.grid_system import projected_cycle
-from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.reduced.sparse_system import SparseSystem
+from warp_lcp.problem.solve_loop import Precision, PrecisionName, Step, Workspace, WorkspaceBase
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
+from warp_lcp.subproblems import grid_step_kernels as engine
+from warp_lcp.subproblems.active_set_kernels import projected_move
+from warp_lcp.subproblems.diagonal_system import DiagonalSystem
+from warp_lcp.subproblems.energy_monitor import EnergyMonitor
+from warp_lcp.subproblems.grid_system import projected_cycle
+from warp_lcp.subproblems.principal_system import principal_system
+from warp_lcp.subproblems.sparse_system import SparseSystem
 from warp_lcp.sweeps.sweep import Diagonal
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
@@ -186,8 +186,10 @@ class SplitResidual(NaturalResidual):
         ) = 1.0, 1, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if has(problem.A, HasStencil) else None
-        self.sums = Sums(self.rows, 2, slots=engine.SLOTS)
-        self._split = Sums(self._stencil.rows if self._stencil else self.rows, len(SPLIT.sums))
+        self.sums = RowReduction(self.rows, 2, slots=engine.SLOTS)
+        self._split = RowReduction(
+            self._stencil.rows if self._stencil else self.rows, len(SPLIT.sums)
+        )
 
     def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
@@ -242,7 +244,7 @@ class SplitResidual(NaturalResidual):
 
         The level's x is z, its b is r.
         """
-        engine.measuring(finest, p, self._split.partials).launch(wp.launch)
+        engine.measure_kernel(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)
         return [float(v) for v in self._split.scalars.numpy()[:4]]
 
@@ -292,7 +294,7 @@ class MPRGPWorkspace(WorkspaceBase):
             False,
             0.0,
         )
-        self._descent = Descent(self.precision.epsilon)
+        self._energy_monitor = EnergyMonitor(self.precision.epsilon)
         self._restricted = 0  # the version of the free set that the preconditioner is restricted to
 
     def start(
@@ -309,7 +311,7 @@ class MPRGPWorkspace(WorkspaceBase):
             False,
             self.residual.energy,
         )
-        self._descent.start(self.residual.energy, self.residual.norm)
+        self._energy_monitor.start(self.residual.energy, self.residual.norm)
         self._restricted = 0
         self.system.refresh()
 
@@ -324,7 +326,7 @@ class MPRGPWorkspace(WorkspaceBase):
         Since the last time that it had; on grids, whether the step before has lowered it.
         """
         if self.is_grid:
-            return self._descent.sinks
+            return self._energy_monitor.sinks
         sinks = self.residual.energy < self._lowest - NOISE * abs(self._lowest)
         self._lowest = self.residual.energy if sinks else self._lowest
         return sinks
@@ -333,14 +335,14 @@ class MPRGPWorkspace(WorkspaceBase):
         """Judge the last step; return whether the next one is a projected cycle."""
         if not (self.is_grid and self.bounded):
             return False
-        fell = self._descent.record(self.residual.energy, self.residual.norm)
+        fell = self._energy_monitor.record(self.residual.energy, self.residual.norm)
         if self._cycled:
-            self._descent.weigh(fell)
-        elif self._cycles_left == 0 and self._descent.creeps(
+            self._energy_monitor.weigh(fell)
+        elif self._cycles_left == 0 and self._energy_monitor.needs_cycle(
             fell, moved=self.stale or self._released
         ):
             self._cycles_left = 1
-        self._cycles_left = self._cycles_left or self._descent.due(self.settings.patience)
+        self._cycles_left = self._cycles_left or self._energy_monitor.due(self.settings.patience)
         self._cycled, self._released = self._cycles_left > 0, False
         return self._cycled
 

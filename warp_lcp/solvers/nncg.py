@@ -14,11 +14,11 @@ import warp as wp
 
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.operator_protocol import HasRows, HasSweep, check_taken
 from warp_lcp.problem.residual import WITHIN
-from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.problem.solve_loop import PrecisionName, Step
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.sweeps.sweep import sweep_for
@@ -50,7 +50,7 @@ class NNCG(Settings):
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
-    supports: ClassVar = (Relaxes, HasRows)
+    supports: ClassVar = (HasSweep, HasRows)
     needs: ClassVar[str] = "as for ProjectedSOR"
     affine_bounds: ClassVar[bool] = True
 
@@ -96,7 +96,7 @@ class NNCGWorkspace(SweepWorkspace):
             sides = zip(affine.constant, affine.index, (-np.inf, np.inf), strict=True)
             lower, upper = (_where_constant(*side) for side in sides)
             self._constant = self._constant._replace(lower=lower, upper=upper)
-        self._sums = Sums(rows_of(self.x), slots=2)
+        self._sums = RowReduction(rows_of(self.x), slots=2)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Reset the direction; the operator may have changed."""

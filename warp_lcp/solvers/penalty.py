@@ -14,17 +14,17 @@ import warp as wp
 
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import Step, WorkspaceBase
-from warp_lcp.reduced.active_set_kernels import ON_FREE
-from warp_lcp.reduced.multigrid_workspace import ColdStart
-from warp_lcp.reduced.principal_system import principal_system
-from warp_lcp.reduced.settings import NewtonSettings
+from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.settings import Positive, Share
+from warp_lcp.subproblems.active_set_kernels import ON_FREE
+from warp_lcp.subproblems.multigrid_workspace import ColdStart
+from warp_lcp.subproblems.principal_system import principal_system
+from warp_lcp.subproblems.settings import NewtonSettings
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]
@@ -131,7 +131,7 @@ class PenaltyWorkspace(WorkspaceBase):
         )
         self.side, self._shift = layout.zeros(wp.int8), layout.zeros(wp.float64)
         self._free, self._inside = layout.zeros(wp.uint8), layout.zeros(wp.uint8)
-        self._sums = Sums(rows_of(self.x), 3)
+        self._sums = RowReduction(rows_of(self.x), 3)
         self.rho, self.cycles_left, self.steps, self.target = settings.rho, 0, 0, 0.0
 
     def start(

@@ -12,13 +12,13 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasColumns, HasStencil, check_taken, has
+from warp_lcp.problem.operator_protocol import HasLowRankTerm, HasStencil, check_taken, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import PrecisionName, Step
-from warp_lcp.problem.spare_workspace import SpareWorkspace, lend
-from warp_lcp.reduced.multigrid_coupled import CoupledWorkspace
-from warp_lcp.reduced.multigrid_workspace import MultigridWorkspace
+from warp_lcp.problem.solve_loop import PrecisionName, Step
+from warp_lcp.problem.workspace_cache import CachedWorkspace, lend
 from warp_lcp.settings import Count, CountOrZero, Settings
+from warp_lcp.subproblems.multigrid_coupled import CoupledWorkspace
+from warp_lcp.subproblems.multigrid_workspace import MultigridWorkspace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +36,12 @@ class ProjectedMultigrid(Settings):
     tolerances: without bounds this is the method of preconditioned conjugate gradients with a true
     residual, and the same code is the linear solver.
 
-    Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`). If it falls evenly while the
-    free set changes, a contact's boundary moves by only one layer of cells per step, and a monotone
-    cycle follows. If `patience` steps reach no new least energy, monotone cycles follow, twice as
-    many each time; with rigid bodies the third run of them ends the solve with STAGNATED. Cycles
-    are slow in channels one cell wide and where coefficients are random over decades: `wl.solve`
-    without a method then continues with `MinimumMapNewton` on the assembled matrix
+    Steps are judged by the energy x'Ax/2 + b'x (`energy_monitor.EnergyMonitor`). If it falls evenly
+    while the free set changes, a contact's boundary moves by only one layer of cells per step, and
+    a monotone cycle follows. If `patience` steps reach no new least energy, monotone cycles follow,
+    twice as many each time; with rigid bodies the third run of them ends the solve with STAGNATED.
+    Cycles are slow in channels one cell wide and where coefficients are random over decades:
+    `wl.solve` without a method then continues with `MinimumMapNewton` on the assembled matrix
     (`wl.default_chain`).
 
     Args:
@@ -52,7 +52,7 @@ class ProjectedMultigrid(Settings):
         cycle: settings of multigrid cycles.
     """
 
-    supports: ClassVar = (HasStencil, HasColumns)
+    supports: ClassVar = (HasStencil, HasLowRankTerm)
     needs: ClassVar[str] = ""
     distributed: ClassVar[bool] = True
 
@@ -85,7 +85,7 @@ class ProjectedMultigrid(Settings):
             )
         return CoupledWorkspace(problem, *terms, self)
 
-    def spare(self, problem: LCP) -> SpareWorkspace | None:
+    def spare(self, problem: LCP) -> CachedWorkspace | None:
         """Return a kept workspace of an earlier solve with the problem's data.
 
         Returns None if `init` has to create one. From the second consecutive solve of a form on,

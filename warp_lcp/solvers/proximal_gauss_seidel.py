@@ -19,7 +19,7 @@ from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.problem.frictional_contact import FrictionalContact
-from warp_lcp.problem.solve import Precision, Step
+from warp_lcp.problem.solve_loop import Precision, Step
 from warp_lcp.settings import Count, Settings, Share
 
 f64, i32 = wp.float64, wp.int32
@@ -165,7 +165,7 @@ class ContactWorkspace:
         self._changes = Reduction(k * dim, device, self._state)
         every = self._rows(0, k)
         self._squares = Reduction(k, device, self._state, threads=max(every.places, 1))
-        self._gather = self._gathering()
+        self._gather = self._gather_kernel()
         self._left = self._passes.residual.bind(every, self._fields, out=self._squares.partials)
         self._program = CommandBuffer(device)
         for count in range(method.check_every):
@@ -192,7 +192,7 @@ class ContactWorkspace:
         )
         return ContactFields(rows, b, e, laws_, contact, one, other, self._w, self.x.flatten())
 
-    def _gathering(self) -> BoundKernel:
+    def _gather_kernel(self) -> BoundKernel:
         """Return the kernel that computes w = J'r body by body."""
         p, fields = self.problem, self._fields
         both = np.stack([p.first[self.order], p.second[self.order]], axis=1).ravel()

@@ -15,11 +15,11 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.data_types import Matrix, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
+from warp_lcp.problem.operator_protocol import HasRows, HasScale, check_taken, has
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.residual_scaling import scale_of_matrix
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import (
+from warp_lcp.problem.solve_loop import (
     FLOOR_MARGIN,
     Solver,
     Step,
@@ -28,11 +28,11 @@ from warp_lcp.problem.solve import (
     evaluate_unless_current,
     method_step,
 )
-from warp_lcp.reduced.dense_problem import proved_infeasible
 from warp_lcp.settings import Settings
 from warp_lcp.solvers.fallback import Fallback, fails
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
+from warp_lcp.subproblems.dense_problem import proved_infeasible
 
 # eps of the first center, its factor from center to center, and the smallest eps.
 CENTER, FACTOR, LEAST = 1e-4, 0.1, 1e-10

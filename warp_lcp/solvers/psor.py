@@ -11,8 +11,15 @@ import numpy as np
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, HasStencil, Relaxes, check_taken, has, version_of
-from warp_lcp.problem.solve import PrecisionName, Step, WorkspaceBase
+from warp_lcp.problem.operator_protocol import (
+    HasRows,
+    HasStencil,
+    HasSweep,
+    check_taken,
+    has,
+    version_of,
+)
+from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.sweeps.spectrum import scaled_spectrum
 from warp_lcp.sweeps.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
@@ -65,7 +72,7 @@ class ProjectedSOR(Settings):
     """
 
     name: ClassVar[str] = "psor"
-    supports: ClassVar = (Relaxes, HasRows)
+    supports: ClassVar = (HasSweep, HasRows)
     needs: ClassVar[str] = (
         "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     )

@@ -14,8 +14,9 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Step
-from warp_lcp.reduced.dense_problem import (
+from warp_lcp.problem.solve_loop import Step
+from warp_lcp.settings import Count, Positive, Settings
+from warp_lcp.subproblems.dense_problem import (
     SEMIDEFINITE,
     DenseProblem,
     DenseWorkspace,
@@ -24,7 +25,6 @@ from warp_lcp.reduced.dense_problem import (
     semidefinite,
     sparse_matrix,
 )
-from warp_lcp.settings import Count, Positive, Settings
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,10 +2,10 @@
 
 Scenes, the command line, the tests and the documentation read it. A new method is one file and one
 line here. Each class lists in `supports` the capabilities of an operator of which it needs at least
-one (see `warp_lcp.problem.protocol`; no attribute if every operator will do), and says in `needs`
-what must hold of A ("symmetric", ...). A class for small problems only has `most_unknowns`. A class
-whose problems are no `LCP` names their class as `problems`; it takes no operators, so that its
-`families` are empty. A class that takes no upper bounds and no equations has `boxed = False`. A
+one (see `warp_lcp.problem.operator_protocol`; no attribute if every operator will do), and says in
+`needs` what must hold of A ("symmetric", ...). A class for small problems only has `most_unknowns`.
+A class whose problems are no `LCP` names their class as `problems`; it takes no operators, so that
+its `families` are empty. A class that takes no upper bounds and no equations has `boxed = False`. A
 class that ends with NEGATIVE_CURVATURE where A is surely no P- and no semi-definite matrix has
 `definite = True`.
 """
@@ -15,8 +15,8 @@ from __future__ import annotations
 from inspect import signature
 from typing import Any
 
-from warp_lcp.problem.protocol import declared, families
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.operator_protocol import declared, families
+from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.settings import nearest
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
@@ -51,7 +51,7 @@ ALSO = {
 }
 
 
-class Methods(dict[str, type[Any]]):
+class MethodRegistry(dict[str, type[Any]]):
     """Methods by their names; the KeyError of an unknown name lists near ones."""
 
     def __missing__(self, name: str) -> type[Any]:
@@ -73,7 +73,7 @@ class Methods(dict[str, type[Any]]):
         return nearest(word, self)
 
 
-METHODS = Methods(
+METHODS = MethodRegistry(
     {
         "accelerated-projected-gradient": AcceleratedProjectedGradient,
         "blocked-gauss-seidel": BlockedGaussSeidel,

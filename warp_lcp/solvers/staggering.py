@@ -24,9 +24,16 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasBlocks, HasRows, check_taken, described, has, version_of
+from warp_lcp.problem.operator_protocol import (
+    HasRestriction,
+    HasRows,
+    check_taken,
+    described,
+    has,
+    version_of,
+)
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.problem.solve import Solver, Step, WorkspaceBase, solve
+from warp_lcp.problem.solve_loop import Solver, Step, WorkspaceBase, solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
@@ -61,7 +68,7 @@ class Staggering(Settings):
         max_block_iterations: maximum number of steps in a block.
     """
 
-    supports: ClassVar = (HasRows, HasBlocks)
+    supports: ClassVar = (HasRows, HasRestriction)
     needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 
@@ -348,7 +355,7 @@ class GridBlock:
 
     def __init__(self, problem: LCP, x: DeviceArray, rows: np.ndarray) -> None:
         A = problem.A
-        assert has(A, HasBlocks)
+        assert has(A, HasRestriction)
         layout = problem.layout
         self._whole, self._x = problem, x
         member = np.zeros(layout.size, dtype=np.uint8)
@@ -371,7 +378,7 @@ class GridBlock:
         Cells that are no longer FLUID leave the block; new ones belong to no block.
         """
         A = self._whole.A
-        assert has(A, HasBlocks)
+        assert has(A, HasRestriction)
         if A.version != self._version:
             self._version = A.version
             cells = self._cells().reshape(self._whole.layout.stored_shape)
@@ -431,11 +438,11 @@ def block_problem(problem: LCP, x: DeviceArray, rows: np.ndarray) -> Block:
     Raises:
         ValueError: the operator has no principal sub-operators.
     """
-    if has(problem.A, HasBlocks):
+    if has(problem.A, HasRestriction):
         return GridBlock(problem, x, rows)
     if has(problem.A, HasRows):
         return MatrixBlock(problem, x, rows)
     raise ValueError(
         f"{type(problem.A).__name__} cannot be split into blocks, which need "
-        f"{described(HasRows, HasBlocks)}"
+        f"{described(HasRows, HasRestriction)}"
     )

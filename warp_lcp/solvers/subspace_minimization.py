@@ -16,16 +16,16 @@ from annotated_types import Ge
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.problem.solve import PrecisionName, Step
-from warp_lcp.reduced.active_set_kernels import ON_FREE, projected_move
-from warp_lcp.reduced.principal_system import principal_system
+from warp_lcp.problem.operator_protocol import HasRows, HasSweep, check_taken
+from warp_lcp.problem.solve_loop import PrecisionName, Step
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.psor import SweepWorkspace
+from warp_lcp.subproblems.active_set_kernels import ON_FREE, projected_move
+from warp_lcp.subproblems.principal_system import principal_system
 from warp_lcp.sweeps.sweep import sweep_for
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
@@ -69,7 +69,7 @@ class SubspaceMinimization(Settings):
         cycle: settings of multigrid cycles.
     """
 
-    supports: ClassVar = (Relaxes, HasRows)
+    supports: ClassVar = (HasSweep, HasRows)
     needs: ClassVar[str] = (
         "as for ProjectedSOR; regular principal blocks (dense: least squares otherwise)"
     )
@@ -124,7 +124,7 @@ class SubspaceWorkspace(SweepWorkspace):
         self.free, self._before = layout.zeros(wp.uint8), layout.zeros(wp.float64)
         affine = problem.bounds.affine is not None
         self._old_bounds = [layout.zeros(wp.float64) for _ in range(2)] if affine else []
-        self._sums = Sums(rows_of(self.x), 2)
+        self._sums = RowReduction(rows_of(self.x), 2)
         self._stale, self._target = True, 0.0
 
     def start(

@@ -17,7 +17,13 @@ from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.affine_bounds import AffineSide, affine_side
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
+from warp_lcp.problem.operator_protocol import (
+    HasFloatingComponents,
+    HasRows,
+    HasStencil,
+    HasSweep,
+    has,
+)
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.sweeps.sweep_kernels import CHANGE, row_kernels
@@ -53,7 +59,7 @@ class OperatorSweep(Sweep):
     """
 
     def __init__(
-        self, problem: LCP, A: Relaxes, omega: float, *, colored: bool | None = None
+        self, problem: LCP, A: HasSweep, omega: float, *, colored: bool | None = None
     ) -> None:
         self.problem, self._A, self.omega = problem, A, omega
         self._options: dict[str, bool] = {} if colored is None else {"colored": colored}
@@ -187,7 +193,7 @@ class Diagonal:
                 f"solves the row (the first is row {row}, "
                 f"b = {b[row]}): no sweep can solve them"
             )
-        if has(p.A, NamesComponents):
+        if has(p.A, HasFloatingComponents):
             # A grid's zero diagonals are isolated cells, which the loop settles or calls
             # INFEASIBLE.
             return
@@ -242,10 +248,10 @@ def sweep_for(
         raise ValueError("order 'greedy' updates y by rows of A, which must be symmetric")
     by_rows = None if rows is None else RowSweep(problem, rows, omega, order, permutation)
     if by_rows is not None and (
-        special or problem.bounds.affine is not None or not has(A, Relaxes)
+        special or problem.bounds.affine is not None or not has(A, HasSweep)
     ):
         return by_rows
-    assert has(A, Relaxes)
+    assert has(A, HasSweep)
     check_colors(problem)
     return DiagonalSweep(OperatorSweep(problem, A, omega), by_rows, diagonal)
 

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable
 
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids, matrices
-from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed
+from warp_lcp.benchmarks.extremes.unseen.draw import SeededGenerator, SeededProblem, changed
 
 RESERVED = range(10_000, 20_000)  # seeds reserved for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
 
-Make = Callable[[Draw], Problem]
+Make = Callable[[SeededGenerator], Problem]
 
 
 def _named(kinds: Iterable[Make]) -> dict[str, Make]:
@@ -33,7 +33,7 @@ ALLOWANCE = {"lognormal": 1.5}
 WARM_EVERY = 3  # every third seed is solved again with b changed by 1 %
 
 
-def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
+def problem(kind: str, seed: int, *, small: bool = False) -> SeededProblem:
     """Return the problem of a kind and a seed.
 
     Args:
@@ -46,11 +46,11 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     """
     if kind not in KINDS:
         raise ValueError(f"kind = {kind}: must be one of {', '.join(KINDS)}")
-    problem = KINDS[kind](Draw(kind, seed, small=small))
+    problem = KINDS[kind](SeededGenerator(kind, seed, small=small))
     if not isinstance(problem, GridProblem):
-        return Unseen(problem)
+        return SeededProblem(problem)
     problem = solvable(problem)
-    return Unseen(
+    return SeededProblem(
         problem,
         changed(problem, seed) if seed % WARM_EVERY == 0 and not small else None,
         ALLOWANCE.get(kind, 1.0),

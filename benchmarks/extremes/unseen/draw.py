@@ -22,7 +22,7 @@ LARGER, LONGER = 0.03, {2: 2.0, 3: 1.4}
 
 
 @dataclass(frozen=True)
-class Unseen:
+class SeededProblem:
     """Problem of a kind and a seed, with an optional changed problem."""
 
     problem: Problem  # the problem to solve
@@ -34,7 +34,7 @@ class Unseen:
 ChoiceT = TypeVar("ChoiceT")
 
 
-class Draw:
+class SeededGenerator:
     """Random generator of a kind and a seed, with common choices.
 
     Args:
@@ -121,7 +121,7 @@ def framed(inside: np.ndarray) -> np.ndarray:
 
 def changed(problem: GridProblem, seed: int, share: float = 0.01) -> GridProblem:
     """Return the problem with b changed smoothly by a share of its norm."""
-    draw = Draw("changed", seed)
+    draw = SeededGenerator("changed", seed)
     b = np.broadcast_to(problem.b, problem.cells.shape).astype(np.float64)
     field = draw.smooth(b.shape, 5) * (problem.cells == FLUID)
     exact, largest = problem.exact(), np.linalg.norm(field)

@@ -7,11 +7,11 @@ import scipy.ndimage
 
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of, with_solution
-from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw, framed
+from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, SeededGenerator, framed
 from warp_lcp.files.tables import Tables, TableValue
 
 
-def some_bounds(draw: Draw, shape: tuple[int, ...]) -> Tables:
+def some_bounds(draw: SeededGenerator, shape: tuple[int, ...]) -> Tables:
     """Return x >= 0 everywhere, on some cells, in one layer, or with an upper bound."""
     kind = draw.of("all", "all", "some", "layer", "box")
     if kind == "all":
@@ -25,14 +25,14 @@ def some_bounds(draw: Draw, shape: tuple[int, ...]) -> Tables:
     return {"upper": draw.decades(0.1, 100)}
 
 
-def loaded(draw: Draw, cells: np.ndarray, **more: TableValue) -> GridProblem:
+def loaded(draw: SeededGenerator, cells: np.ndarray, **more: TableValue) -> GridProblem:
     """Return a problem with a random right-hand side and bounds on these cells."""
     return GridProblem(
         cells=cells, b=draw.load(cells.shape), **more, **some_bounds(draw, cells.shape)
     )
 
 
-def strip(draw: Draw) -> GridProblem:
+def strip(draw: SeededGenerator) -> GridProblem:
     """Return a long strip, 1 to 40 cells wide, with AIR at one end or both.
 
     Some strips have an upper bound.
@@ -52,14 +52,14 @@ def strip(draw: Draw) -> GridProblem:
     )
 
 
-def vent(draw: Draw) -> GridProblem:
+def vent(draw: SeededGenerator) -> GridProblem:
     """Return a box of liquid with a few single cells of AIR."""
     cells = np.full(draw.shape(draw.of(2, 2, 3)), FLUID)
     cells.flat[draw.rng.integers(cells.size, size=draw.of(1, 1, 2, 4))] = AIR
     return loaded(draw, cells)
 
 
-def voxels(draw: Draw) -> GridProblem:
+def voxels(draw: SeededGenerator) -> GridProblem:
     """Return random blobs of AIR and SOLID in liquid, in 2-D or 3-D."""
     shape = draw.shape(draw.of(2, 3))
     width = draw.decades(1, 8)
@@ -71,7 +71,7 @@ def voxels(draw: Draw) -> GridProblem:
     return loaded(draw, cells)
 
 
-def liquid(draw: Draw) -> GridProblem:
+def liquid(draw: SeededGenerator) -> GridProblem:
     """Return a body of liquid with a rough surface in a box.
 
     b is the divergence of noise and of a fall; p >= 0 at walls or everywhere.
@@ -94,7 +94,7 @@ def liquid(draw: Draw) -> GridProblem:
     return GridProblem(cells=cells, b=b, lower=lower)
 
 
-def periodic(draw: Draw) -> GridProblem:
+def periodic(draw: SeededGenerator) -> GridProblem:
     """Return a box that is periodic along some axes, held by bounds on 1 or 2 cells."""
     dimensions = draw.of(2, 2, 3)
     shape = draw.shape(dimensions)
@@ -115,7 +115,7 @@ def periodic(draw: Draw) -> GridProblem:
     )
 
 
-def handful(draw: Draw) -> GridProblem:
+def handful(draw: SeededGenerator) -> GridProblem:
     """Return one to sixty cells of any type."""
     dimensions = draw.of(2, 3)
     most = 8 if dimensions == 2 else 5
@@ -126,7 +126,7 @@ def handful(draw: Draw) -> GridProblem:
     return GridProblem(cells=cells, b=draw.noise(shape), shift=shift, **some_bounds(draw, shape))
 
 
-def section(draw: Draw, n: int) -> np.ndarray:
+def section(draw: SeededGenerator, n: int) -> np.ndarray:
     """Return a cross-section of a bar.
 
     It is a square, a rectangle, an ellipse, an L, a triangle or a square with a hole.
@@ -147,7 +147,7 @@ def section(draw: Draw, n: int) -> np.ndarray:
     return np.ones((n, n), dtype=bool)
 
 
-def torsion(draw: Draw) -> GridProblem:
+def torsion(draw: SeededGenerator) -> GridProblem:
     """Return elastic-plastic torsion: |x| at most the distance to the border.
 
     The load is 2 to 30.
@@ -164,7 +164,7 @@ def torsion(draw: Draw) -> GridProblem:
     return GridProblem(cells=cells, b=b, lower=-distance, upper=distance)
 
 
-def rough(draw: Draw) -> GridProblem:
+def rough(draw: SeededGenerator) -> GridProblem:
     """Return noise between two rough obstacles, AIR on one side."""
     shape = draw.shape()
     cells = np.full(shape, FLUID)
@@ -178,7 +178,7 @@ def rough(draw: Draw) -> GridProblem:
     return GridProblem(cells=cells, b=b, lower=low, upper=high + draw.between(0, 1))
 
 
-def dam(draw: Draw) -> GridProblem:
+def dam(draw: SeededGenerator) -> GridProblem:
     """Return seepage through a dam, by Baiocchi's variable.
 
     Width and water levels are random.
@@ -197,7 +197,7 @@ def dam(draw: Draw) -> GridProblem:
     )
 
 
-def bearing(draw: Draw) -> GridProblem:
+def bearing(draw: SeededGenerator) -> GridProblem:
     """Return a journal bearing's film with cavitation: Reynolds' equation.
 
     Coefficients are h^3 around the shaft; the pressure is >= 0.
@@ -218,7 +218,7 @@ def bearing(draw: Draw) -> GridProblem:
     return GridProblem(cells=cells, b=b, faces=faces, periodic=(True, False, False))
 
 
-def rows(draw: Draw) -> GridProblem:
+def rows(draw: SeededGenerator) -> GridProblem:
     """Return rows of all kinds side by side, with random shares.
 
     The kinds are equations, one bound, two bounds and fixed values.
@@ -235,7 +235,7 @@ def rows(draw: Draw) -> GridProblem:
     return GridProblem(cells=cells, b=draw.load(cells.shape), lower=lower, upper=upper)
 
 
-def degenerate(draw: Draw) -> GridProblem:
+def degenerate(draw: SeededGenerator) -> GridProblem:
     """Return b of a chosen degenerate solution.
 
     On a share of the cells x = l and y = 0 together; the solution is smooth or noise.
@@ -254,7 +254,7 @@ def degenerate(draw: Draw) -> GridProblem:
     return with_solution(cells, x, np.where(x == 0, push, 0.0))
 
 
-def lognormal(draw: Draw) -> GridProblem:
+def lognormal(draw: SeededGenerator) -> GridProblem:
     """Return coefficients exp(sigma N), sigma 1 to 3, AIR around.
 
     N is white noise or noise with a correlation length.
@@ -279,7 +279,7 @@ def lognormal(draw: Draw) -> GridProblem:
     )
 
 
-def cut_cells(draw: Draw) -> GridProblem:
+def cut_cells(draw: SeededGenerator) -> GridProblem:
     """Return liquid around a round solid with cut faces, below a ghost-fluid surface.
 
     The coefficients of faces at the surface are 1/theta.
@@ -312,7 +312,7 @@ def cut_cells(draw: Draw) -> GridProblem:
     return loaded(draw, cells, faces={"face_x": face_x, "face_y": face_y})
 
 
-def shifted(draw: Draw) -> GridProblem:
+def shifted(draw: SeededGenerator) -> GridProblem:
     """Return a time step of diffusion: a shift of 10^-5 to 100.
 
     The shift is on all cells or some, with or without AIR.

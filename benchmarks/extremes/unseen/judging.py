@@ -21,11 +21,11 @@ from warp_lcp.benchmarks.extremes.case import (
     HONEST,
     REFUSED,
     SOLVED,
-    Expected,
+    ExpectedOutcome,
     ExtremeAttempt,
     ExtremeCase,
     ExtremeVerdict,
-    Promise,
+    OutcomeKind,
     SolveCase,
     checked,
 )
@@ -33,7 +33,7 @@ from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, equality
 from warp_lcp.benchmarks.harness.record import RecordTable
 from warp_lcp.files.tables import Tables
 from warp_lcp.gradients.names import SolveOptions
-from warp_lcp.problem.protocol import families
+from warp_lcp.problem.operator_protocol import families
 
 FAMILY, METHODS_FAMILY = FAMILIES = ("unseen", "unseen, every method")
 # More iterations than the default, so that the count is known.
@@ -48,7 +48,7 @@ WITHOUT_EQUATIONS = 100  # iterations where the equations have no solution: the 
 WARM_MORE = 1
 # Statuses that no method may return for a solvable small problem.
 NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")
-GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
+GAVE_UP = ExpectedOutcome(OutcomeKind.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
 GRIDS_A_KIND, MATRICES_A_KIND = 18, 10
 
 Solve = Callable[..., wl.SolveResult]
@@ -67,7 +67,7 @@ def solved(
 
 
 @dataclass(frozen=True)
-class Drawn(ExtremeCase):
+class RandomProblem(ExtremeCase):
     """Random problem, reproducible from its kind and seed."""
 
     kind: str  # kind of the problem
@@ -77,7 +77,7 @@ class Drawn(ExtremeCase):
     solve: Solve = wl.solve  # replaces `wl.solve` in tests of the checks
 
 
-class UnseenCase(Drawn):
+class UnseenCase(RandomProblem):
     """Random problem for the default method."""
 
     def __init__(self, kind: str, seed: int, solve: Solve = wl.solve) -> None:
@@ -153,7 +153,7 @@ def limit(equations: int | None, of: tuple[float, int], allowance: float) -> flo
     )
 
 
-class EveryMethodCase(Drawn):
+class EveryMethodCase(RandomProblem):
     """Small random problem for every applicable method.
 
     No method may report convergence for a wrong answer, or fail otherwise.
@@ -165,7 +165,7 @@ class EveryMethodCase(Drawn):
             f"{kind} {seed} small",
             kind,
             seed,
-            expected=Promise(Expected.DONE),
+            expected=ExpectedOutcome(OutcomeKind.DONE),
             budget=180.0,
         )
 
@@ -220,7 +220,7 @@ def by_method(
 
 def cases(
     first: int, grids: int = GRIDS_A_KIND, matrices: int = MATRICES_A_KIND
-) -> Iterator[Drawn]:
+) -> Iterator[RandomProblem]:
     """Yield problems of all kinds, with seeds from `first` on.
 
     The first of each kind also goes to every method, in a small size.
@@ -236,7 +236,7 @@ def summary(verdicts: Sequence[ExtremeVerdict], first: int) -> tuple[RecordTable
     """Return a row for each kind, and the faults of all cases together."""
     cases = [v for v in verdicts if v.case.family == FAMILY]
     rows = [
-        _row(kind, [v for v in cases if isinstance(v.case, Drawn) and v.case.kind == kind])
+        _row(kind, [v for v in cases if isinstance(v.case, RandomProblem) and v.case.kind == kind])
         for kind in unseen.KINDS
     ]
     counted = [v.attempt for v in cases if v.attempt.facts.get("equality") is not None]

@@ -13,14 +13,14 @@ import scipy.spatial
 
 from warp_lcp.benchmarks.extremes.problem import MatrixProblem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids
-from warp_lcp.benchmarks.extremes.unseen.draw import Draw
+from warp_lcp.benchmarks.extremes.unseen.draw import SeededGenerator
 from warp_lcp.host_problem import Matrix
 
 GRIDS = (grids.torsion, grids.dam, grids.voxels, grids.shifted)
 SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # zero, and the range of tiny diagonals
 
 
-def grid_matrix(draw: Draw) -> MatrixProblem:
+def grid_matrix(draw: SeededGenerator) -> MatrixProblem:
     """Return one of several grids as a sparse matrix."""
     return MatrixProblem.of(solvable(draw.of(*GRIDS)(draw)).exact())
 
@@ -56,7 +56,7 @@ def stiffness(poisson: float) -> np.ndarray:
     return K
 
 
-def elastic(draw: Draw) -> MatrixProblem:
+def elastic(draw: SeededGenerator) -> MatrixProblem:
     """Return an elastic block pressed on a foundation.
 
     It consists of bilinear squares, held at its top and pressed down there by a given displacement,
@@ -89,7 +89,7 @@ def elastic(draw: Draw) -> MatrixProblem:
     return MatrixProblem(matrix=A[free][:, free].tocsr(), b=b[free], lower=lower[free])
 
 
-def triangles(draw: Draw) -> MatrixProblem:
+def triangles(draw: SeededGenerator) -> MatrixProblem:
     """Return a membrane over an obstacle on an irregular mesh of linear triangles.
 
     K_ij = e_i . e_j / (4 area) with the edges e_i opposite to the corners. The load is lumped: a
@@ -118,7 +118,7 @@ def triangles(draw: Draw) -> MatrixProblem:
     )
 
 
-def option(draw: Draw) -> MatrixProblem:
+def option(draw: SeededGenerator) -> MatrixProblem:
     """Return an implicit step of an American put, tridiagonal and unsymmetric.
 
     It is Euler's implicit step dt of V_t = sigma^2 s^2 / 2 V_ss + rate s V_s - rate V, t the time
@@ -143,7 +143,7 @@ def option(draw: Draw) -> MatrixProblem:
     return MatrixProblem(matrix=A.tocsr(), b=b, lower=payoff)
 
 
-def held(draw: Draw, matrix: Matrix) -> MatrixProblem:
+def held(draw: SeededGenerator, matrix: Matrix) -> MatrixProblem:
     """Return the problem of a matrix with a chosen solution.
 
     Entries have x > 0 and y = 0, or the other way round.
@@ -155,18 +155,18 @@ def held(draw: Draw, matrix: Matrix) -> MatrixProblem:
     return MatrixProblem(matrix=matrix, b=y - matrix @ x)
 
 
-def as_kind(draw: Draw, matrix: np.ndarray) -> Matrix:
+def as_kind(draw: SeededGenerator, matrix: np.ndarray) -> Matrix:
     """Return the matrix as dense or sparse."""
     return matrix if draw.chance(0.5) else scipy.sparse.csr_array(matrix)
 
 
-def small_diagonal(draw: Draw) -> float:
+def small_diagonal(draw: SeededGenerator) -> float:
     """Return 0 or a tiny number."""
     none, low, high = SMALLEST_DIAGONALS
     return none if draw.chance(0.2) else draw.decades(low, high)
 
 
-def linear_program(draw: Draw) -> MatrixProblem:
+def linear_program(draw: SeededGenerator) -> MatrixProblem:
     """Return the optimality conditions of min c'x, A x >= b, x >= 0.
 
     The diagonal is tiny.
@@ -180,14 +180,14 @@ def linear_program(draw: Draw) -> MatrixProblem:
     return held(draw, as_kind(draw, M))
 
 
-def skew(draw: Draw) -> MatrixProblem:
+def skew(draw: SeededGenerator) -> MatrixProblem:
     """Return a skew matrix with a small diagonal."""
     n = draw.whole(2, 120)
     C = draw.noise((n, n)) * (draw.rng.random((n, n)) < draw.between(0.2, 1))
     return held(draw, as_kind(draw, (C - C.T) / np.sqrt(n) + small_diagonal(draw) * np.eye(n)))
 
 
-def least_squares(draw: Draw) -> MatrixProblem:
+def least_squares(draw: SeededGenerator) -> MatrixProblem:
     """Return nonnegative least squares: B'B of full or deficient rank.
 
     Columns have any length.

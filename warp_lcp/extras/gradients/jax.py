@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Unpack
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve as solve_problem
 from warp_lcp.gradients.names import (
     Coefficients,
     MakesOperator,
@@ -21,8 +20,9 @@ from warp_lcp.gradients.names import (
     operator_of,
 )
 from warp_lcp.gradients.vjp import vjp
+from warp_lcp.method_selection import solve as solve_problem
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.operator_protocol import Operator
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Unpack
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve as solve_problem
 from warp_lcp.gradients.names import (
     Coefficients,
     MakesOperator,
@@ -23,8 +22,9 @@ from warp_lcp.gradients.names import (
 )
 from warp_lcp.gradients.vjp import vjp
 from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.method_selection import solve as solve_problem
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.operator_protocol import Operator
 from warp_lcp.problem.stopping import StoppingCriteria
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def _solution() -> type[torch.autograd.Function]:
     """Return the autograd function, created at the first call."""
     import torch
 
-    class Solution(torch.autograd.Function):
+    class SolveFunction(torch.autograd.Function):
         @staticmethod
         def forward(
             ctx: FunctionCtx, how: How, b: torch.Tensor, *others: torch.Tensor | float
@@ -117,7 +117,7 @@ def _solution() -> type[torch.autograd.Function]:
                 for t, kind in zip(tensors, ctx.kinds, strict=True)
             )
 
-    return Solution
+    return SolveFunction
 
 
 def _shared(tensor: torch.Tensor) -> DeviceArray | float:

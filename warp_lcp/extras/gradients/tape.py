@@ -7,13 +7,13 @@ from typing import Unpack
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import solve as solve_problem
 from warp_lcp.gradients.names import Coefficients, MakesOperator, SolveOptions, flat, operator_of
 from warp_lcp.gradients.vjp import vjp
 from warp_lcp.kernels.fields import Array
 from warp_lcp.kernels.vectors import ADD, convert, rows_of
+from warp_lcp.method_selection import solve as solve_problem
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.operator_protocol import Operator
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
 

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 
 from warp_lcp.extras.newton.shapes import rotation_of
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody
 from warp_lcp.rigid.mass_properties import MassProperties

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.grid.solids import (
+from warp_lcp.grid.signed_distance import (
     Box,
     Capsule,
     Geometry,
@@ -69,7 +69,7 @@ def geometries(model: newton.Model, origin: np.ndarray) -> dict[int, list[Geomet
     return geometries_of
 
 
-def united(shapes: list[Geometry]) -> Geometry:
+def union_of(shapes: list[Geometry]) -> Geometry:
     """Return all shapes of a body as one shape."""
     return shapes[0] if len(shapes) == 1 else Union(parts=tuple(shapes))
 

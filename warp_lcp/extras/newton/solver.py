@@ -13,7 +13,7 @@ from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledProxy
 
 from warp_lcp.extras.newton.bodies import WorldBodies
-from warp_lcp.extras.newton.shapes import geometries, reaches_into, united
+from warp_lcp.extras.newton.shapes import geometries, reaches_into, union_of
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 from warp_lcp.fluids.scene import COUPLED_METHODS
 from warp_lcp.grid.voxelize import PlacedSolid
@@ -273,7 +273,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
         chosen = sorted(shapes) if self._chosen is None else [int(body) for body in self._chosen]
         if missing := [body for body in chosen if body not in shapes]:
             raise ValueError(f"bodies: {missing} have no shapes that collide with shapes")
-        united_shapes = {body: united(shapes[body]) for body in chosen}
+        united_shapes = {body: union_of(shapes[body]) for body in chosen}
         placed, separating = placed_solids(scene, Path()), scene.domain.wall == "separating"
         placed += [
             PlacedSolid(geometry=shape, separating=separating, name=f"shape {n} of the world")

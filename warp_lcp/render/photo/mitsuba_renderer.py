@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_lcp.files.tables import Tables
-from warp_lcp.render.photo.photo_scene import Finish, PhotoMesh, PhotoScene
+from warp_lcp.render.photo.photo_scene import PhotoMesh, PhotoScene, SurfaceFinish
 from warp_lcp.render.recording import RenderError
 from warp_lcp.scene.camera import Viewpoint
 
@@ -216,7 +216,7 @@ def scene_plugins(mitsuba: ModuleType, scene: PhotoScene, size: tuple[int, int])
     transform = mitsuba.ScalarTransform4f
     reach = GROUND_REACH * float(scene.size.max())
     middle = 0.5 * scene.size
-    absorbing = any(mesh.finish is Finish.LIQUID for mesh in scene.meshes)
+    absorbing = any(mesh.finish is SurfaceFinish.LIQUID for mesh in scene.meshes)
     path = {"type": "volpath" if absorbing else "path", "max_depth": DEPTH, "rr_depth": ROULETTE}
     lying = (
         transform()
@@ -269,7 +269,7 @@ def mesh_plugin(mitsuba: ModuleType, mesh: PhotoMesh) -> mitsuba.Mesh:
     properties = mitsuba.Properties()
     colored = mesh.color.ndim == 2
     properties["surface"] = mitsuba.load_dict(surface_plugin(mesh, colored))
-    if mesh.finish is Finish.LIQUID:
+    if mesh.finish is SurfaceFinish.LIQUID:
         # Colors of plugins are at most 1, `scale` is unlimited.
         most = max(float(mesh.color.max()), 1e-9)
         color = {"type": "rgb", "value": (mesh.color / most).tolist()}
@@ -300,14 +300,14 @@ def mesh_plugin(mitsuba: ModuleType, mesh: PhotoMesh) -> mitsuba.Mesh:
 
 def surface_plugin(mesh: PhotoMesh, colored: bool) -> Tables:
     """Return the scattering model of a surface."""
-    if mesh.finish is Finish.LIQUID:
+    if mesh.finish is SurfaceFinish.LIQUID:
         return {"type": "dielectric", "int_ior": WATER_INDEX, "ext_ior": 1.0}
     color = (
         {"type": "mesh_attribute", "name": "vertex_color"}
         if colored
         else {"type": "rgb", "value": np.asarray(mesh.color).tolist()}
     )
-    if mesh.finish is Finish.SATIN:
+    if mesh.finish is SurfaceFinish.SATIN:
         return {
             "type": "twosided",
             "inner": {

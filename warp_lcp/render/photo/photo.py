@@ -28,7 +28,7 @@ from warp_lcp.render.photo.mitsuba_renderer import (
 )
 from warp_lcp.render.photo.photo_scene import PhotoScenes
 from warp_lcp.render.photo.view_transform import agx
-from warp_lcp.render.recording import Recording, RenderError, Show
+from warp_lcp.render.recording import Recording, RenderError, VisiblePart
 
 EXPOSURE = 1.55  # factor on radiance, before AgX
 CONTRAST, SATURATION = 1.6, 1.35  # applied after AgX's sigmoid
@@ -62,7 +62,7 @@ class PhotoSettings:
     size: tuple[int, int] = (1280, 720)
     samples: int = SAMPLES
     shutter: float = SHUTTER
-    show: Show | None = None
+    show: VisiblePart | None = None
     overrides: Sequence[str] = ()
 
     def __post_init__(self) -> None:
@@ -108,7 +108,7 @@ def photograph_run(
     recording = Recording(folder, None, settings.show, settings.overrides)
     numbers, out = recording.chosen(frames), out or folder / "photo"
     scenes = PhotoScenes(
-        recording, settings.size[0] / settings.size[1], beads=settings.show is Show.PARTICLES
+        recording, settings.size[0] / settings.size[1], beads=settings.show is VisiblePart.PARTICLES
     )
     files = {number: out / f"photo_{number:06d}.png" for number in numbers}
     wanted = {number: picture_settings(scenes, number, settings) for number in numbers}
@@ -117,7 +117,7 @@ def photograph_run(
     _report(noted, held, wanted, missing)
     if missing:
         variant = choose_variant()
-        liquid = recording.scene.palette == "water" and recording.show is not Show.BODIES
+        liquid = recording.scene.palette == "water" and recording.show is not VisiblePart.BODIES
         estimated(len(missing) * expected_seconds(settings, variant, liquid=liquid))
     on_progress(0, len(numbers))
     for done, number in enumerate(numbers, 1):
@@ -128,7 +128,7 @@ def photograph_run(
                 settings.shutter / recording.scene.time.frames_per_second,
             )
             radiance = render_radiance(scenes.frame(number), quality, number, variant)
-            _save(developed(radiance), wanted[number], files[number], folder)
+            _save(tone_mapped(radiance), wanted[number], files[number], folder)
         on_progress(done, len(numbers))
         yield files[number]
 
@@ -234,7 +234,7 @@ def core_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def developed(radiance: np.ndarray) -> np.ndarray:
+def tone_mapped(radiance: np.ndarray) -> np.ndarray:
     """Return 8-bit pixels of scene-linear radiance."""
     return (
         255.0 * agx(EXPOSURE * radiance, contrast=CONTRAST, saturation=SATURATION) + 0.5

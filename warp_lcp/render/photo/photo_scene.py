@@ -28,7 +28,7 @@ from warp_lcp.render.photo.meshes import (
     grain_poses,
     smooth_normals,
 )
-from warp_lcp.render.recording import Recording, RenderError, Show, spread
+from warp_lcp.render.recording import Recording, RenderError, VisiblePart, spread
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.camera import VIEW_ANGLE, Viewpoint, view_of_points, viewpoint
@@ -53,7 +53,7 @@ PALE = np.array([0.82, 0.80, 0.76])  # reflectance of every other wedge of balls
 WEDGES = 6
 
 
-class Finish(StrEnum):
+class SurfaceFinish(StrEnum):
     """Surface finish: reflection and transmission of light."""
 
     LIQUID = "liquid"  # smooth dielectric, index of refraction 1.33, absorbing inside
@@ -79,7 +79,7 @@ class PhotoMesh:
     name: str
     points: np.ndarray
     corners: np.ndarray
-    finish: Finish
+    finish: SurfaceFinish
     color: np.ndarray
     normals: np.ndarray | None = None
     velocity: np.ndarray | None = None
@@ -129,7 +129,7 @@ class PhotoScenes:
         particles = scene.particles if isinstance(scene, ParticleScene) else None
         self._wrapped = scene.palette == "water" and particles is not None and not beads
         banded = particles is not None and particles.narrow_band is not None
-        if self._wrapped and recording.show is Show.PARTICLES and banded:
+        if self._wrapped and recording.show is VisiblePart.PARTICLES and banded:
             raise RenderError(
                 "--look photo: a run with a narrow band of particles needs output.surface = true; "
                 "--show particles draws beads"
@@ -159,10 +159,10 @@ class PhotoScenes:
             meshes += body_meshes(
                 bodies, [body_surface(geometry, 3).points for geometry in self._bodies]
             )
-        if self.recording.show in (Show.SURFACE, Show.BOTH):
+        if self.recording.show in (VisiblePart.SURFACE, VisiblePart.BOTH):
             meshes += self._material(self.recording.surface(number), self._distance(time, bodies))
         elif (
-            self.recording.show is Show.PARTICLES
+            self.recording.show is VisiblePart.PARTICLES
             and self._wrapped
             and isinstance(self._scene, ParticleScene)
         ):
@@ -170,7 +170,7 @@ class PhotoScenes:
                 particle_surface(self._scene, self.recording.particles(number)),
                 self._distance(time, bodies),
             )
-        elif self.recording.show is Show.PARTICLES:
+        elif self.recording.show is VisiblePart.PARTICLES:
             meshes += self._grains(number)
         return PhotoScene(meshes, self.view, 0.0, np.array(self._scene.domain.size))
 
@@ -185,7 +185,7 @@ class PhotoScenes:
                     "sand",
                     surface.points,
                     surface.corners,
-                    Finish.MATTE,
+                    SurfaceFinish.MATTE,
                     SANDS[0],
                     normals,
                     surface.fields.get("velocity"),
@@ -200,7 +200,7 @@ class PhotoScenes:
                 "liquid",
                 points,
                 corners,
-                Finish.LIQUID,
+                SurfaceFinish.LIQUID,
                 absorption,
                 normals,
                 velocity if velocity.any() else None,
@@ -224,7 +224,7 @@ class PhotoScenes:
             grain_colors(seeds)[own] if self._scene.palette == "sand" else liquid_beads(self._scene)
         )
         normals = smooth_normals(points, corners).astype(np.float32) if fine else None
-        return [PhotoMesh("grains", points, corners, Finish.MATTE, color, normals, moved)]
+        return [PhotoMesh("grains", points, corners, SurfaceFinish.MATTE, color, normals, moved)]
 
     def _solid_meshes(self, time: float) -> list[PhotoMesh]:
         """Return the prescribed solids, cut at the domain; containers are invisible."""
@@ -246,7 +246,7 @@ class PhotoScenes:
                 points, corners = outline.points, outline.corners
             points, corners, normals = creased(points, corners)
             meshes.append(
-                PhotoMesh(f"solid_{number}", points, corners, Finish.MATTE, SOLID, normals)
+                PhotoMesh(f"solid_{number}", points, corners, SurfaceFinish.MATTE, SOLID, normals)
             )
         return meshes
 
@@ -307,9 +307,9 @@ def framed(recording: Recording, aspect: float) -> Viewpoint:
     low, high = scene.seen
     groups = []
     for number in spread(recording.numbers, FRAMING_FRAMES):
-        if recording.show is Show.PARTICLES:
+        if recording.show is VisiblePart.PARTICLES:
             groups.append(recording.particles(number).points)
-        elif recording.show is not Show.BODIES:
+        elif recording.show is not VisiblePart.BODIES:
             groups.append(recording.surface(number).points)
         if (bodies := recording.bodies(number)) is not None:
             groups.append(bodies.points)
@@ -361,7 +361,7 @@ def body_meshes(bodies: Surface, at_first: Sequence[np.ndarray]) -> list[PhotoMe
             None if velocity is None else np.asarray(velocity)[point_indices][local].reshape(-1, 3)
         )
         meshes.append(
-            PhotoMesh(f"body_{body}", points, triangles, Finish.SATIN, color, normals, moved)
+            PhotoMesh(f"body_{body}", points, triangles, SurfaceFinish.SATIN, color, normals, moved)
         )
     return meshes
 
