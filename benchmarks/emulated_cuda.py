@@ -154,6 +154,8 @@ def emulate_kernels():
     )
     wp.config.enable_cpu_blocks = True
     # A cache folder of its own, since Warp does not hash templates.
+    # Kernels run once or twice on small grids: compiling them well takes longer than it saves.
+    wp.config.optimization_level = 0
     wp.config.kernel_cache_dir = str(Path(__file__).parents[1] / "build" / "emulated-cuda")
 
 

@@ -30,7 +30,7 @@ def curvature_kernel(
     limit: float,
     bend: F32,
 ):
-    """Compute the curvature again near thin solids, see `surface_tension.h`.
+    """Compute the curvature again near thin solids, see `headers/pressure.h`.
 
     Cells beyond a thin solid are replaced by cells on the near side.
     """

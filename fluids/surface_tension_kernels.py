@@ -26,7 +26,7 @@ BAND = 0.02  # fractions nearer to 0 or 1 than this are too far from the surface
 HALF = 0.3  # range of the fraction on either side of 1/2 within which the area is integrated
 FARTHEST = 1.5  # largest distance of a cell beside the surface from the smooth surface [cells]
 KERNELS = KernelFile(
-    Path(__file__).parent / "headers/surface_tension.h",
+    Path(__file__).parent / "headers/pressure.h",
     CONSTANTS | {"BAND": BAND, "FARTHEST": FARTHEST, "THETA_MIN": THETA_MIN, "HALF": HALF},
 )
 CURVATURE = KERNELS["fluids.surface_tension.curvature"]

@@ -124,7 +124,7 @@ def test_what_is_often_looked_for_is_where_the_page_says(what, file, names):
 TERMS = {
     "halo exchange": ["warp_lcp/distributed/halo.py", "warp_lcp/grid/grid_part.py"],
     "CFL": ["warp_lcp/run/stepping.py", "warp_lcp/material/particle_simulation.py"],
-    "natural residual": ["warp_lcp/problem/residual.py", "warp_lcp/problem/headers/residual.h"],
+    "natural residual": ["warp_lcp/problem/residual.py", "warp_lcp/problem/headers/problem.h"],
     "truncated": ["warp_lcp/subproblems/multigrid_workspace.py"],
     "friction cone": ["granular/headers/sand.h", "granular/stress_layout.py"],
     "P2G": ["warp_lcp/grid/transfer.py", "warp_lcp/material/particle_simulation.py"],

@@ -246,7 +246,7 @@ FORMULAS = [
         ("vn = v[i] - length * dx", "vn = v[i] + length * dx"),
     ),
     *_changes(
-        "subproblems/headers/active_set.h",
+        "subproblems/headers/reduced_systems.h",
         ACTIVE,
         ("low = v<l", "low = v <= l"),
         ("high = v> u", "high = v >= u"),

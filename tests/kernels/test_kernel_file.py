@@ -259,6 +259,8 @@ def test_every_kernel_and_snippet_is_taken():
     headers = [path for path in HEADER_FILES if path.parent != HEADERS] + [
         HEADERS / "vectors.h",
         HEADERS / "snippets.h",
+        HEADERS / "row_functions.h",
+        HEADERS / "piece.h",
     ]
     words = {
         word
@@ -274,10 +276,10 @@ def test_every_kernel_and_snippet_is_taken():
 
 
 def test_headers_are_of_areas():
-    names = [path.name for path in HEADER_FILES if path.parent != HEADERS]
+    names = [path.name for path in HEADER_FILES]
     assert len(names) == len(set(names)) <= 50
     for path in HEADER_FILES:
-        assert 10 <= len(path.read_text().splitlines()) < 700, path
+        assert 10 <= len(path.read_text().splitlines()) < 600, path
 
 
 def test_python_declares_no_roles():

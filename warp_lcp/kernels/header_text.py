@@ -123,6 +123,6 @@ def _included(path: Path, number: int, line: str) -> str | None:
 
 
 @functools.cache
-def shared(name: str) -> str:
-    """Return a header of this package."""
-    return text(HEADERS / name)
+def shared(name: str, section: str = "") -> str:
+    """Return a header of this package, or a section of it."""
+    return text(HEADERS / name, section)

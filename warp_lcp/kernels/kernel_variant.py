@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, SupportsIndex, TypeAlias
 import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.header_text import HEADERS, shared, text
+from warp_lcp.kernels.header_text import shared, text
 from warp_lcp.kernels.layout import (
     ANYWHERE,
     Alignment,
@@ -301,18 +301,20 @@ class KernelVariant:
         sums = [
             "#define EACH_FOUND(DO) "
             f"{' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}",
-            text(HEADERS / "sums.h"),
+            shared("piece.h", "sums"),
         ]
         sums += ["#undef EACH_FOUND"]
         common = [
-            shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used
+            shared("row_functions.h", section)
+            for section, used in (("stencil", d.stencil), ("bounds", d.bounds))
+            if used
         ]
         before = [
             shared("native.h"),
             '#line 1 "types"',
             *head,
-            shared("piece.h"),
-            shared("tasks.h"),
+            shared("piece.h", "piece"),
+            shared("piece.h", "tasks"),
             '#line 1 "fields"',
             POINTERS,
             *each,
@@ -343,12 +345,14 @@ class KernelVariant:
         d = self.declared
         found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
         sums = (
-            [f"#define EACH_FOUND(DO) {found}", text(HEADERS / "sums.h"), "#undef EACH_FOUND"]
+            [f"#define EACH_FOUND(DO) {found}", shared("piece.h", "sums"), "#undef EACH_FOUND"]
             if d.found
             else []
         )
         common = [
-            shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used
+            shared("row_functions.h", section)
+            for section, used in (("stencil", d.stencil), ("bounds", d.bounds))
+            if used
         ]
         function = [*common, text(d.header, d.declared), '#line 1 "sums"', *sums]
         head = [*head, f"constexpr bool FINER = {str(d.finer).lower()};"]

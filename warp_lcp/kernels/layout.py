@@ -274,7 +274,7 @@ class Pattern:
         )
 
     def source(self) -> list[str]:
-        """Return C++ for `stencil.h`: weight functions and a macro that visits them.
+        """Return C++ for `row_functions.h`: weight functions and a macro that visits them.
 
         There is one function of the piece's cell for each weight.
         """

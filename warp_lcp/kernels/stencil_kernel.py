@@ -98,9 +98,9 @@ class StencilKernel:
         name: of the kernel, with the area before it: `projected_multigrid.assess`.
         header: C++ row function, or the header of an area in which it is `declared`.
         compute: type that T stands for.
-        stencil: types of the diagonal and the weights of `stencil.h`, if it has one. `affine` there
+        stencil: types of the diagonal and the weights of `row_functions.h`, if it has one. `affine`
             is A x + b: of the stencil, or precomputed.
-        bounds: whether it has those of `bounds.h`.
+        bounds: whether it has those of `row_functions.h`.
         reads: fields, pointers to the piece's first cell.
         writes: likewise, written.
         ring: those of the fields that keep three planes only; the pointer is to its plane there,

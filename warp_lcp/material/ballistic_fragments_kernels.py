@@ -44,7 +44,7 @@ class FragmentFields:
 
 
 KERNELS = KernelFile(
-    Path(__file__).parent / "headers/flight.h",
+    Path(__file__).parent / "headers/particle_models.h",
     {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
 )
 UNITE = KERNELS["warp_lcp.material.ballistic_fragments.unite"]

@@ -38,7 +38,7 @@ CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} |
 }
 
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/density_correction.h", CONSTANTS)
+KERNELS = KernelFile(Path(__file__).parent / "headers/particle_models.h", CONSTANTS)
 PREPARE = KERNELS["warp_lcp.material.density_correction.prepare_correction"]
 EVEN = KERNELS["warp_lcp.material.density_correction.even"]
 CROWD = KERNELS["warp_lcp.material.crowding.crowd"]

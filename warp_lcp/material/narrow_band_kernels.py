@@ -18,7 +18,7 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _RELEASED = wp.constant(wp.uint8(RELEASED))
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/narrow_band.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/particle_models.h")
 RELAX = KERNELS["warp_lcp.material.narrow_band.relax_depth"]
 
 

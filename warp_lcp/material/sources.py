@@ -129,7 +129,7 @@ class Sources:
             *(np.zeros(0, dtype=np.int32) for _ in range(3)),
             np.zeros((0, 3), dtype=np.float32),
         )
-        self._span = HostArray(14, wp.float64, device)  # see `sources.h`
+        self._span = HostArray(14, wp.float64, device)  # see `particle_models.h`
         self._lattice, self._memory = ListMemory(device), zeros(0, wp.int32, device)
         self._points, self._found = (
             dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device)),

@@ -23,7 +23,9 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _BYTES = wp.array(dtype=wp.uint8)
 
-ENTER = KernelFile(Path(__file__).parent / "headers/sources.h")["warp_lcp.material.sources.enter"]
+ENTER = KernelFile(Path(__file__).parent / "headers/particle_models.h")[
+    "warp_lcp.material.sources.enter"
+]
 
 
 @wp.func

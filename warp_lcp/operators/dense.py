@@ -25,7 +25,7 @@ from warp_lcp.problem.operator_protocol import Derivatives
 from warp_lcp.problem.pickling import HostPickling, Reduced, rebuilt_from
 from warp_lcp.problem.residual_scaling import scale_of_matrix
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/matrices.h")
 PRODUCT = KERNELS["dense.product"]
 RELAX = KERNELS["dense.relax"]
 # Relative to the largest entries of two rows: asymmetry from rounding of J M^-1 J' and of assembly

@@ -60,7 +60,7 @@ class ColumnEntries:
     width: int
 
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/matrices.h")
 GATHER = KERNELS["low_rank.gather"]
 SCATTER = KERNELS["low_rank.scatter"]
 DIAGONAL = KERNELS["low_rank.diagonal"]

@@ -58,7 +58,7 @@ def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: 
         color[i] = c
 
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/sparse.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/matrices.h")
 PRODUCT = KERNELS["sparse.product"]
 RELAX = KERNELS["sparse.relax"]
 SURVEY = KERNELS["sparse.survey"]

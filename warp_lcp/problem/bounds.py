@@ -32,7 +32,7 @@ INFINITY = 1e20
 # than the launch.
 LAUNCHED = 4096
 BITS = (1, 2)  # bits of a code: the lower bound is finite, the upper one is
-KERNELS = KernelFile(Path(__file__).parent / "headers/bound_codes.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/problem.h")
 ENCODE = KERNELS["bounds.encode"]
 CODE_ROWS = KERNELS["bounds.code_rows"]
 DECODE = KERNELS["bounds.decode"]

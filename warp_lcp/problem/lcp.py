@@ -39,7 +39,7 @@ from warp_lcp.problem.operator_protocol import (
 from warp_lcp.problem.pickling import HostArrayPickle, HostPickling, Reduced
 from warp_lcp.problem.preconditioner import Preconditioner
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/problem.h")
 CHECK = KERNELS["problem.check"]
 # Largest number of elements of CPU fields that NumPy checks in less time than a launch: 45 of 75
 # us.

@@ -25,7 +25,7 @@ from warp_lcp.problem.operator_protocol import HasRows, HasScale, HasStencil, ha
 from warp_lcp.problem.residual_scaling import estimated_scale
 
 EPS = float(np.finfo(np.float64).eps)
-KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/problem.h")
 NATURAL = KERNELS["residual.natural"]
 UNKNOWN_SQUARE = KERNELS["residual.unknown_square"]
 WITHIN = KERNELS["residual.within"]

@@ -3,13 +3,13 @@
 The bounds are affine in the normal impulses.
 
 The problem is solved by the method of `warp_lcp.solvers.nncg` on B = J J' + diag(e), in a separate
-loop (`headers/contact_nncg.h`) with the same formula of beta (`snippets.h`). It differs in three
-ways: rows are products with J at bodies, so that a sweep costs the entries of J, not those of B;
-contacts are swept in their order, not by colors; and an island of bodies is solved by one thread in
-one launch, which evaluates the residual every 8 sweeps. `wl.NNCG` on the assembled B takes 390, 510
-and 890 us an iteration with 20, 200 and 1,000 contacts, this loop 2.6, 26 and 110 us. The number of
-sweeps is about the ratio of masses in contact, times the square of a stack's height; harder
-problems are solved by sparse systems in `contact_newton`.
+loop (`headers/contact_impulses.h`) with the same formula of beta (`snippets.h`). It differs in
+three ways: rows are products with J at bodies, so that a sweep costs the entries of J, not those of
+B; contacts are swept in their order, not by colors; and an island of bodies is solved by one thread
+in one launch, which evaluates the residual every 8 sweeps. `wl.NNCG` on the assembled B takes 390,
+510 and 890 us an iteration with 20, 200 and 1,000 contacts, this loop 2.6, 26 and 110 us. The
+number of sweeps is about the ratio of masses in contact, times the square of a stack's height;
+harder problems are solved by sparse systems in `contact_newton`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # unique. Bodies at rest creep by 1e-7 m/s at most.
 YIELDS = 1e-6
 MANY = 20_000  # sweeps, if no other method converges
-KERNELS = KernelFile(Path(__file__).parent / "headers/contact_nncg.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/contact_impulses.h")
 NNCG = KERNELS["warp_lcp.rigid.contacts.nncg"]
 
 

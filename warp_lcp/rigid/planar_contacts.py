@@ -63,7 +63,7 @@ RATE = 0.3  # fraction of a larger overlap that a step removes
 # Criteria for overlaps, which take several steps anyway.
 ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)
 PUSH = HostKernel(
-    KernelFile(Path(__file__).parent / "headers/planar_impulses.h")[
+    KernelFile(Path(__file__).parent / "headers/contact_impulses.h")[
         "warp_lcp.rigid.planar_impulses.push"
     ],
     YIELDS=YIELDS,

@@ -8,7 +8,7 @@ from warp_lcp.kernels import KernelFile, Rows
 from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.kernels.types import DeviceArray
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/reduced_systems.h")
 CLASSIFY = KERNELS["active_set.classify"]
 ALL_FREE = KERNELS["active_set.all_free"]
 ON_FREE = KERNELS["active_set.on_free"]
@@ -34,7 +34,7 @@ def projected_move(
     """Set `to` = clip(x + length along, l, u) where the direction is not 0.
 
     With `z`, the direction z + beta along first replaces `along`. `kept` receives x. If `guarded`,
-    an x whose step is not finite stays unchanged. See `active_set.h`.
+    an x whose step is not finite stays unchanged. See `reduced_systems.h`.
     """
     STEP.bind(
         rows,

@@ -34,7 +34,7 @@ from warp_lcp.subproblems.dense_problem import (
     without_contact,
 )
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/reduced_systems.h")
 UNITS = KERNELS["equilibrated.units"]
 ALIKE = 4.0  # rows whose units differ by at most this factor are not scaled
 # Steps without a residual below FALL times the smallest after which a proof of infeasibility is

@@ -24,7 +24,7 @@ ITERATIONS = wp.constant(STEP_SLOTS + 3)
 SLOTS = STEP_SLOTS + 5
 
 KERNELS = KernelFile(
-    Path(__file__).parent / "headers/fused_conjugate_gradient.h",
+    Path(__file__).parent / "headers/reduced_systems.h",
     {"BETA": BETA, "STEP": STEP, "ITERATIONS": ITERATIONS},
 )
 DIRECT = KERNELS["grid_conjugate_gradient.direct"]

@@ -133,7 +133,7 @@ def calm_kernel(
             calm[0] = 0
 
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/low_rank_correction.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/reduced_systems.h")
 SQUARES = KERNELS["low_rank_correction.squares"]
 BY_TURNS = KERNELS["low_rank_correction.squares_by_turns"]
 DOTS = KERNELS["low_rank_correction.dots"]

@@ -9,7 +9,7 @@
 //   box        float64 fastest
 //   numbers    int count, parts; float64 span
 EXACT_MATH
-#include "algebra.h:algebra"
+#include "snippets.h:algebra"
 const double *turns = reals, *shifts = turns + 9 * count * (parts + 1),
              *boxes = shifts + 3 * count * (parts + 1);
 const double* size = boxes + 6 * count;
@@ -92,7 +92,7 @@ for (int n = first; n < last; ++n) {
 //   box        float64 near
 //   numbers    int count, shapes, corners; bool flat
 EXACT_MATH
-#include "algebra.h:algebra"
+#include "snippets.h:algebra"
 const double *turns = reals, *shifts = turns + 9 * count, *rotations = shifts + 3 * count,
              *translations = rotations + 9 * shapes;
 const double *scales = translations + 3 * shapes, *origins = scales + shapes,

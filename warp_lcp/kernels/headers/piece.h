@@ -1,4 +1,7 @@
-// Piece: consecutive cells of a row along x. Only this header computes the addresses of cells.
+// What surrounds a row function: the piece of a row, the loop over tasks, partial sums.
+
+// snippet piece: Consecutive cells of a row along x. Only this header computes the addresses of
+// cells.
 struct Piece {
     long long p;  // index of the first cell's element
     int n;  // number of cells
@@ -77,3 +80,53 @@ const auto piece = [&](int k, int j, int c, const Ring& ring) -> Piece {
     P.more = k % L.slab > 0;
     return P;
 };
+
+// snippet sums: Add the sums of a piece to those of the thread's piece in the plane below. On CUDA,
+// where a thread has a piece in each plane of a slab, they stay in registers until its last plane.
+// Integers are summed as integers there, since float64 is slow.
+double* sums_ = given.out.data + P.t;
+const auto joined_ = [](int s, auto a, auto b) { return s < SUMS ? a + b : b > a ? b : a; };
+#ifdef __CUDA_ARCH__
+#ifndef QUADS
+const bool last_ = (k_i + 1) % L.slab == 0 || k_i + 1 == L.planes;
+#endif
+const auto keep_ = [&](int s, auto v) {
+    if constexpr ((decltype(v))0.5 == 0) {
+        whole_[s] = P.more ? joined_(s, v, (decltype(v))whole_[s]) : v;
+        if (last_) sums_[s * places_] = (double)whole_[s];
+    } else {
+        total_[s] = P.more ? joined_(s, (double)v, total_[s]) : (double)v;
+        if (last_) sums_[s * places_] = total_[s];
+    }
+};
+#define KEEP_(S, NAME) keep_(S, NAME);
+EACH_FOUND(KEEP_)
+#undef KEEP_
+#else
+#define VALUE_(S, NAME) (double)NAME,
+const double all_[] = {EACH_FOUND(VALUE_)};
+#undef VALUE_
+for (int s = 0; s < FOUND; ++s, sums_ += places_)
+    *sums_ = P.more ? joined_(s, all_[s], *sums_) : all_[s];
+#endif
+
+// snippet tasks: Loop over tasks from (i_, j_, c_) on. A task is a chunk of a row in each plane of
+// a slab. On CUDA a thread has one task; on the CPU it has as many as a thread of the pool takes at
+// once. The body follows and ends with three braces.
+const int per_plane_ = L.rows * L.chunks;
+int i_ = slab_, at_ = row_ * L.chunks + chunk_;
+#ifdef __CUDA_ARCH__
+double total_[FOUND ? FOUND : 1];
+int whole_[FOUND ? FOUND : 1];
+#endif
+for (int left_ = count_, here_; left_ > 0; left_ -= here_, ++i_, at_ = 0) {
+    here_ = left_ < per_plane_ - at_ ? left_ : per_plane_ - at_;
+    for (int k_i = i_ * L.slab; k_i < (i_ + 1) * L.slab && k_i < L.planes; ++k_i) {
+        Ring ring_;
+        if constexpr (RINGS) ring_ = ring_of(k_i);
+        int j_i = at_ / L.chunks, c_ = at_ - j_i * L.chunks;
+        for (int m_i = 0; m_i < here_; ++m_i, ++c_) {
+            if (c_ == L.chunks) {
+                c_ = 0;
+                ++j_i;
+            }

@@ -1,4 +1,4 @@
-// Snippets for kernels of several areas.
+// Snippets for kernels of several areas. `algebra` is for loops on the host.
 
 // snippet bytes: Macros for loops that compile quickly. MASKED64, where MASKED_BYTES is 1: a loop
 // over bytes whose remainder after the last whole vector is masked, where the processor has masks.
@@ -48,3 +48,26 @@ auto grid_coordinate = [=](T x, int before = 0) -> T {
 // 0: p is reset ([Book] algorithm 8).
 const double ratio = old > 0.0 ? fresh / old : 0.0, beta = ratio > 1.0 ? 0.0 : ratio,
              keep = ratio > 1.0 ? 0.0 : 1.0;
+
+// snippet algebra: Products of vectors and 3 x 3 matrices. Sums are taken in the order of NumPy and
+// OpenBLAS, so that results equal those of array code to the last bit. `along`: the order of a
+// matrix product, a dot product and A'x. `across`: the order of A x. Adding 0 turns -0 into 0.
+const auto along = [&](const double* a, int s, const double* b, int t) {
+    return fused(a[2 * s], b[2 * t], fused(a[s], b[t], a[0] * b[0])) + 0.0;
+};
+const auto across = [&](const double* a, const double* b) {
+    return fused(a[2], b[2], fused(a[0], b[0], a[1] * b[1])) + 0.0;
+};
+const auto apply = [&](const double* A, const double* x, double* y) {
+    for (int i = 0; i < 3; ++i) y[i] = across(A + 3 * i, x);
+};
+const auto apply_transposed = [&](const double* A, const double* x, double* y) {
+    for (int i = 0; i < 3; ++i) y[i] = along(A + i, 3, x, 1);
+};
+const auto product = [&](const double* A, const double* B, double* C) {
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) C[3 * i + j] = along(A + 3 * i, 1, B + j, 3);
+};
+const auto length = [&](const double* a) {
+    return sqrt((a[0] * a[0] + a[1] * a[1]) + a[2] * a[2]);
+};

@@ -78,7 +78,7 @@ const auto advance = [&](double* values, double mass, const double* inverse, dou
 //   numbers    int count
 //   constants  MOST_ROUNDS = 60
 EXACT_MATH
-#include "algebra.h:algebra"
+#include "snippets.h:algebra"
 #include "spins"
 #include "turns"
 const double *mass = reals + 26 * count, *inverse = mass + count, *dt = inverse + 9 * count;
@@ -93,7 +93,7 @@ for (int t = first; t < last; ++t) advance(reals + 26 * t, mass[t], inverse + 9 
 //   numbers    int count, times
 //   constants  MOST_ROUNDS = 60
 EXACT_MATH
-#include "algebra.h:algebra"
+#include "snippets.h:algebra"
 #include "spins"
 #include "turns"
 const double *mass = reals + 26 * count, *inverse = mass + count, *centers = inverse + 9 * count,

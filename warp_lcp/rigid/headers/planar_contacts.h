@@ -287,7 +287,7 @@ const auto spread = [&](const Touch& touch, double size, int* chosen) {
 //              ON_SURFACE, PARALLEL, FACE_FIRST, LOWER, MUCH_LOWER, LEVEL, SAME, OTHER_SIDE;
 //              int FLAT, MORE, MOST_OF_PAIR
 EXACT_MATH
-#include "algebra.h:algebra"
+#include "snippets.h:algebra"
 #include "motion.h:spins"
 #include "distances"
 #include "points"
