@@ -129,10 +129,10 @@ def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) 
     return traces
 
 
-WITHOUT: dict[str, Traces] = {}
+WITHOUT: dict[str, SimulationTraces] = {}
 
 
-def traces_without(case: Case, patch: pytest.MonkeyPatch) -> Traces:
+def traces_without(case: OnOffModel, patch: pytest.MonkeyPatch) -> SimulationTraces:
     """Return the traces of a case's scene without its model; cases share the scene."""
     key = f"{case.sand} {case.off}"
     if key not in WITHOUT:
