@@ -3,7 +3,6 @@
 import ast
 import inspect
 import re
-from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -475,15 +474,3 @@ def test_older_names_of_functions_do_not_come_back():
 
 def test_older_names_of_modules_do_not_come_back():
     assert [name for name in OLDER_MODULES if (ROOT / name).exists()] == []
-
-
-def test_a_class_name_is_defined_once_with_those_of_tests():
-    defined = Counter(
-        node.name
-        for folder in ("warp_lcp", "fluids", "granular", "benchmarks", "tests", "docs")
-        for file in (ROOT / folder).rglob("*.py")
-        if not any(part.is_symlink() for part in (file, *file.parents))
-        for node in ast.walk(parsed(file))
-        if isinstance(node, ast.ClassDef)
-    )
-    assert [name for name, count in defined.items() if count > 1] == []
