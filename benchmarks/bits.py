@@ -66,7 +66,7 @@ SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse
 SEED = 0  # added to the seeds of all problems
 
 
-Made = wl.GridPoisson | wl.SparseOperator | wl.DenseOperator
+MatrixOperator = wl.GridPoisson | wl.SparseOperator | wl.DenseOperator
 Side = float | np.ndarray  # a bound
 BitsSolve = tuple[str, wl.LCP, Solver, np.ndarray | None]  # name, problem, method, start
 
@@ -202,7 +202,7 @@ def method_solves() -> Iterator[BitsSolve]:
                     yield f"{what} {kind} {number} warm", wl.LCP(make(), b, *sides), made, start
 
 
-def _operators() -> Iterator[tuple[str, Callable[[], Made], tuple[int, ...]]]:
+def _operators() -> Iterator[tuple[str, Callable[[], MatrixOperator], tuple[int, ...]]]:
     rng = generator(1618)
     factor = rng.standard_normal((40, 40))
     matrix = factor @ factor.T + 4 * np.eye(40)

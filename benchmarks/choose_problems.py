@@ -188,8 +188,8 @@ def equations(rng: np.random.Generator, seed: int) -> Problem:
     )
 
 
-Make = Callable[[np.random.Generator, int], Problem | wl.LCP]
-FAMILIES: dict[str, Make] = {
+ProblemFamily = Callable[[np.random.Generator, int], Problem | wl.LCP]
+FAMILIES: dict[str, ProblemFamily] = {
     "tiny": lambda r, s: gallery.definite(
         int(r.integers(1, 5)), condition=10.0, plant=plant(r), seed=s
     ),
@@ -364,7 +364,7 @@ def membrane(rng: np.random.Generator) -> wl.LCP:
     return wl.LCP(A, b, 0.0, float(rng.uniform(0.05, 0.3)) if rng.random() < 0.5 else np.inf)
 
 
-KINDS: dict[str, Make] = {  # problems of many fields; all have solutions
+KINDS: dict[str, ProblemFamily] = {  # problems of many fields; all have solutions
     "pressure": lambda r, s: liquid(r, 32),
     "membrane": lambda r, s: membrane(r),
     "low rank": lambda r, s: low_rank(r, 0.0),
@@ -462,7 +462,7 @@ def large_game(rng: np.random.Generator) -> wl.LCP:
 
 
 # For rules that no kind above meets; problems of sign errors may have no solution.
-RARE: dict[str, Make] = {
+RARE: dict[str, ProblemFamily] = {
     "sign error": lambda r, s: sign_error(r, 10, 500),
     "large sign error": lambda r, s: sign_error(r, 1001, 3000),
     "negative diagonal": lambda r, s: negative_diagonal(r, s, boxed=False),

@@ -79,13 +79,13 @@ class PublishedCount:
 
 
 # A norm of x and y, fields of the problem's shape.
-Small = Callable[[np.ndarray, np.ndarray], float]
+ErrorNorm = Callable[[np.ndarray, np.ndarray], float]
 
 
 def steps_until(
     problem: wl.LCP,
     method: Solver,
-    norm: Small,
+    norm: ErrorNorm,
     tolerance: float,
     *,
     relative: bool = True,

@@ -40,7 +40,7 @@ from warp_lcp.material.particle_assembly import (
 )
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
-from warp_lcp.material.velocity_extrapolation import Join, extend_velocity
+from warp_lcp.material.velocity_extrapolation import LayerCallback, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.solve_loop import Solver, Workspace
 from warp_lcp.rigid.bodies import RigidBodies
@@ -527,7 +527,7 @@ class SandSimulation(ParticleSimulation):
         known: list[wp.array],
         kind: wp.array,
         contact: wp.array,
-        join: Join | None,
+        join: LayerCallback | None,
     ) -> None:
         """Extrapolate the velocity beside walls according to the stresses' contact."""
         s = self.solids

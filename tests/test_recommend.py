@@ -380,7 +380,7 @@ def test_a_recommendation_prints_the_chain_its_reasons_and_what_comes_else():
     first, *rest = str(advice).splitlines()
     assert (
         first == "minimum-map-newton, then interior-point (stalls), then proximal-point "
-        "(PathCreeps(steps=10))"
+        "(CentralPathStalls(steps=10))"
     )
     assert first == str(advice.chain)
     assert rest[: len(advice.reasons)] == list(advice.reasons)

@@ -194,13 +194,15 @@ def test_a_method_may_want_steps_from_a_start_within_the_tolerance() -> None:
 def test_methods_and_problems_that_do_not_go_together() -> None:
     problem = ContactInequality(2, 5)
     with pytest.raises(
-        ValueError, match="ProjectedSOR takes problems of the class LCP: this is a Contacts"
+        ValueError,
+        match="ProjectedSOR takes problems of the class LCP: this is a ContactInequality",
     ):
         wl.solve(problem, wl.ProjectedSOR())
-    with pytest.raises(ValueError, match="a Contacts needs one of its own methods"):
+    with pytest.raises(ValueError, match="a ContactInequality needs one of its own methods"):
         wl.solve(problem)
     with pytest.raises(
-        ValueError, match="ProjectedGradient takes problems of the class Contacts: this is a LCP"
+        ValueError,
+        match="ProjectedGradient takes problems of the class ContactInequality: this is a LCP",
     ):
         wl.solve(wl.LCP(np.eye(3), np.ones(3)), ProjectedGradient())
 

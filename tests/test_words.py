@@ -47,6 +47,203 @@ REPLACED = {
 }
 
 
+# Older names of classes, without a leading underscore, each with the one that replaces it.
+OLDER_CLASSES = {
+    "Beginning": "SolveStart",
+    "Begun": "_StepStart",
+    "Block": "StridedBox",
+    "Boxes": "_BoundsCache",
+    "Column": "ParticleArray",
+    "Complaint": "CrossKeyError",
+    "Crossings": "SelfIntersections",
+    "Cube": "DualCell",
+    "Descent": "EnergyMonitor",
+    "Drag": "WallDragFields",
+    "Dress": "MeshConversion",
+    "Extent": "LaunchDimensions",
+    "FieldsOnHost": "DataclassPickling",
+    "Finish": "SurfaceFinish",
+    "Flight": "FragmentFields",
+    "FoundContacts": "DetectedContacts",
+    "GathersFields": "FieldGather",
+    "Ghosts": "GhostExchange",
+    "HasType": "HasDataType",
+    "Holds": "FormatSupport",
+    "Identified": "KeyedArgument",
+    "Joined": "HasPieces",
+    "KeepsWorkspace": "HasWorkspaceCache",
+    "Kept": "WorkspaceCache",
+    "Look": "MaterialSnapshot",
+    "Looks": "ImageStyle",
+    "Marks": "FaceMarks",
+    "Masks": "HasPrincipalSystem",
+    "Measured": "HasTables",
+    "MethodOfChoice": "RegistryContactMethod",
+    "Moved": "CompletedStep",
+    "Moving": "MovingSolids",
+    "Multiplies": "SupportsMatmul",
+    "NamesComponents": "HasFloatingComponents",
+    "Nearest": "NearestSolids",
+    "Numbered": "CellNumbering",
+    "OfAnyShape": "ShapeUnion",
+    "OneProcess": "SerialCommunicator",
+    "OnHost": "HostArrayPickle",
+    "OptionalMembers": "WorkspaceDefaults",
+    "Parts": "GridComponents",
+    "PathCreeps": "CentralPathStalls",
+    "PatientMethod": "EnergyDescentMethod",
+    "Pickled": "HostPickling",
+    "Place": "UncheckedPose",
+    "Placed": "RigidTransform",
+    "PlaceOrder": "SummationOrder",
+    "Places": "IncidenceFields",
+    "Planned": "_PlannedSolve",
+    "Plant": "PlantedSolution",
+    "Profiled": "HasStages",
+    "Recorded": "HasRecordedProblems",
+    "Refill": "GhostLayerExchange",
+    "Relaxes": "HasSweep",
+    "RenderLook": "ImageRenderer",
+    "Replicates": "HasReplica",
+    "Resampled": "HasResampling",
+    "Scheduled": "HasEvents",
+    "Show": "VisiblePart",
+    "Sites": "JitteredLattice",
+    "Spare": "ReusableWorkspace",
+    "SpareChain": "CachedChain",
+    "StartsAfter": "HasInitAfter",
+    "StoresRounded": "HasStorageRounding",
+    "Substitute": "FallbackSystem",
+    "Sums": "RowReduction",
+    "Tally": "DynamicReduction",
+    "TimeIsUp": "DeadlineReached",
+    "Traits": "ProblemProperties",
+    "Transposes": "HasTranspose",
+    "TreesAtCuts": "FragmentMerger",
+    "Turns": "_RotationCurve",
+    "Versioned": "HasVersion",
+    "Waiting": "_StretchQueue",
+    "WallPull": "ViscousWallCoupling",
+    "WindowTally": "WindowReduction",
+}
+# Older names of functions and methods.
+OLDER_FUNCTIONS = {
+    "adding": "sum_operation",
+    "appended": "register_append",
+    "_assessing": "_evaluate_kernel",
+    "begin_ahead": "begin_on_device",
+    "_begin_ahead": "_begin_on_device",
+    "begins_ahead": "begins_on_gpu",
+    "_begins_ahead": "_begins_on_gpu",
+    "_building": "_build_program",
+    "coarsening": "coarsen_kernel",
+    "_coarsening": "_coarsen_program",
+    "collecting": "collect_task",
+    "correcting": "correct_kernel",
+    "creeps": "needs_cycle",
+    "_creeps": "_needs_cycle",
+    "dealt": "device_by_number",
+    "developed": "tone_mapped",
+    "device_begins": "begins_on_device",
+    "exchanging": "exchange_operation",
+    "exchanging_all": "exchange_all_operation",
+    "factoring": "factor_kernels",
+    "fetched": "fetch",
+    "filling": "fill_task",
+    "_filling": "_fill_operation",
+    "_gathering": "_gather_kernel",
+    "gathering": "field_gather",
+    "handing_down": "restrict_to_coarse_kernel",
+    "_has_run_ahead": "_take_device_step",
+    "is_ahead": "has_device_steps",
+    "is_made_ahead": "is_made_on_gpu",
+    "led": "root_only",
+    "looked_on": "show_while_running",
+    "measuring": "measure_kernel",
+    "multiplying": "product_kernel",
+    "nudged": "perturb_diagonal",
+    "of_one": "for_one_process",
+    "rebuilding": "rebuild_program",
+    "removing": "register_removal",
+    "renewing": "clear_kernel",
+    "restricting": "restrict_kernel",
+    "seen_by": "cells_with_ghosts",
+    "signing": "mark_changes_kernel",
+    "smoothing": "smooth_kernels",
+    "standing": "device_state",
+    "sweeping": "sweep_kernel",
+    "swing": "momentum_limit",
+    "too_far": "displacement_beyond_ghosts",
+    "transferring": "transfer_kernels",
+    "_updating": "_update_kernel",
+}
+OLDER_MODULES = {
+    "granular/solids.py": "wall_friction.py",
+    "warp_lcp/default.py": "method_selection.py",
+    "warp_lcp/distributed/solids.py": "subdomain_boundary.py",
+    "warp_lcp/grid/part.py": "grid_part.py",
+    "warp_lcp/grid/solids.py": "signed_distance.py",
+    "warp_lcp/kernels/memory.py": "recorded_arguments.py",
+    "warp_lcp/problem/protocol.py": "operator_protocol.py",
+    "warp_lcp/problem/solve.py": "solve_loop.py",
+    "warp_lcp/problem/spare_workspace.py": "workspace_cache.py",
+    "warp_lcp/reduced/__init__.py": "subproblems/__init__.py",
+}
+# Words that tell nothing as the name of a class, alone or as its last word.
+EMPTY_WORDS = {
+    "Away",
+    "Beginning",
+    "Blurred",
+    "Drawn",
+    "Doubled",
+    "Found",
+    "Given",
+    "Gone",
+    "Growing",
+    "Heard",
+    "Held",
+    "Joined",
+    "Kept",
+    "Least",
+    "Look",
+    "Looks",
+    "Made",
+    "Marked",
+    "Misses",
+    "Moved",
+    "Moves",
+    "Moving",
+    "Own",
+    "Other",
+    "Others",
+    "Parts",
+    "Place",
+    "Placed",
+    "Places",
+    "Plain",
+    "Planned",
+    "Plants",
+    "Recorded",
+    "Refuses",
+    "Said",
+    "Shared",
+    "Show",
+    "Shown",
+    "Small",
+    "Spare",
+    "Taken",
+    "Timed",
+    "Told",
+    "Touching",
+    "Watched",
+}
+# Verbs in the third person; a capability is named `Has` with its noun.
+VERBS = re.compile(
+    r"(Applies|Converts|Gathers|Holds|Keeps|Makes|Masks|Multiplies|Names|Relaxes|Replicates|Starts"
+    r"|Stores|Takes)(?=[A-Z]|$)"
+)
+
+
 # What no message, help text or description of a key says, besides those.
 NOT_IN_MESSAGES = {
     **REPLACED,
@@ -232,3 +429,48 @@ def test_the_glossary_names_code_that_exists(term, file, name):
         for target in (getattr(node, "targets", None) or [None])
     }
     assert not name or name in defined, term
+
+
+def definitions(kind: type[ast.ClassDef] | type[ast.FunctionDef], *folders: str) -> dict[str, str]:
+    """Return the place of each class or function, nested ones included, by its name."""
+    return {
+        node.name: f"{file.relative_to(ROOT)}:{node.lineno}"
+        for folder in folders
+        for file in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(parsed(file))
+        if isinstance(node, kind)
+    }
+
+
+def is_term(name: str) -> bool:
+    """Return whether a class name is no participle, adjective, verb or empty word."""
+    bare = name.lstrip("_")
+    words = re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z][a-z]+|[A-Z]+", bare)
+    return (
+        bare not in OLDER_CLASSES
+        and not VERBS.match(bare)
+        and not (words and words[-1] in EMPTY_WORDS)
+    )
+
+
+def test_class_names_are_terms():
+    places = definitions(
+        ast.ClassDef, "warp_lcp", "fluids", "granular", "benchmarks", "tests", "docs"
+    )
+    assert len(places) > 900
+    assert {name: place for name, place in places.items() if not is_term(name)} == {}
+    assert not any(map(is_term, ("Kept", "_Planned", "StoresRounded", "ReplacedTaken", "Told")))
+    assert all(map(is_term, ("WorkspaceCache", "HasSweep", "GMRES", "StepFailed")))
+
+
+def test_older_names_of_functions_do_not_come_back():
+    places = definitions(ast.FunctionDef, "warp_lcp", "fluids", "granular")
+    found = {
+        f"{name} ({places[name]})": OLDER_FUNCTIONS[name]
+        for name in OLDER_FUNCTIONS.keys() & places.keys()
+    }
+    assert not found, f"write instead: {found}"
+
+
+def test_older_names_of_modules_do_not_come_back():
+    assert [name for name in OLDER_MODULES if (ROOT / name).exists()] == []

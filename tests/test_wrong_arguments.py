@@ -332,8 +332,8 @@ def test_operators_that_lack_members():
 
     with pytest.raises(
         ValueError,
-        match=r"A is a Half without device, apply_transpose, diagonal: an operator needs them; a "
-        r"subclass of",
+        match=r"A is a IncompleteOperator without device, apply_transpose, diagonal: "
+        r"an operator needs them; a subclass of",
     ):
         wl.LCP(IncompleteOperator(), B)
 

@@ -36,8 +36,10 @@ ENDED = (
 )
 
 Criteria = StoppingCriteria | MeanCriteria
-Watch = Callable[[Record], None]
-Run = Callable[[RestatedProblem, Solver, Criteria | None, Array | None, Watch | None], SolveResult]
+RecordCallback = Callable[[Record], None]
+Run = Callable[
+    [RestatedProblem, Solver, Criteria | None, Array | None, RecordCallback | None], SolveResult
+]
 
 
 def default_method(problem: LCP) -> Solver:
@@ -148,7 +150,7 @@ def solve_restated(
     method: Solver,
     stopping: Criteria | None,
     x0: Array | None,
-    callback: Watch | None,
+    callback: RecordCallback | None,
 ) -> SolveResult:
     """Solve a problem in another form; return the result in the original form."""
     found = solve_by(
@@ -161,7 +163,7 @@ def solve_by_attempts(
     problem: LCP,
     stopping: Criteria | None,
     x0: Array | None,
-    callback: Watch | None,
+    callback: RecordCallback | None,
     *,
     fallback: bool = True,
     run: Run = solve_restated,
@@ -288,10 +290,10 @@ def _planned(
 
 
 def _recorded(
-    solve: Callable[[Watch | None], SolveResult],
+    solve: Callable[[RecordCallback | None], SolveResult],
     name: str,
     results: list[SolveResult],
-    callback: Watch | None,
+    callback: RecordCallback | None,
     start_time: float,
 ) -> SolveResult:
     """Solve, with the steps and seconds of earlier results added to the records."""

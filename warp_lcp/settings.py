@@ -62,8 +62,8 @@ Relaxation = Annotated[float, Gt(0), Lt(2)]
 Annotation: TypeAlias = object  # a type, or a form of `typing`
 Kind = TypeVar("Kind")
 Owner = TypeVar("Owner")
-Found = TypeVar("Found")
-Given = ParamSpec("Given")
+ReturnT = TypeVar("ReturnT")
+ParametersT = ParamSpec("ParametersT")
 KINDS = {
     int: "an integer",
     float: "a finite number",
@@ -183,8 +183,8 @@ def renamed_names(module: str, **names: str) -> Callable[[str], object]:
 
 
 def renamed_method(
-    old: str, method: Callable[Concatenate[Owner, Given], Found]
-) -> Callable[Concatenate[Owner, Given], Found]:
+    old: str, method: Callable[Concatenate[Owner, ParametersT], ReturnT]
+) -> Callable[Concatenate[Owner, ParametersT], ReturnT]:
     """Return a method that calls one by its new name, with a DeprecationWarning.
 
     Args:
@@ -194,13 +194,13 @@ def renamed_method(
     new = method.__name__
 
     @wraps(method)
-    def call(self: Owner, *args: Given.args, **keywords: Given.kwargs) -> Found:
+    def call(self: Owner, *args: ParametersT.args, **keywords: ParametersT.kwargs) -> ReturnT:
         warnings.warn(
             f"{type(self).__name__}.{old} is now {type(self).__name__}.{new}",
             DeprecationWarning,
             stacklevel=2,
         )
-        found: Found = getattr(self, new)(*args, **keywords)
+        found: ReturnT = getattr(self, new)(*args, **keywords)
         return found
 
     return call

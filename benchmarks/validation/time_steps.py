@@ -41,7 +41,7 @@ MOMENTS = np.array([0.04, 0.08, 0.12, 0.16, 0.2])
 MOST = 1e-3  # share of the total energy that a step may add
 CHANGE = 5e-3  # share of the total energy that the last halving may change
 Simulation = SandSimulation | LiquidSimulation
-Watched = Callable[..., None]  # of a simulation
+SimulationChange = Callable[..., None]  # of a simulation
 
 
 @check_at("time steps", "{what}, {cells} cells")
@@ -79,7 +79,7 @@ def collapse(
     cells: int,
     dt: float,
     *,
-    change: Watched | None = None,
+    change: SimulationChange | None = None,
     moments: np.ndarray = MOMENTS,
 ) -> tuple[np.ndarray, float]:
     """Simulate a column that collapses from rest.
@@ -157,7 +157,7 @@ def _push_liquid_apart(simulation: LiquidSimulation) -> None:
     projection.prepare = pushed  # type: ignore[assignment, method-assign]
 
 
-PUSHED_APART: dict[str, Watched] = {
+PUSHED_APART: dict[str, SimulationChange] = {
     "sand": _push_sand_apart,
     "liquid, unilateral": _push_liquid_apart,
 }

@@ -149,4 +149,4 @@ def test_memory_and_messages_of_a_liquid_on_a_rank_are_counted(mpi):
     assert 8 < found["Ranks.gather: times a step"] <= 12
     # Particles that migrate, and ghosts of a density correction.
     assert found["MpiMailbox.swap: times a step"] <= 2
-    assert not {name for name in found if re.match(r"(Halo|Gathering)\.", name)}
+    assert not {name for name in found if re.match(r"(Halo|GridGather)\.", name)}

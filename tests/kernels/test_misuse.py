@@ -92,12 +92,14 @@ def test_a_kernel_takes_the_members_of_structs_that_it_declares(double):
     np.testing.assert_array_equal(z.numpy(), 4 * np.arange(10))
     double.bind(rows, SingleField(z), x=x).launch()
     np.testing.assert_array_equal(z.numpy(), y.numpy())
-    with pytest.raises(TypeError, match=r"misuse\.double: missing \['x'\] in Target, unknown \[\]"):
+    with pytest.raises(
+        TypeError, match=r"misuse\.double: missing \['x'\] in SingleField, unknown \[\]"
+    ):
         double.bind(rows, SingleField(z))
     with pytest.raises(TypeError, match=r"misuse\.double: missing \[\], unknown \['other'\]"):
         double.bind(rows, ManyFields(x, y), other=0)
     with pytest.raises(
-        TypeError, match=r"misuse\.double: Fields, Target: two of them have \['y'\]"
+        TypeError, match=r"misuse\.double: ManyFields, SingleField: two of them have \['y'\]"
     ):
         double.bind(rows, ManyFields(x, y), SingleField(z))
     with pytest.raises(TypeError, match=r"misuse\.double: dict is not a dataclass"):

@@ -95,7 +95,7 @@ def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
         assert not takes(cls, operator)
         with pytest.raises(
             ValueError,
-            match=f"^{cls.__name__} needs an operator with .*; Least has none: use "
+            match=f"^{cls.__name__} needs an operator with .*; MinimalOperator has none: use "
             "MinimumMapNewton",
         ):
             wl.solve(problem, cls())

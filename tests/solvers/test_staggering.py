@@ -114,7 +114,9 @@ def test_problems_that_cannot_be_split_are_refused():
             return wp.full(3, 1.0, dtype=wp.float64, device="cpu")
 
     with pytest.raises(
-        ValueError, match=r"Staggering needs an operator with rows .* or blocks .*; Ring has none"
+        ValueError,
+        match=r"Staggering needs an operator with rows .* or blocks .*; "
+        r"OperatorWithoutBlocks has none",
     ):
         Staggering().init(wl.LCP(OperatorWithoutBlocks(), -np.ones(3)))
     for settings in ({"blocks": 0}, {"eta": 1.0}, {"max_block_iterations": 0}):

@@ -34,14 +34,14 @@ COPIES = 5  # copies of the text in memory: the shortest number has 2 bytes, and
 NUMBER = 8  # bytes
 HEAD = 1 << 16  # bytes that are searched for a header before the whole file is read
 Matrix = scipy.sparse.csr_array | np.ndarray  # of a file, float64
-Fits = Callable[[int, int], bool]  # whether a matrix of these sizes is allowed
+ShapeTest = Callable[[int, int], bool]  # whether a matrix of these sizes is allowed
 
 
 class MarketError(ValueError):
     """Error of the file format; the message does not include the file's name."""
 
 
-def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
+def read_shape(path: Path, fits: ShapeTest, expected: str) -> tuple[int, int]:
     """Return rows and columns from the header of a matrix.
 
     Args:
@@ -67,7 +67,7 @@ def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
     return rows, columns
 
 
-def read_market(path: Path, fits: Fits, expected: str) -> Matrix:
+def read_market(path: Path, fits: ShapeTest, expected: str) -> Matrix:
     """Read a matrix: scipy.sparse (CSR) or numpy, as in the file, float64.
 
     Args:
@@ -92,7 +92,9 @@ def read_market(path: Path, fits: Fits, expected: str) -> Matrix:
     return _sparse(body, rows, columns, more[0], symmetry, pattern=field == b"pattern")
 
 
-def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[int, int, list[int]]:
+def _size(
+    header: re.Match[bytes] | None, fits: ShapeTest, expected: str
+) -> tuple[int, int, list[int]]:
     """Check a header; return rows, columns and the number of entries.
 
     The last one only for sparse matrices.

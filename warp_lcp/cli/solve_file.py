@@ -12,7 +12,7 @@ import scipy.io
 import scipy.sparse
 from rich.table import Table
 
-from warp_lcp.cli.matrix_market import Fits, MarketError, Matrix, read_market, read_shape
+from warp_lcp.cli.matrix_market import MarketError, Matrix, ShapeTest, read_market, read_shape
 from warp_lcp.files.atomic import replacing
 from warp_lcp.method_selection import solve
 from warp_lcp.operators import DenseOperator, SparseOperator
@@ -27,7 +27,7 @@ from warp_lcp.settings import SettingError
 from warp_lcp.solvers.registry import METHODS
 
 MOST_ROWS = 40  # rows of the table of iterations: a longer history shows its first and last ones
-SQUARE: tuple[Fits, str] = (lambda rows, columns: rows == columns > 0, "A must be square")
+SQUARE: tuple[ShapeTest, str] = (lambda rows, columns: rows == columns > 0, "A must be square")
 FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"
 
 
@@ -216,7 +216,7 @@ def write_vector(path: Path, x: np.ndarray) -> None:
         raise ProblemError(f"--out {path}: {error.strerror}") from error
 
 
-def _vector_of(n: int) -> tuple[Fits, str]:
+def _vector_of(n: int) -> tuple[ShapeTest, str]:
     """Return the test for shapes of a vector, and their description."""
     return (
         lambda rows, columns: (rows, columns) in ((n, 1), (1, n)),
@@ -224,7 +224,7 @@ def _vector_of(n: int) -> tuple[Fits, str]:
     )
 
 
-def _checked(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
+def _checked(path: Path, fits: ShapeTest, expected: str) -> tuple[int, int]:
     """Return the shape in a file's header after a check."""
     with _file_named_in_errors(path):
         return read_shape(path, fits, expected)
@@ -245,7 +245,7 @@ def _file_named_in_errors(path: Path) -> Iterator[None]:
         raise ProblemError(f"{path}: {error}") from error
 
 
-def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> Matrix:
+def _read(path: Path, fits: ShapeTest, expected: str, *, infinite: bool = False) -> Matrix:
     """Return the matrix in a file of an allowed shape, with finite real numbers.
 
     Or also infinite ones, if `infinite` is set.

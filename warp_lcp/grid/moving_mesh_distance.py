@@ -26,8 +26,8 @@ from warp_lcp.grid.node_distance_kernels import (
 )
 from warp_lcp.grid.signed_distance import Geometry, TriangleMesh
 from warp_lcp.grid.signed_distance_kernels import (
-    Block,
     ShapeFrame,
+    StridedBox,
     block_of,
     node_position,
     to_mesh,
@@ -39,7 +39,7 @@ from warp_lcp.kernels.host_array import HostArray
 MODULE = "warp_lcp.grid.moving_mesh_distance"
 _FAR, _ROUNDING, _HOLLOW = wp.constant(FAR), wp.constant(ROUNDING), wp.constant(wp.int8(HOLLOW))
 Blocks, Frames, Distances = (
-    wp.array(dtype=Block),
+    wp.array(dtype=StridedBox),
     wp.array(dtype=ShapeFrame),
     wp.array(dtype=wp.float32),
 )
@@ -115,7 +115,7 @@ def mark_flat_cells(
     i,
     planes: int,
     near: F32,
-    block: Block,
+    block: StridedBox,
     shapes: wp.array(dtype=PlacedShape),
     begin: bool,
     marks: I8,
@@ -137,7 +137,7 @@ def mark_flat_cells_of_mesh(
     i,
     planes: int,
     near: F32,
-    block: Block,
+    block: StridedBox,
     frames: Frames,
     mesh: wp.uint64,
     begin: bool,
@@ -168,7 +168,7 @@ class MovingMesh:
     ) -> None:
         self.grid, self.places, self._number, self._geometry = grid, list(places), number, geometry
         self._block, self._frame = (
-            HostArray(1, Block, grid.device),
+            HostArray(1, StridedBox, grid.device),
             HostArray(1, ShapeFrame, grid.device),
         )
         size = math.prod(-(-n // COARSE) for n in grid.shape)
@@ -209,7 +209,7 @@ class MovingMesh:
         self._window.launch(enter_mesh, [*inputs, snap, self._number, nodes.struct])
 
     def mark(
-        self, window: Window, near: wp.array, block: Block, marks: wp.array, *, begin: bool
+        self, window: Window, near: wp.array, block: StridedBox, marks: wp.array, *, begin: bool
     ) -> None:
         """Unmark flat cells that the mesh covers, see `FlatCells`."""
         inputs = [self.grid.planes, near, block, self._frame.array, self._mesh, begin, marks]

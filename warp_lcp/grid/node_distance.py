@@ -20,7 +20,7 @@ from warp_lcp.grid import node_distance_kernels as kernels
 from warp_lcp.grid.motion import UNLIMITED
 from warp_lcp.grid.node_distance_kernels import COARSE, FAR, NearestSolids
 from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
-from warp_lcp.grid.signed_distance_kernels import Block, block_of, item_points
+from warp_lcp.grid.signed_distance_kernels import StridedBox, block_of, item_points
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.host_array import HostArray
@@ -403,7 +403,7 @@ class NodeSampler:
         *,
         stride: int = 1,
         offset: float = 0.0,
-    ) -> Block:
+    ) -> StridedBox:
         return block_of(
             low,
             high,
@@ -423,7 +423,7 @@ class NodeSampler:
         stride: int = 1,
         offset: float,
         before: tuple[int, int, int] | None = None,
-    ) -> Iterator[tuple[Block, wp.array]]:
+    ) -> Iterator[tuple[StridedBox, wp.array]]:
         """Yield blocks of a box of nodes that fit in memory, each with its distances [m].
 
         Blocks are planes or else rows.

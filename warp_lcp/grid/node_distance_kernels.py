@@ -8,10 +8,10 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 from warp_lcp.grid.signed_distance_kernels import (
-    Block,
     Distances,
     Points,
     ShapeFrame,
+    StridedBox,
     first_node,
     node_position,
     to_box,
@@ -29,7 +29,7 @@ HOLLOW = 1
 
 BOX, SPHERE, CAPSULE, PLANE = range(4)  # kinds of a PlacedShape
 
-Listed = wp.array(dtype=wp.vec4i)
+NodeList = wp.array(dtype=wp.vec4i)
 options = {"module": "warp_lcp.grid.node_distance"}
 
 
@@ -114,7 +114,9 @@ def snapped(meters: float, spacing: float, snap: float):
 
 
 @forward_kernel(**options)
-def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, nodes: NearestSolids):
+def claim_nodes(
+    block: StridedBox, distance: Distances, snap: float, solid: int, nodes: NearestSolids
+):
     """Enter the distances [m] of a solid at a block of nodes."""
     c = wp.tid()
     enter(first_node(block, c), snapped(distance[c], block.spacing, snap), solid, nodes)
@@ -126,7 +128,7 @@ def enter_solids(
     j,
     first,
     end,
-    block: Block,
+    block: StridedBox,
     solids: wp.array(dtype=ShapeGroup),
     shapes: wp.array(dtype=PlacedShape),
     snap: float,
@@ -147,12 +149,12 @@ def enter_solids(
 
 @forward_kernel(**options)
 def claim_groups(
-    block: Block,
+    block: StridedBox,
     distance: Distances,
     solid: int,
     nodes: NearestSolids,
-    unsure: Listed,
-    sure: Listed,
+    unsure: NodeList,
+    sure: NodeList,
     listed: wp.array(dtype=wp.int32),
 ):
     """Bound the distances of groups of nodes by the distance of their middles.
@@ -183,7 +185,7 @@ def claim_groups(
 
 
 @forward_kernel(**options)
-def listed_points(block: Block, list: Listed, out: Points):
+def listed_points(block: StridedBox, list: NodeList, out: Points):
     """Fill the places [m] of listed nodes, or cell centers by the block's offset."""
     c = wp.tid()
     out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), block.offset)
@@ -191,7 +193,12 @@ def listed_points(block: Block, list: Listed, out: Points):
 
 @forward_kernel(**options)
 def claim_listed(
-    block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: NearestSolids
+    block: StridedBox,
+    list: NodeList,
+    distance: Distances,
+    snap: float,
+    solid: int,
+    nodes: NearestSolids,
 ):
     """Enter the distances [m] of a solid at listed nodes.
 
@@ -206,7 +213,9 @@ def claim_listed(
 
 
 @cell_kernel("warp_lcp.grid.node_distance", ordered=True)
-def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.array(dtype=wp.int32)):
+def find_flat_cells(
+    k, j, i, planes: int, near: F32, list: NodeList, count: wp.array(dtype=wp.int32)
+):
     """List the cells with distance 0 at all corners.
 
     Each is a gap or a plate, one cell wide; only its center shows which.
@@ -223,7 +232,7 @@ def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.arr
 
 
 @forward_kernel(**options)
-def mark_listed(list: Listed, distance: Distances, begin: bool, marks: I8):
+def mark_listed(list: NodeList, distance: Distances, begin: bool, marks: I8):
     """Mark the listed cells HOLLOW whose center no solid so far covers."""
     c = wp.tid()
     i = list[c][0]

@@ -173,7 +173,7 @@ def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32
 
 
 @wp.struct
-class Block:
+class StridedBox:
     """Box of nodes or cells as kernels see it, x fastest.
 
     Each item stands for `stride` nodes along every axis.
@@ -190,7 +190,7 @@ class Block:
 
 
 @wp.func
-def first_node(block: Block, item: int):
+def first_node(block: StridedBox, item: int):
     """Return the low node (x, y, z) of an item of a block."""
     across = block.counts[0]
     i = item % across
@@ -200,7 +200,7 @@ def first_node(block: Block, item: int):
 
 
 @wp.func
-def node_position(block: Block, node: wp.vec3i, offset: float):
+def node_position(block: StridedBox, node: wp.vec3i, offset: float):
     """Return the position [m] of a node, moved by `offset` cells along each axis.
 
     2-D has z = 0.
@@ -213,7 +213,7 @@ def node_position(block: Block, node: wp.vec3i, offset: float):
 
 
 @forward_kernel(module=MODULE)
-def item_points(block: Block, out: Points):
+def item_points(block: StridedBox, out: Points):
     """Fill the positions [m] of the items of a block.
 
     Items are nodes, the middles of groups of nodes, or the centers of cells.
@@ -224,7 +224,7 @@ def item_points(block: Block, out: Points):
 
 @forward_kernel(module=MODULE)
 def claim_cells(
-    block: Block,
+    block: StridedBox,
     distance: Distances,
     solid: int,
     index: wp.array3d(dtype=wp.int32),
@@ -251,12 +251,12 @@ def block_of(
     *,
     stride: int = 1,
     offset: float = 0.0,
-) -> Block:
+) -> StridedBox:
     """Return the block of nodes or cells low <= (x, y, z) < high.
 
     Items are groups of `stride` nodes along each axis; their points are moved by `offset` cells.
     """
-    block = Block()
+    block = StridedBox()
     block.low, block.high = wp.vec3i(*(int(v) for v in low)), wp.vec3i(*(int(v) for v in high))
     block.counts = wp.vec3i(*(-(-int(b - a) // stride) for a, b in zip(low, high, strict=True)))
     block.stride, block.flat, block.spacing, block.origin, block.offset = (

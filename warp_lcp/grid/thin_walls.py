@@ -34,7 +34,7 @@ THIN_SHARE = 1e-3  # least share of a mesh's surface that is thin, for the mesh 
 # Share of a mesh's surface above which the mesh is a shell: thin everywhere but at its rims.
 SHELL_SHARE = 0.8
 COST = 32  # work of a particle, in cells of a usual pass
-Simple = Box | Sphere | Capsule | TriangleMesh
+SimpleShape = Box | Sphere | Capsule | TriangleMesh
 
 
 def parts_of(geometry: Geometry) -> list[Geometry]:
@@ -55,7 +55,7 @@ def is_thin(geometry: Geometry, thickness: float, device: wp.Device) -> bool:
 
 
 def _is_thin(shape: Geometry, thickness: float, device: wp.Device) -> bool:
-    if not isinstance(shape, Simple) or shape.invert:
+    if not isinstance(shape, SimpleShape) or shape.invert:
         return False
     if isinstance(shape, TriangleMesh):
         return shape.thin_fraction(thickness, device) > THIN_SHARE
@@ -350,7 +350,7 @@ def _shape(number: int, geometry: Geometry, device: wp.Device, skin: float) -> k
 
     A mesh is not enlarged.
     """
-    assert isinstance(geometry, Simple), "half spaces are not thin"
+    assert isinstance(geometry, SimpleShape), "half spaces are not thin"
     result, place, bounds = kernels.ThinShape(), geometry.placement, geometry.bounds()
     assert bounds is not None, "an inverted shape is not thin"
     result.solid = number

@@ -28,8 +28,8 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 if TYPE_CHECKING:
     from warp_lcp.kernels.device_graph import DeviceGraph
 
-Given = ParamSpec("Given")
-Found = TypeVar("Found")
+ParametersT = ParamSpec("ParametersT")
+ReturnT = TypeVar("ReturnT")
 MOST_SEQUENCES = 64  # sequences that are remembered
 # The device is idle after these functions.
 WAITING_FOR = ("synchronize", "synchronize_device", "synchronize_stream", "numpy")
@@ -164,14 +164,16 @@ def _settle_before_warp() -> None:
                 setattr(owner, name, _settling(plain, idle=name in WAITING_FOR))
 
 
-def _settling(plain: Callable[Given, Found], *, idle: bool) -> Callable[Given, Found]:
+def _settling(
+    plain: Callable[ParametersT, ReturnT], *, idle: bool
+) -> Callable[ParametersT, ReturnT]:
     """Return a function of Warp that first launches the queued stretches.
 
     `idle`: the device has finished all work after it.
     """
 
     @functools.wraps(plain)
-    def called(*args: Given.args, **options: Given.kwargs) -> Found:
+    def called(*args: ParametersT.args, **options: ParametersT.kwargs) -> ReturnT:
         if WAITING.programs and not options.get("record_cmd"):
             settle()
         found = plain(*args, **options)

@@ -27,7 +27,11 @@ from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy, launch
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material import boundary_kernels as kernels
-from warp_lcp.material.velocity_extrapolation import Join, extend_velocity, extend_velocity_cut
+from warp_lcp.material.velocity_extrapolation import (
+    LayerCallback,
+    extend_velocity,
+    extend_velocity_cut,
+)
 
 Faces = list[wp.array]  # one field a component
 
@@ -84,7 +88,7 @@ class Boundary(Protocol):
         kind: wp.array,
         contact: wp.array,
         layers: int,
-        join: Join | None = None,
+        join: LayerCallback | None = None,
     ) -> None:
         """Extrapolate the projected velocity into air and walls.
 
@@ -214,7 +218,7 @@ class WholeCells:
         kind: wp.array,
         contact: wp.array,
         layers: int,
-        join: Join | None = None,
+        join: LayerCallback | None = None,
     ) -> None:
         """Extrapolate the projected velocity into air and walls."""
         s = self.solids
@@ -373,7 +377,7 @@ class CutBoundary:
         kind: wp.array,
         contact: wp.array,
         layers: int,
-        join: Join | None = None,
+        join: LayerCallback | None = None,
     ) -> None:
         """Extrapolate the projected velocity into air and walls."""
         extend_velocity_cut(

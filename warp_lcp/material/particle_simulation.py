@@ -33,7 +33,7 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import particle_trouble
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
-from warp_lcp.material.velocity_extrapolation import Join
+from warp_lcp.material.velocity_extrapolation import LayerCallback
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
@@ -474,7 +474,7 @@ class ParticleSimulation(ParticleCheckpoints):
         known: list[wp.array],
         kind: wp.array,
         contact: wp.array,
-        join: Join | None,
+        join: LayerCallback | None,
     ) -> None:
         """Extrapolate the velocity among the boundary's walls.
 
@@ -484,7 +484,7 @@ class ParticleSimulation(ParticleCheckpoints):
             window, self.velocity, self.weights, known, kind, contact, self.layers, join
         )
 
-    def _layer_filled(self) -> Join | None:
+    def _layer_filled(self) -> LayerCallback | None:
         """Return a function that is called after each layer of extrapolated faces.
 
         Its arguments are the marks and the field of a component. It fills ghost cells and periodic

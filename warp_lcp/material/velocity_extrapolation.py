@@ -39,7 +39,9 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
-Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
+LayerCallback = Callable[
+    [wp.array, wp.array], None
+]  # takes the marks and the velocity of a component
 
 # Cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), plus the error of the
 # distance.
@@ -141,7 +143,7 @@ def extend_velocity(
     solid_velocity: Sequence[wp.array],
     layers: int,
     *,
-    join: Join | None = None,
+    join: LayerCallback | None = None,
 ) -> None:
     """Extrapolate the projected velocity into air and walls.
 
@@ -247,7 +249,7 @@ def extend_velocity_cut(
     scratch: Sequence[wp.array],
     layers: int,
     *,
-    join: Join | None = None,
+    join: LayerCallback | None = None,
 ) -> None:
     """Extrapolate the projected velocity into air and walls that cut cells.
 

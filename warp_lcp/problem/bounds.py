@@ -38,7 +38,7 @@ CODE_ROWS = KERNELS["bounds.code_rows"]
 DECODE = KERNELS["bounds.decode"]
 
 
-GivenSide: TypeAlias = "float | np.ndarray | HostArrayPickle | AffineBounds"  # of a pickle
+PickledSide: TypeAlias = "float | np.ndarray | HostArrayPickle | AffineBounds"  # of a pickle
 
 
 class Bounds:
@@ -153,7 +153,7 @@ class Bounds:
         if self.affine is not None:
             self.affine.evaluate(x)
 
-    def given_again(self) -> tuple[GivenSide, GivenSide]:
+    def given_again(self) -> tuple[PickledSide, PickledSide]:
         """Return the current values of both sides, for a pickle."""
         if self.affine is not None:
             return self.affine.sides

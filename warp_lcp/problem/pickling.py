@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.kernels.types import DeviceArray
 
 Reduced: TypeAlias = tuple[Callable[..., object], tuple[object, ...]]  # of `__reduce__`
-Made = TypeVar("Made")
+BuiltT = TypeVar("BuiltT")
 TYPES = {
     kind.__name__: kind for kind in (wp.int8, wp.uint8, wp.int32, wp.int64, wp.float32, wp.float64)
 }
@@ -71,7 +71,7 @@ class DataclassPickling(HostPickling):
 
 
 def rebuilt_from(
-    make: Callable[..., Made], *arguments: object, device: wp.Device, **options: object
+    make: Callable[..., BuiltT], *arguments: object, device: wp.Device, **options: object
 ) -> Reduced:
     """Return the value of an operator's `__reduce__`.
 
@@ -86,11 +86,11 @@ def rebuilt_from(
 
 
 def _made(
-    make: Callable[..., Made],
+    make: Callable[..., BuiltT],
     arguments: tuple[object, ...],
     device: str,
     options: dict[str, object],
-) -> Made:
+) -> BuiltT:
     if "dtype" in options:
         options = {**options, "dtype": TYPES[options["dtype"]]}
     return make(*arguments, device=_present(device), **options)

@@ -62,7 +62,7 @@ SHADING_CELLS = 4e6  # cells of the density that shades a liquid, to limit its m
 # Distance from a side of the domain up to which a point is on it, relative to the longest side.
 FLUSH = 1e-5
 
-Drawn: TypeAlias = "tuple[pyvista.DataSet, MeshStyle]"  # a mesh, and how it is drawn
+StyledMesh: TypeAlias = "tuple[pyvista.DataSet, MeshStyle]"  # a mesh, and how it is drawn
 
 
 class MeshStyle(TypedDict, total=False):
@@ -96,7 +96,7 @@ class Actors:
         self.plotter = plotter
         self._counts: dict[str, int] = defaultdict(int)
 
-    def exchange(self, group: str, meshes: Sequence[Drawn]) -> list[pyvista.Actor]:
+    def exchange(self, group: str, meshes: Sequence[StyledMesh]) -> list[pyvista.Actor]:
         """Replace the meshes of a group; return the actors of those with points."""
         for number in range(self._counts[group]):
             self.plotter.remove_actor(f"{group} {number}", render=False)
@@ -117,7 +117,7 @@ class Actors:
 
 def surface_meshes(
     surface: Surface, palette: str, size: Sequence[float], line_width: float
-) -> list[Drawn]:
+) -> list[StyledMesh]:
     """Return the surface of a material, separated by the domain's sides.
 
     In 2-D it consists of the inside, deeper in color toward the bottom, and the outline, behind the
@@ -163,7 +163,7 @@ def surface_meshes(
 
 def body_meshes(
     bodies: Surface | None, at_first: Surface | None, line_width: float, front: float
-) -> list[Drawn]:
+) -> list[StyledMesh]:
     """Return rigid bodies at their positions, each in a color of its own.
 
     Args:
@@ -175,7 +175,7 @@ def body_meshes(
     if bodies is None:
         return []
     of_corner = np.asarray(bodies.fields["body"]).ravel()[bodies.corners[:, 0]]
-    meshes: list[Drawn] = []
+    meshes: list[StyledMesh] = []
     for number, body in enumerate(np.unique(of_corner)):
         color, corners = BODY_COLORS[number % len(BODY_COLORS)], bodies.corners[of_corner == body]
         if corners.shape[1] == 2:
@@ -187,7 +187,7 @@ def body_meshes(
 
 def _solid_body(
     points: np.ndarray, corners: np.ndarray, color: str, at_first: Surface | None
-) -> Drawn:
+) -> StyledMesh:
     """Return a body; a ball has octants of two shades, which show its rotation."""
     from matplotlib.colors import to_hex, to_rgb
 
@@ -215,7 +215,7 @@ def _solid_body(
 
 def _flat_body(
     points: np.ndarray, corners: np.ndarray, color: str, line_width: float, front: float
-) -> list[Drawn]:
+) -> list[StyledMesh]:
     """Return inside and outline of a body, in front of particles and walls."""
     outline = poly_data(points, corners).clean()
     inside = outline.triangulate_contours().translate((0.0, 0.0, front))

@@ -15,8 +15,8 @@ from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import (
     SHADES,
     Actors,
-    Drawn,
     MeshStyle,
+    StyledMesh,
     body_meshes,
     shaded,
     surface_meshes,
@@ -248,7 +248,7 @@ class Picture:
             if solid.motion
         ]
 
-    def _casters(self, meshes: list[Drawn]) -> np.ndarray:
+    def _casters(self, meshes: list[StyledMesh]) -> np.ndarray:
         """Return points [m] on objects that cast shadows.
 
         Lines, and containers, which are transparent, cast none.
@@ -264,7 +264,9 @@ class Picture:
             ]
         )
 
-    def _particles(self, frame: RecordedFrame, sun: Sunlight | None) -> tuple[list[Drawn], float]:
+    def _particles(
+        self, frame: RecordedFrame, sun: Sunlight | None
+    ) -> tuple[list[StyledMesh], float]:
         """Return particles as discs, balls or grains, shaded, and their radius [m]."""
         import pyvista
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.signed_distance import Geometry, TriangleMesh
-from warp_lcp.render.actors import Drawn, MeshStyle
+from warp_lcp.render.actors import MeshStyle, StyledMesh
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import (
     BoxTable,
@@ -44,13 +44,13 @@ FLAT_SOLID, SOLID, EDGE = "#bfc3c8", "#cdd1d5", "#6b7075"
 class SolidDrawer(Protocol[PreparedT]):
     """Draws the domain, and solids that it has prepared."""
 
-    def domain(self) -> list[Drawn]:
+    def domain(self) -> list[StyledMesh]:
         """Return the domain."""
 
     def prepared(self, solid: Shape) -> PreparedT:
         """Return the form of a solid that `meshes` draws."""
 
-    def meshes(self, solids: Sequence[tuple[PreparedT, Pose]]) -> list[Drawn]:
+    def meshes(self, solids: Sequence[tuple[PreparedT, Pose]]) -> list[StyledMesh]:
         """Return solids with their poses."""
 
 
@@ -77,7 +77,7 @@ class FlatSolids:
         self._plane = pyvista.ImageData(dimensions=(*counts, 1), spacing=(*spacing, 1.0))
         self._points = wp.array(self._plane.points, dtype=wp.vec3, device="cpu")
 
-    def domain(self) -> list[Drawn]:
+    def domain(self) -> list[StyledMesh]:
         """Return the frame around the domain, and its edges."""
         import pyvista
 
@@ -105,7 +105,7 @@ class FlatSolids:
         """Return the geometry of a solid."""
         return solid.to_geometry(Path(), 2)
 
-    def meshes(self, solids: Sequence[tuple[Geometry, Pose]]) -> list[Drawn]:
+    def meshes(self, solids: Sequence[tuple[Geometry, Pose]]) -> list[StyledMesh]:
         """Return the region of negative distance to the nearest solid, and its outline."""
         nearest = nearest_distance(solids, self._points)
         if nearest.min() >= 0.0:
@@ -134,7 +134,7 @@ class RoomSolids:
     def __init__(self, size: Sequence[float], line_width: float) -> None:
         self.size, self.line_width = np.array(size), line_width
 
-    def domain(self) -> list[Drawn]:
+    def domain(self) -> list[StyledMesh]:
         """Return the edges of the domain."""
         import pyvista
 
@@ -147,9 +147,9 @@ class RoomSolids:
         """Return the surface of a solid, in its own coordinates."""
         return Outline(solid)
 
-    def meshes(self, solids: Sequence[tuple[Outline, Pose]]) -> list[Drawn]:
+    def meshes(self, solids: Sequence[tuple[Outline, Pose]]) -> list[StyledMesh]:
         """Return the surfaces of solids, and the edges of containers."""
-        meshes: list[Drawn] = []
+        meshes: list[StyledMesh] = []
         for outline, pose in solids:
             mesh = outline.inside(self.size, pose)
             looks: MeshStyle = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}

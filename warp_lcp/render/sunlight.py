@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 if TYPE_CHECKING:
     import pyvista
 
-    from warp_lcp.render.actors import Drawn
+    from warp_lcp.render.actors import StyledMesh
 
 # Direction from the domain to the lamp.
 LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])
@@ -61,7 +61,7 @@ class Sunlight:
             )
         return cast(np.ndarray, free / 9.0)
 
-    def floor(self, size: Sequence[float]) -> Drawn:
+    def floor(self, size: Sequence[float]) -> StyledMesh:
         """Return the floor of a domain [m] with the shadows on it, and its options."""
         import pyvista
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines
 # click's ClickException, which new versions of typer include.
-Refusal: type[ClickException] = typer.BadParameter.__mro__[2]
+UsageErrorBase: type[ClickException] = typer.BadParameter.__mro__[2]
 
 
 class Terminal(Console):
@@ -98,7 +98,7 @@ class CommandGroup(TyperGroup):
         """Create a command's context; escape arguments in its errors."""
         try:
             return super().make_context(info_name, args, parent, **extra)
-        except Refusal as error:
+        except UsageErrorBase as error:
             error.message = visible(error.message)
             raise
 
@@ -106,7 +106,7 @@ class CommandGroup(TyperGroup):
         """Run a command; interruptions and cache errors end with exit code 1."""
         try:
             return super().invoke(ctx)
-        except Refusal as error:
+        except UsageErrorBase as error:
             error.message = visible(error.message)
             raise
         except (KernelCacheError, KeyboardInterrupt) as error:

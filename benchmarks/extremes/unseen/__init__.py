@@ -16,10 +16,10 @@ from warp_lcp.benchmarks.extremes.unseen.draw import SeededGenerator, SeededProb
 RESERVED = range(10_000, 20_000)  # seeds reserved for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
 
-Make = Callable[[SeededGenerator], Problem]
+ProblemFamily = Callable[[SeededGenerator], Problem]
 
 
-def _named(kinds: Iterable[Make]) -> dict[str, Make]:
+def _named(kinds: Iterable[ProblemFamily]) -> dict[str, ProblemFamily]:
     return {make.__name__.replace("_", "-"): make for make in kinds}
 
 

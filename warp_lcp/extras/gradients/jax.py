@@ -66,7 +66,7 @@ def solve(
     given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
     names, values = tuple(given), tuple(map(jax.numpy.asarray, given.values()))
 
-    Kept = tuple[Sequence[jax.Array], jax.Array]  # data and solution
+    SavedData = tuple[Sequence[jax.Array], jax.Array]  # data and solution
 
     def solved(data: Sequence[jax.Array], x0: jax.Array | None = None) -> SolveResult:
         """Solve the problem of host arrays."""
@@ -97,11 +97,11 @@ def solve(
         like = jax.ShapeDtypeStruct(data[0].shape, data[0].dtype)
         return jax.pure_callback(lambda d: solved(d).x.numpy().astype(like.dtype), like, data)
 
-    def forward(data: Sequence[jax.Array]) -> tuple[jax.Array, Kept]:
+    def forward(data: Sequence[jax.Array]) -> tuple[jax.Array, SavedData]:
         x = solution(data)
         return x, (data, x)
 
-    def backward(kept: Kept, cotangent: jax.Array) -> tuple[Sequence[jax.Array]]:
+    def backward(kept: SavedData, cotangent: jax.Array) -> tuple[Sequence[jax.Array]]:
         like = tuple(jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kept[0])
         return (jax.pure_callback(derived, like, *kept, cotangent),)
 

@@ -65,7 +65,9 @@ def solve(
 
 
 # Operator, options of the solve, criteria of the gradients, names of the other arguments.
-How = tuple[Operator | MakesOperator, SolveOptions, StoppingCriteria | None, tuple[Name, ...]]
+SolveArguments = tuple[
+    Operator | MakesOperator, SolveOptions, StoppingCriteria | None, tuple[Name, ...]
+]
 
 
 @cache
@@ -76,7 +78,7 @@ def _solution() -> type[torch.autograd.Function]:
     class SolveFunction(torch.autograd.Function):
         @staticmethod
         def forward(
-            ctx: FunctionCtx, how: How, b: torch.Tensor, *others: torch.Tensor | float
+            ctx: FunctionCtx, how: SolveArguments, b: torch.Tensor, *others: torch.Tensor | float
         ) -> torch.Tensor:
             """Solve, and keep the result for the backward pass."""
             A, options, ctx.adjoint, ctx.names = how
