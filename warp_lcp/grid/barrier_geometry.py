@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import U8
+from warp_lcp.grid.cell_kernel import U8, of_axis
 from warp_lcp.grid.thin_walls_kernels import GROUPS, MISS, SHAPES, away, hit, into_group
 
 CENTERS = 3  # the `axis` of a field at cell centers
@@ -14,6 +14,8 @@ INSIDE = 2  # value of `near` where a cell's center lies in a mesh
 # Cells. Points within this distance of a surface count as in the solid; particles keep a larger
 # distance.
 SURFACE = 1.0e-6
+
+SIGHTS = 15  # places along an axis of a face that a line of sight may end at
 
 _MISS = wp.constant(wp.float64(MISS))
 TURNS, SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
@@ -29,6 +31,9 @@ class Barrier:
     planes: int
     dx: float
     origin: wp.vec3i  # cells of a larger grid before the first one of this
+    sight_x: U8  # see `warp_lcp.grid.barriers.Barriers.sight`
+    sight_y: U8
+    sight_z: U8
 
 
 @wp.func
@@ -40,6 +45,40 @@ def place_of(B: Barrier, axis: int, k: int, j: int, i: int):
     if B.planes == 2:
         z = (float(k + B.origin[2]) - wp.where(axis == 2, 1.0, 0.5)) * B.dx
     return wp.vec3(x, y, z)
+
+
+@wp.func
+def sight_code(axis: int, way: wp.vec3):
+    """Return a shift [cells] within a face along its two axes as a byte; never 0.
+
+    Each shift, from -1/2 to 1/2, is rounded to one of SIGHTS values.
+    """
+    half = 0.5 * float(SIGHTS - 1)
+    first = way[wp.where(axis == 0, 1, 0)]
+    second = way[wp.where(axis == 2, 1, 2)]
+    low = int(wp.clamp(wp.round((2.0 * first + 1.0) * half), 0.0, 2.0 * half))
+    high = int(wp.clamp(wp.round((2.0 * second + 1.0) * half), 0.0, 2.0 * half))
+    return wp.uint8(1 + low + SIGHTS * high)
+
+
+@wp.func
+def sight_of(B: Barrier, axis: int, k: int, j: int, i: int):
+    """Return the point [m] of a lower face that stands for it in lines of sight.
+
+    It is the face's center, or that of the face's open part where a thin solid ends within it.
+    """
+    x = place_of(B, axis, k, j, i)
+    if axis < CENTERS:
+        code = int(of_axis(axis, B.sight_x, B.sight_y, B.sight_z, k, j, i))
+        if code > 0:
+            half = 0.5 * float(SIGHTS - 1)
+            first = (float((code - 1) % SIGHTS) - half) / (2.0 * half)
+            second = (float((code - 1) // SIGHTS) - half) / (2.0 * half)
+            way = wp.vec3()
+            way[wp.where(axis == 0, 1, 0)] = B.dx * first
+            way[wp.where(axis == 2, 1, 2)] = B.dx * second
+            x += way
+    return x
 
 
 @wp.func

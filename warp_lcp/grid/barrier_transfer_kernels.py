@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.barrier_geometry import CENTERS, Barrier, place_of, sees
+from warp_lcp.grid.barrier_geometry import CENTERS, Barrier, place_of, sees, sight_of
 from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, U8, cell_kernel, list_kernel, spline
 
 MODULE = "warp_lcp.grid.barriers.transfer"
@@ -69,6 +69,7 @@ def gather_kernel(
     """Average the velocities of the particles that a face sees around it."""
     if B.near[k, j, i] != wp.uint8(0):
         face = place_of(B, axis, k, j, i)
+        seen_at = sight_of(B, axis, k, j, i)
         momentum = float(0.0)
         sum = float(0.0)
         low = wp.vec3i(wp.max(i - 1, 0), wp.max(j - 1, 0), wp.max(k - B.planes + 1, 0))
@@ -79,7 +80,7 @@ def gather_kernel(
                     way = face - position[p]
                     w = tent(B, axis, way / B.dx)
                     if w > 0.0:
-                        if sees(B, position[p], face):
+                        if sees(B, position[p], seen_at):
                             v = velocity[p][axis]
                             if gradient:
                                 v += wp.dot(gradient[p], way)
@@ -120,7 +121,7 @@ def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
         w = wp.where(a == 1, f[0], 1.0 - f[0]) * wp.where(b == 1, f[1], 1.0 - f[1])
         if B.planes == 2:
             w *= wp.where(c == 1, f[2], 1.0 - f[2])
-        if sees(B, x, place_of(B, axis, k + c, j + b, i + a)):
+        if sees(B, x, sight_of(B, axis, k + c, j + b, i + a)):
             v = field[k + c, j + b, i + a]
             values[n] = v
             there[n] = 1.0
