@@ -16,7 +16,9 @@ from warp_lcp.grid.barrier_geometry import (
     Barrier,
     nearest_wall,
     place_of,
+    room_at,
     sees,
+    sees_from,
     sight_code,
     sight_of,
     wall_between,
@@ -451,6 +453,7 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
     result = float(1.0)
     if B.near[k, j, i] != wp.uint8(0):
         x = place_of(B, CENTERS, k, j, i)
+        room = room_at(B, x, REACH * B.dx)
         seen = float(0.0)
         all = float(0.0)
         step = 1.0 / float(parts)
@@ -467,7 +470,7 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
                     if B.planes == 2:
                         w *= spline(z)
                     all += w
-                    if sees(B, x, x + B.dx * way):
+                    if sees_from(B, x, x + B.dx * way, room):
                         seen += w
         result = seen / all
     share[k, j, i] = result

@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import U8, of_axis
-from warp_lcp.grid.thin_walls_kernels import GROUPS, MISS, SHAPES, away, hit, into_group
+from warp_lcp.grid.thin_walls_kernels import GROUPS, MISS, SHAPES, away, hit, into_group, passes_by
 
 CENTERS = 3  # the `axis` of a field at cell centers
 # Cells from a cell's center to a solid that may stand between a particle in the cell and a face
@@ -15,6 +15,7 @@ INSIDE = 2  # value of `near` where a cell's center lies in a mesh
 # distance.
 SURFACE = 1.0e-6
 
+CERTAIN = 1.0e-3  # cells by which a line must be shorter than the distance of its end from solids
 SIGHTS = 15  # places along an axis of a face that a line of sight may end at
 
 _MISS = wp.constant(wp.float64(MISS))
@@ -91,9 +92,12 @@ def wall_between(B: Barrier, x: wp.vec3, y: wp.vec3):
     found = int(0)
     for g in range(B.groups.shape[0]):
         group = B.groups[g]
+        end = group.end
+        if passes_by(group, x, y):
+            end = group.first
         a = into_group(group.turn, group.shift, wp.vec3d(x))
         b = into_group(group.turn, group.shift, wp.vec3d(y))
-        for s in range(group.first, group.end):
+        for s in range(group.first, end):
             at, _n = hit(B.shapes[s], a, b)
             if at < t:
                 t = at
@@ -113,6 +117,34 @@ def sees(B: Barrier, x: wp.vec3, y: wp.vec3):
     """Return whether no solid stands between two points."""
     found, _t = wall_between(B, x, y)
     return found == 0
+
+
+@wp.func
+def room_at(B: Barrier, x: wp.vec3, reach: float):
+    """Return the distance [m] of a point from the nearest solid, at most `reach`.
+
+    It is negative in a solid that is not a mesh.
+    """
+    least = wp.float64(reach)
+    for g in range(B.groups.shape[0]):
+        group = B.groups[g]
+        p = into_group(group.turn, group.shift, wp.vec3d(x))
+        for s in range(group.first, group.end):
+            d, _n = away(B.shapes[s], p, least)
+            least = wp.min(least, d)
+    return float(least)
+
+
+@wp.func
+def sees_from(B: Barrier, x: wp.vec3, y: wp.vec3, room: float):
+    """Return whether no solid stands between two points, given the distance of one from solids.
+
+    A line that is shorter than this distance `room` [m] need not be tested.
+    """
+    free = bool(True)
+    if wp.length(y - x) + CERTAIN * B.dx > room:
+        free = sees(B, x, y)
+    return free
 
 
 @wp.func
