@@ -5,11 +5,11 @@ import warp as wp
 
 from warp_lcp.grid.barrier_geometry import (
     CENTERS,
+    CERTAIN,
     Barrier,
     place_of,
     room_at,
     sees,
-    sees_from,
     sight_of,
 )
 from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, U8, cell_kernel, list_kernel, spline
@@ -32,7 +32,8 @@ def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: PO
     """Add up the particles around a cell that its center sees."""
     if B.near[k, j, i] != wp.uint8(0):
         center = place_of(B, CENTERS, k, j, i)
-        room = room_at(B, center, KERNEL * B.dx)
+        # Lines shorter than this [cells] are free; tests take most of the time.
+        certain = room_at(B, center, KERNEL * B.dx) / B.dx - CERTAIN
         total = float(0.0)
         for c in range(wp.max(k - B.planes + 1, 0), wp.min(k + B.planes, density.shape[0])):
             for b in range(wp.max(j - 1, 0), wp.min(j + 2, density.shape[1])):
@@ -45,19 +46,22 @@ def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: PO
                     if B.planes == 2:
                         w *= spline(way[2])
                     if w > 0.0:
-                        if sees_from(B, center, position[p], room):
+                        free = wp.length(way) < certain
+                        if not free:
+                            free = sees(B, center, position[p])
+                        if free:
                             total += w
         density[k, j, i] = each * total
 
 
 @wp.func
-def tent(B: Barrier, axis: int, way: wp.vec3):
+def tent(planes: int, axis: int, way: wp.vec3):
     """Return the tent weight of a face at a distance `way` [cells] from a particle.
 
     The weight of faces of the particle's own cell is positive.
     """
     w = float(1.0)
-    for d in range(B.planes + 1):
+    for d in range(planes + 1):
         part = 1.0 - wp.abs(way[d])
         if d == axis and part > -EDGE:
             part = wp.max(part, EDGE)
@@ -83,7 +87,7 @@ def gather_kernel(
     if B.near[k, j, i] != wp.uint8(0):
         face = place_of(B, axis, k, j, i)
         seen_at = sight_of(B, axis, k, j, i)
-        room = room_at(B, seen_at, TENT * B.dx)
+        certain = room_at(B, seen_at, TENT * B.dx) - CERTAIN * B.dx
         momentum = float(0.0)
         sum = float(0.0)
         low = wp.vec3i(wp.max(i - 1, 0), wp.max(j - 1, 0), wp.max(k - B.planes + 1, 0))
@@ -92,9 +96,12 @@ def gather_kernel(
                 row = (c * field.shape[1] + b) * field.shape[2]
                 for p in range(offsets[row + low[0]], offsets[row + wp.min(i + 2, field.shape[2])]):
                     way = face - position[p]
-                    w = tent(B, axis, way / B.dx)
+                    w = tent(B.planes, axis, way / B.dx)
                     if w > 0.0:
-                        if sees_from(B, position[p], seen_at, room):
+                        free = wp.length(seen_at - position[p]) < certain
+                        if not free:
+                            free = sees(B, position[p], seen_at)
+                        if free:
                             v = velocity[p][axis]
                             if gradient:
                                 v += wp.dot(gradient[p], way)
@@ -123,6 +130,10 @@ def seen(B: Barrier, axis: int, x: wp.vec3, room: float, field: F32):
     if B.planes == 2:
         k = int(wp.floor(g[2]))
     f = g - wp.vec3(float(i), float(j), float(k))
+    if B.planes == 1:
+        f[2] = 0.0
+    # Lines shorter than this [cells] are free; tests take most of the time.
+    certain = room / B.dx - CERTAIN
     values = VEC8()
     there = VEC8()
     sum = float(0.0)
@@ -135,7 +146,10 @@ def seen(B: Barrier, axis: int, x: wp.vec3, room: float, field: F32):
         w = wp.where(a == 1, f[0], 1.0 - f[0]) * wp.where(b == 1, f[1], 1.0 - f[1])
         if B.planes == 2:
             w *= wp.where(c == 1, f[2], 1.0 - f[2])
-        if sees_from(B, x, sight_of(B, axis, k + c, j + b, i + a), room):
+        free = wp.length(wp.vec3(float(a), float(b), float(c)) - f) < certain
+        if not free:
+            free = sees(B, x, sight_of(B, axis, k + c, j + b, i + a))
+        if free:
             v = field[k + c, j + b, i + a]
             values[n] = v
             there[n] = 1.0
