@@ -155,7 +155,7 @@ def closed_on(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     else:
         free, wall = fields_on(S, axis, k, j, i)
         owner = wall
-        if free < 1.0:
+        if free < 1.0 and wall >= 0:  # -1 beside the edge of a thin solid
             own = 1.0 - free
             if S.moving.moves:
                 _free, solid, part = moving_on(S, axis, k, j, i)

@@ -16,7 +16,11 @@ from warp_lcp.grid.barrier_geometry import (
     Barrier,
     nearest_wall,
     place_of,
+    room_at,
     sees,
+    sees_from,
+    sight_code,
+    sight_of,
     wall_between,
 )
 from warp_lcp.grid.cell_kernel import (
@@ -29,6 +33,7 @@ from warp_lcp.grid.cell_kernel import (
     cell_below,
     cell_kernel,
     next_to,
+    of_axis,
     spline,
 )
 from warp_lcp.grid.cut_cells_kernels import corner
@@ -40,6 +45,9 @@ MODULE = "warp_lcp.grid.barriers.faces"
 MOVING = "warp_lcp.grid.barriers.moving"
 WHOLE = "warp_lcp.grid.barriers.whole"
 
+WIDEST = wp.constant(1.0)  # cells from a face's center up to which its open part may reach
+HALVINGS = 10  # halvings of the interval that the end of a face's open part lies in
+LEAST_OPEN = 0.02  # least open fraction of a crossed face
 _AIR, _SOLID = wp.constant(wp.int8(AIR)), wp.constant(wp.int8(SOLID))
 
 
@@ -83,10 +91,12 @@ def apart_kernel(k, j, i, B: Barrier, axis: int, apart: U8):
     """
     bits = int(0)
     if B.near[k, j, i] != wp.uint8(0):
-        x = place_of(B, axis, k, j, i)
+        x = sight_of(B, axis, k, j, i)
         for d in range(B.planes + 1):
             c, b, a = next_to(d, -1, k, j, i)
             y = place_of(B, axis, c, b, a)
+            if c >= 0 and b >= 0 and a >= 0:
+                y = sight_of(B, axis, c, b, a)
             if not sees(B, x, y):
                 bits = bits | (1 << d)
     apart[k, j, i] = wp.uint8(bits)
@@ -185,6 +195,202 @@ def cross_kernel(
     number[k, j, i] = wp.int16(crossed)
 
 
+@wp.struct
+class Crossings:
+    """Fields of the faces of each component, see `warp_lcp.grid.barriers`; z is null in 2-D."""
+
+    number_x: I16
+    number_y: I16
+    number_z: I16
+    below_x: F32
+    below_y: F32
+    below_z: F32
+    above_x: F32
+    above_y: F32
+    above_z: F32
+    wall_x: I16
+    wall_y: I16
+    wall_z: I16
+
+
+@wp.func
+def number_on(C: Crossings, axis: int, k: int, j: int, i: int):
+    """Return the number of the solid that crosses a lower face, 0 without one."""
+    return int(of_axis(axis, C.number_x, C.number_y, C.number_z, k, j, i))
+
+
+@wp.func
+def whole(C: Crossings, axis: int, k: int, j: int, i: int):
+    """Return whether no solid and no side of the domain closes a part of a lower face."""
+    wall = of_axis(axis, C.wall_x, C.wall_y, C.wall_z, k, j, i)
+    return wall == wp.int16(-1) and number_on(C, axis, k, j, i) == 0
+
+
+@wp.func
+def ends_within(C: Crossings, axis: int, d: int, side: int, k: int, j: int, i: int):
+    """Return whether a solid that crosses one of two neighboring faces ends between them.
+
+    Of the four faces between the cells around their common edge it crosses only this one. The faces
+    are a lower face and its neighbor along axis d, on the upper `side` (1) or the lower one (0).
+    """
+    c, b, a = next_to(axis, -1, k, j, i)
+    z, y, x = next_to(d, side, k, j, i)
+    w, v, u = next_to(d, side, c, b, a)
+    return whole(C, d, z, y, x) and whole(C, d, w, v, u)
+
+
+@wp.func
+def way_to_wall(C: Crossings, d: int, side: int, k: int, j: int, i: int):
+    """Return the distance [cells] from a cell's center to a thin solid before the next one.
+
+    The next cell is that along axis d, on the upper `side` (1) or the lower one (0). Without a solid
+    the distance is WIDEST.
+    """
+    c, b, a = next_to(d, side, k, j, i)
+    result = WIDEST
+    if number_on(C, d, c, b, a) > 0:
+        result = of_axis(d, C.above_x, C.above_y, C.above_z, c, b, a)
+        if side == 1:
+            result = of_axis(d, C.below_x, C.below_y, C.below_z, c, b, a)
+    return wp.min(result, WIDEST)
+
+
+@wp.func
+def free_line(B: Barrier, axis: int, k: int, j: int, i: int, way: wp.vec3):
+    """Return whether no thin solid stands on the line between two cells' centers.
+
+    The cells are those of a lower face. The line is shifted by `way` [m].
+    """
+    c, b, a = next_to(axis, -1, k, j, i)
+    lower = place_of(B, CENTERS, c, b, a) + way
+    return sees(B, lower, place_of(B, CENTERS, k, j, i) + way)
+
+
+@wp.func
+def open_width(B: Barrier, C: Crossings, axis: int, d: int, side: int, k: int, j: int, i: int):
+    """Return the width [cells] of an open lower face from its center on, along axis d.
+
+    It is the distance by which the line between the cells' centers can be shifted to one side until
+    a thin solid stands in the way. The part of a neighboring cell before the solid, if its center
+    is behind it, so belongs to this face. Half a cell if no solid is in the way.
+    """
+    c, b, a = next_to(axis, -1, k, j, i)
+    z, y, x = next_to(d, 2 * side - 1, k, j, i)
+    result = float(0.5)
+    limit = wp.min(way_to_wall(C, d, side, k, j, i), way_to_wall(C, d, side, c, b, a))
+    if limit < WIDEST or number_on(C, axis, z, y, x) > 0:
+        if ends_within(C, axis, d, side, k, j, i):
+            limit = 0.5  # the neighboring face has its own open part
+        way = wp.vec3()
+        low = float(0.0)
+        high = limit
+        steps = int(HALVINGS)  # a variable, so that the loop is not unrolled
+        for step in range(steps):
+            middle = wp.where(step == 0, 0.999 * high, 0.5 * (low + high))
+            way[d] = B.dx * middle * float(2 * side - 1)
+            if free_line(B, axis, k, j, i, way):
+                low = middle
+            else:
+                high = middle
+        result = 0.5 * (low + high)
+        if low > 0.998 * limit:
+            result = limit
+    return result
+
+
+@wp.func
+def open_lines(B: Barrier, axis: int, samples: int, k: int, j: int, i: int):
+    """Return the share of a lower face's lines that are free, and the mean shift of these [cells].
+
+    The lines join the center planes of the two cells. `samples` is their number along each axis.
+    """
+    first = wp.where(axis == 0, 1, 0)
+    second = wp.where(axis == 2, 1, 2)
+    rows = wp.where(B.planes == 2, samples, 1)
+    count = float(0.0)
+    total = wp.vec3()
+    for m in range(rows):
+        for n in range(samples):
+            way = wp.vec3()
+            way[first] = (float(n) + 0.5) / float(samples) - 0.5
+            if B.planes == 2:
+                way[second] = (float(m) + 0.5) / float(samples) - 0.5
+            if free_line(B, axis, k, j, i, B.dx * way):
+                count += 1.0
+                total += way
+    return count / float(rows * samples), total / wp.max(count, 1.0)
+
+
+@cell_kernel(MODULE)
+def edge_kernel(
+    k,
+    j,
+    i,
+    B: Barrier,
+    axis: int,
+    C: Crossings,
+    fixed: wp.array(dtype=wp.uint8),
+    samples: int,
+    open: F32,
+    sight: U8,
+):
+    """Set the open fraction of faces that a thin solid blocks in part.
+
+    A solid ends within such a face, or it crosses the next one. Without this the width of an opening
+    would be a whole number of cells.
+
+    - A solid that crosses a face and ends before the next one leaves the free lines of the face open.
+      The next face has those that are free of its own.
+    - Other whole faces beside a crossed one reach as far as the solid (`open_width`), where a solid
+      goes on between the cells and their neighbors.
+    """
+    code = wp.uint8(0)
+    inside = i > 0 and j > 0 and i + 1 < open.shape[2] and j + 1 < open.shape[1]
+    if B.planes == 2 and (k == 0 or k + 1 == open.shape[0]):
+        inside = False
+    if inside and B.near[k, j, i] != wp.uint8(0):
+        solid = number_on(C, axis, k, j, i)
+        free = whole(C, axis, k, j, i) and open[k, j, i] == 1.0
+        known = fixed[solid] != wp.uint8(0)
+        ends = bool(False)
+        goes_on = bool(False)
+        v, u, t = next_to(axis, -1, k, j, i)
+        for d in range(B.planes + 1):
+            if d != axis and (solid > 0 or free):
+                for side in range(2):
+                    c, b, a = next_to(d, 2 * side - 1, k, j, i)
+                    other = number_on(C, axis, c, b, a)
+                    z, y, x = next_to(d, side, k, j, i)
+                    upper = number_on(C, d, z, y, x)
+                    z, y, x = next_to(d, side, v, u, t)
+                    lower = number_on(C, d, z, y, x)
+                    alone = ends_within(C, axis, d, side, k, j, i)
+                    if solid > 0:
+                        ends = ends or (alone and whole(C, axis, c, b, a))
+                    else:
+                        known = known and fixed[other] * fixed[upper] * fixed[lower] != wp.uint8(0)
+                        ends = ends or (other > 0 and alone)
+                        goes_on = goes_on or (other > 0 and not alone) or upper + lower > 0
+        if known and goes_on:
+            area = float(1.0)
+            for d in range(B.planes + 1):
+                if d != axis:
+                    width = open_width(B, C, axis, d, 0, k, j, i)
+                    area *= width + open_width(B, C, axis, d, 1, k, j, i)
+            open[k, j, i] = area
+            code = sight_code(axis, wp.vec3())
+        elif known and ends:
+            share, way = open_lines(B, axis, samples, k, j, i)
+            if solid > 0 and share < LEAST_OPEN:
+                share = float(0.0)
+            if share > 0.0:
+                open[k, j, i] = share
+                code = sight_code(axis, way)
+                if solid == 0:
+                    code = sight_code(axis, wp.vec3())
+    sight[k, j, i] = code
+
+
 @cell_kernel(MODULE)
 def solid_kernel(k, j, i, B: Barrier, ax: F32, ay: F32, az: F32, base: I8):
     """Mark cells whose faces are all closed as SOLID."""
@@ -218,7 +424,7 @@ def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INT
 
     A face has a gap if the way beside its center is free although the next face is closed as well.
     """
-    if number[k, j, i] > wp.int16(0):
+    if number[k, j, i] > wp.int16(0) and open[k, j, i] == 0.0:
         y = place_of(B, CENTERS, k, j, i)
         c, b, a = cell_below(axis, k, j, i)
         x = place_of(B, CENTERS, c, b, a)
@@ -247,6 +453,7 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
     result = float(1.0)
     if B.near[k, j, i] != wp.uint8(0):
         x = place_of(B, CENTERS, k, j, i)
+        room = room_at(B, x, REACH * B.dx)
         seen = float(0.0)
         all = float(0.0)
         step = 1.0 / float(parts)
@@ -263,7 +470,7 @@ def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
                     if B.planes == 2:
                         w *= spline(z)
                     all += w
-                    if sees(B, x, x + B.dx * way):
+                    if sees_from(B, x, x + B.dx * way, room):
                         seen += w
         result = seen / all
     share[k, j, i] = result
@@ -297,9 +504,9 @@ def capacity_kernel(k, j, i, share: F32, cuts: bool, capacity: F32):
 
 
 @cell_kernel(MOVING)
-def forget_kernel(k, j, i, number: I16, velocity: F32):
+def forget_kernel(k, j, i, number: I16, sight: U8, velocity: F32):
     """Clear the solids' velocity on faces that they no longer cross."""
-    if number[k, j, i] > wp.int16(0):
+    if number[k, j, i] > wp.int16(0) or sight[k, j, i] != wp.uint8(0):
         velocity[k, j, i] = 0.0
 
 
@@ -307,8 +514,10 @@ def forget_kernel(k, j, i, number: I16, velocity: F32):
 def wall_velocity_kernel(
     k, j, i, B: Barrier, axis: int, number: I16, turn: TURNS, shift: SHIFTS, velocity: F32
 ):
-    """Fill the velocity of the solids on the faces that they cross."""
+    """Fill the velocity of the solids on the faces that they cross or that they close in part."""
     solid = int(number[k, j, i])
+    if solid == 0 and of_axis(axis, B.sight_x, B.sight_y, B.sight_z, k, j, i) != wp.uint8(0):
+        solid, _n, _d = nearest_wall(B, place_of(B, axis, k, j, i), 1.5 * B.dx)
     if solid > 0:
         v = turn[solid] * place_of(B, axis, k, j, i) + shift[solid]
         velocity[k, j, i] = v[axis]

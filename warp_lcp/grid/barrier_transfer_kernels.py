@@ -3,7 +3,15 @@
 
 import warp as wp
 
-from warp_lcp.grid.barrier_geometry import CENTERS, Barrier, place_of, sees
+from warp_lcp.grid.barrier_geometry import (
+    CENTERS,
+    CERTAIN,
+    Barrier,
+    place_of,
+    room_at,
+    sees,
+    sight_of,
+)
 from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, U8, cell_kernel, list_kernel, spline
 
 MODULE = "warp_lcp.grid.barriers.transfer"
@@ -11,6 +19,10 @@ MODULE = "warp_lcp.grid.barriers.transfer"
 EDGE = 1.0e-5
 TINY_WEIGHT = 1.0e-9
 FREE = 2.5  # cells from other solids beyond which these do not affect a particle's path
+
+# Cells: more than the distance between a particle and a face, or a cell, to which it contributes.
+TENT = 1.8
+KERNEL = 2.65
 
 VEC8 = wp.types.vector(length=8, dtype=wp.float32)
 
@@ -20,6 +32,8 @@ def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: PO
     """Add up the particles around a cell that its center sees."""
     if B.near[k, j, i] != wp.uint8(0):
         center = place_of(B, CENTERS, k, j, i)
+        # Lines shorter than this [cells] are free; tests take most of the time.
+        certain = room_at(B, center, KERNEL * B.dx) / B.dx - CERTAIN
         total = float(0.0)
         for c in range(wp.max(k - B.planes + 1, 0), wp.min(k + B.planes, density.shape[0])):
             for b in range(wp.max(j - 1, 0), wp.min(j + 2, density.shape[1])):
@@ -32,19 +46,22 @@ def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: PO
                     if B.planes == 2:
                         w *= spline(way[2])
                     if w > 0.0:
-                        if sees(B, center, position[p]):
+                        free = wp.length(way) < certain
+                        if not free:
+                            free = sees(B, center, position[p])
+                        if free:
                             total += w
         density[k, j, i] = each * total
 
 
 @wp.func
-def tent(B: Barrier, axis: int, way: wp.vec3):
+def tent(planes: int, axis: int, way: wp.vec3):
     """Return the tent weight of a face at a distance `way` [cells] from a particle.
 
     The weight of faces of the particle's own cell is positive.
     """
     w = float(1.0)
-    for d in range(B.planes + 1):
+    for d in range(planes + 1):
         part = 1.0 - wp.abs(way[d])
         if d == axis and part > -EDGE:
             part = wp.max(part, EDGE)
@@ -69,6 +86,8 @@ def gather_kernel(
     """Average the velocities of the particles that a face sees around it."""
     if B.near[k, j, i] != wp.uint8(0):
         face = place_of(B, axis, k, j, i)
+        seen_at = sight_of(B, axis, k, j, i)
+        certain = room_at(B, seen_at, TENT * B.dx) - CERTAIN * B.dx
         momentum = float(0.0)
         sum = float(0.0)
         low = wp.vec3i(wp.max(i - 1, 0), wp.max(j - 1, 0), wp.max(k - B.planes + 1, 0))
@@ -77,9 +96,12 @@ def gather_kernel(
                 row = (c * field.shape[1] + b) * field.shape[2]
                 for p in range(offsets[row + low[0]], offsets[row + wp.min(i + 2, field.shape[2])]):
                     way = face - position[p]
-                    w = tent(B, axis, way / B.dx)
+                    w = tent(B.planes, axis, way / B.dx)
                     if w > 0.0:
-                        if sees(B, position[p], face):
+                        free = wp.length(seen_at - position[p]) < certain
+                        if not free:
+                            free = sees(B, position[p], seen_at)
+                        if free:
                             v = velocity[p][axis]
                             if gradient:
                                 v += wp.dot(gradient[p], way)
@@ -90,11 +112,11 @@ def gather_kernel(
 
 
 @wp.func
-def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
+def seen(B: Barrier, axis: int, x: wp.vec3, room: float, field: F32):
     """Interpolate a component from the faces that a point sees.
 
     Returns the value, its gradient [1/m] and the weight of the visible faces. Faces that the point
-    does not see get the mean of the others.
+    does not see get the mean of the others. `room` is the point's distance from solids [m].
     """
     g = x / B.dx + wp.vec3(
         1.0 - float(B.origin[0]), 1.0 - float(B.origin[1]), 1.0 - float(B.origin[2])
@@ -108,6 +130,10 @@ def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
     if B.planes == 2:
         k = int(wp.floor(g[2]))
     f = g - wp.vec3(float(i), float(j), float(k))
+    if B.planes == 1:
+        f[2] = 0.0
+    # Lines shorter than this [cells] are free; tests take most of the time.
+    certain = room / B.dx - CERTAIN
     values = VEC8()
     there = VEC8()
     sum = float(0.0)
@@ -120,7 +146,10 @@ def seen(B: Barrier, axis: int, x: wp.vec3, field: F32):
         w = wp.where(a == 1, f[0], 1.0 - f[0]) * wp.where(b == 1, f[1], 1.0 - f[1])
         if B.planes == 2:
             w *= wp.where(c == 1, f[2], 1.0 - f[2])
-        if sees(B, x, place_of(B, axis, k + c, j + b, i + a)):
+        free = wp.length(wp.vec3(float(a), float(b), float(c)) - f) < certain
+        if not free:
+            free = sees(B, x, sight_of(B, axis, k + c, j + b, i + a))
+        if free:
             v = field[k + c, j + b, i + a]
             values[n] = v
             there[n] = 1.0
@@ -191,11 +220,12 @@ def interpolate_kernel(
     x = position[i]
     c, b, a = cell_at(B, x, shape_of(B.near))
     if B.near[c, b, a] != wp.uint8(0):
-        value, slope, sum = seen(B, axis, x, field)
+        room = room_at(B, x, TENT * B.dx)
+        value, slope, sum = seen(B, axis, x, room, field)
         v = velocity[i]
         if sum > 0.0:
             if flip > 0.0:
-                old, _slope, _sum = seen(B, axis, x, saved)
+                old, _slope, _sum = seen(B, axis, x, room, saved)
                 value += flip * (before[i][axis] - old)
             v[axis] = value
             velocity[i] = v
@@ -209,11 +239,12 @@ def velocity_at(B: Barrier, u: F32, v: F32, w: F32, x: wp.vec3):
 
     The component along an axis is 0 if no face of that axis is visible.
     """
-    a, _a, _sa = seen(B, 0, x, u)
-    b, _b, _sb = seen(B, 1, x, v)
+    room = room_at(B, x, TENT * B.dx)
+    a, _a, _sa = seen(B, 0, x, room, u)
+    b, _b, _sb = seen(B, 1, x, room, v)
     c = float(0.0)
     if B.planes == 2:
-        c, _c, _sc = seen(B, 2, x, w)
+        c, _c, _sc = seen(B, 2, x, room, w)
     return wp.vec3(a, b, c)
 
 

@@ -11,6 +11,7 @@ from warp_lcp.grid.barrier_geometry import (
     nearest_wall,
     place_of,
     sees,
+    sight_of,
 )
 from warp_lcp.grid.cell_kernel import F32, I8, I16, U8, cell_kernel, next_to, of_axis
 
@@ -51,7 +52,7 @@ def mean_around(B: Barrier, axis: int, other: int, k: int, j: int, i: int, field
         c, b, a = next_to(axis, -below, k, j, i)
         c, b, a = next_to(other, above, c, b, a)
         if known[c, b, a] > wp.int8(0):
-            if sees(B, x, place_of(B, other, c, b, a)):
+            if sees(B, x, sight_of(B, other, c, b, a)):
                 total += field[c, b, a]
                 count += 1.0
     return total / wp.max(count, 1.0)
@@ -65,6 +66,7 @@ def constrain_kernel(
     B: Barrier,
     axis: int,
     number: I16,
+    open: F32,
     U: FaceComponents,
     K: FaceMarks,
     turn: TURNS,
@@ -79,9 +81,9 @@ def constrain_kernel(
 
     A face loses the relative velocity into its wall; where the wall holds the material it loses all
     relative velocity along the normal. A crossed face lies on one side of the wall, and only places
-    on that side see it.
+    on that side see it. A face that is open in part has been projected and keeps its velocity.
     """
-    if number[k, j, i] > wp.int16(0):
+    if number[k, j, i] > wp.int16(0) and open[k, j, i] == 0.0:
         own = of_axis(axis, U.u, U.v, U.w, k, j, i)
         mark = of_axis(axis, K.u, K.v, K.w, k, j, i)
         x = place_of(B, axis, k, j, i)
@@ -113,11 +115,11 @@ def constrain_kernel(
 
 
 @cell_kernel(MODULE)
-def take_kernel(k, j, i, number: I16, result: F32, field: F32, known: I8):
+def take_kernel(k, j, i, number: I16, open: F32, result: F32, field: F32, known: I8):
     """Copy the results of `constrain_kernel`, and mark those faces as unknown.
 
     Faces that solids cut must not use them any more.
     """
-    if number[k, j, i] > wp.int16(0):
+    if number[k, j, i] > wp.int16(0) and open[k, j, i] == 0.0:
         field[k, j, i] = result[k, j, i]
         known[k, j, i] = wp.int8(0)

@@ -25,6 +25,7 @@ from warp_lcp.grid.barrier_fields import binomial_kernel, shift_kernel
 from warp_lcp.grid.barrier_geometry import CENTERS, REACH, Barrier
 from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
 from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.motion import RigidMotion
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.grid.thin_walls import ThinWalls
@@ -37,6 +38,7 @@ BARRIER = 3.0
 # Sample points per cell and axis, for the share of its kernel that its center sees.
 PARTS = {2: 6, 3: 3}
 PARTS_MOVING = {2: 4, 3: 2}  # sample points per cell and axis if solids move, in each step
+SAMPLES = {2: 96, 3: 12}  # lines per axis of a face, for the part that a solid's edge leaves open
 COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
@@ -67,6 +69,9 @@ class Barriers:
         below: float32, one field a component: distance from the center of the cell below a crossed
             face to the solid [cells].
         above: the same from the cell above.
+        sight: uint8, one field a component: the point of a face that a thin solid closes in part
+            where lines of sight end, as a byte (`warp_lcp.grid.barrier_geometry.sight_code`); 0 on
+            other faces, whose lines end at their center.
         calm: int8, base of the cells, SOLID in those near the solids: where particles may not be
             taken from one cell to another.
     """
@@ -78,6 +83,9 @@ class Barriers:
         self.number, self._share, self._scratch = grid.faces(wp.int16), grid.field(), grid.faces()
         self.below, self.above = grid.faces(), grid.faces()
         self._share.fill_(1.0)
+        self.sight = grid.faces(wp.uint8)
+        fixed = [True, *(not isinstance(solid.motion, RigidMotion) for solid in cut.solids)]
+        self._fixed = wp.array(fixed, dtype=wp.uint8, device=grid.device)
         self._barrier = self._barrier_of(grid, walls.shapes)
         # Barriers are only near the thin parts of solids.
         self._thin = self._barrier_of(grid, walls.thin_shapes)
@@ -94,6 +102,7 @@ class Barriers:
         barrier.shapes, barrier.groups, barrier.near = shapes, self.walls.groups, self.near
         barrier.planes, barrier.dx = grid.planes, grid.spacing
         barrier.origin = wp.vec3i(*grid.origin)
+        barrier.sight_x, barrier.sight_y, barrier.sight_z = three_components(self.sight)
         return barrier
 
     def place(self, time: float) -> None:
@@ -113,11 +122,7 @@ class Barriers:
         self._all.launch(faces_kernels.near_kernel, [self._thin, self.near])
         if self.walls.has_meshes:
             self._all.launch(faces_kernels.inside_kernel, [barrier, self.near])
-        for axis, apart in enumerate(self.apart):
-            self._all.launch(
-                faces_kernels.apart_kernel,
-                [barrier, CENTERS if axis == grid.dimension else axis, apart],
-            )
+        self._all.launch(faces_kernels.apart_kernel, [barrier, CENTERS, self.apart[-1]])
         parts = (PARTS_MOVING if self.walls.moves else PARTS)[grid.dimension]
         self._all.launch(faces_kernels.share_kernel, [barrier, parts, self._share])
 
@@ -141,11 +146,16 @@ class Barriers:
         ):
             gaps = self.below[axis], self.above[axis]
             if cut.velocity is not None:
-                self._all.launch(faces_kernels.forget_kernel, [number, cut.velocity[axis]])
+                self._all.launch(
+                    faces_kernels.forget_kernel, [number, self.sight[axis], cut.velocity[axis]]
+                )
             self._all.launch(
                 faces_kernels.cross_kernel,
                 [barrier, axis, self.apart[-1], cut.distance, open_, wall, number, *gaps],
             )
+        self._find_edges()
+        for axis, apart in enumerate(self.apart[:-1]):
+            self._all.launch(faces_kernels.apart_kernel, [barrier, axis, apart])
         inner = self._all.common(self.grid.domain)
         if inner is not None:
             inner.launch(
@@ -156,6 +166,25 @@ class Barriers:
             self._all.launch(
                 faces_kernels.capacity_kernel,
                 [self._share, bool(self.walls.in_parts), cut.capacity],
+            )
+
+    def _find_edges(self) -> None:
+        """Find the open fractions of faces in which thin solids end."""
+        crossings = faces_kernels.Crossings()
+        fields = {
+            "number": self.number,
+            "below": self.below,
+            "above": self.above,
+            "wall": self.cut.wall,
+        }
+        for name, components in fields.items():
+            for letter, field in zip("xyz", components, strict=False):
+                setattr(crossings, f"{name}_{letter}", field)
+        samples = SAMPLES[self.grid.dimension]
+        for axis, (open_, sight) in enumerate(zip(self.cut.open, self.sight, strict=True)):
+            self._all.launch(
+                faces_kernels.edge_kernel,
+                [self._barrier, axis, crossings, self._fixed, samples, open_, sight],
             )
 
     def set_velocity(self) -> None:
@@ -194,7 +223,15 @@ class Barriers:
 
     def placed(self) -> list[wp.array]:
         """Return the fields of the placed solids, whose ghost cells other ranks fill."""
-        return [self.near, *self.apart, *self.number, *self.below, *self.above, self.calm]
+        return [
+            self.near,
+            *self.apart,
+            *self.number,
+            *self.below,
+            *self.above,
+            *self.sight,
+            self.calm,
+        ]
 
     @property
     def reach(self) -> Window:
@@ -367,11 +404,15 @@ class Barriers:
         components, marks = velocity_kernels.FaceComponents(), velocity_kernels.FaceMarks()
         components.u, components.v, components.w = three_components(velocity)
         marks.u, marks.v, marks.w = three_components(known)
-        for axis, (number, result) in enumerate(zip(self.number, self._scratch, strict=True)):
+        opened = self.cut.open
+        for axis, (number, open_, result) in enumerate(
+            zip(self.number, opened, self._scratch, strict=True)
+        ):
             kernel_args = [
                 self._barrier,
                 axis,
                 number,
+                open_,
                 components,
                 marks,
                 self.cut.turn,
@@ -383,7 +424,7 @@ class Barriers:
                 result,
             ]
             window.launch(velocity_kernels.constrain_kernel, kernel_args)
-        for number, result, field, mark in zip(
-            self.number, self._scratch, velocity, known, strict=True
+        for number, open_, result, field, mark in zip(
+            self.number, opened, self._scratch, velocity, known, strict=True
         ):
-            window.launch(velocity_kernels.take_kernel, [number, result, field, mark])
+            window.launch(velocity_kernels.take_kernel, [number, open_, result, field, mark])

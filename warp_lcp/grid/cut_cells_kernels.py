@@ -144,7 +144,7 @@ def moving_part(
     free = open[k, j, i]
     solid = int(0)
     part = float(0.0)
-    if free < 1.0:
+    if free < 1.0 and wall[k, j, i] >= wp.int16(0):
         solid = int(wall[k, j, i])
         least = float(1.0e30)
         if S.moves[wp.max(solid, 0)] == wp.uint8(0):

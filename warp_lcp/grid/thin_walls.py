@@ -33,6 +33,8 @@ SKIN = 1e-4
 THIN_SHARE = 1e-3  # least share of a mesh's surface that is thin, for the mesh to be thin
 # Share of a mesh's surface above which the mesh is a shell: thin everywhere but at its rims.
 SHELL_SHARE = 0.8
+# Cells around a group's shapes that belong to their box: more than the distance that particles keep.
+BOX_ROOM = 0.05
 COST = 32  # work of a particle, in cells of a usual pass
 SimpleShape = Box | Sphere | Capsule | TriangleMesh
 
@@ -177,6 +179,7 @@ class ThinWalls:
                 group.shift = group.shift_before = wp.vec3d(*image)
                 if motion is not None:
                     self._moving.append((len(self._groups), moving, image))
+                self._find_box(group)
                 self._groups.append(group)
             moving += motion is not None
         self.shapes = wp.array(shapes, dtype=kernels.ThinShape, device=grid.device)
@@ -237,6 +240,7 @@ class ThinWalls:
             group.turn_before, group.shift_before = group.turn, group.shift
             group.turn = wp.mat33d(rotations[0, motion])
             group.shift = wp.vec3d(*(translations[0, motion] + image))
+            self._find_box(group)
         self.groups.assign(self._groups)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -244,17 +248,27 @@ class ThinWalls:
 
         Low and high corner [m], shape (3,) each.
         """
-        lows, highs = [], []
-        for group in self._groups:
-            turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
-            for geometry in self._geometries[group.first : group.end]:
-                box = geometry.bounds()
-                assert box is not None, "thin solids are bounded"
-                low, high = np.clip(box, -kernels.ENDLESS, kernels.ENDLESS)
-                middle, reach = 0.5 * (low + high), np.abs(turn) @ (0.5 * (high - low))
-                lows.append(turn @ middle + shift - reach)
-                highs.append(turn @ middle + shift + reach)
+        lows, highs = zip(*map(self._bounds_of, self._groups), strict=True)
         return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def _bounds_of(self, group: kernels.ThinGroup) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners of a box around the shapes of a group at its current place."""
+        lows, highs = [], []
+        turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
+        for geometry in self._geometries[group.first : group.end]:
+            box = geometry.bounds()
+            assert box is not None, "thin solids are bounded"
+            low, high = np.clip(box, -kernels.ENDLESS, kernels.ENDLESS)
+            middle, reach = 0.5 * (low + high), np.abs(turn) @ (0.5 * (high - low))
+            lows.append(turn @ middle + shift - reach)
+            highs.append(turn @ middle + shift + reach)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def _find_box(self, group: kernels.ThinGroup) -> None:
+        """Set the box of a group: lines and particles farther away need not be tested."""
+        low, high = self._bounds_of(group)
+        room = BOX_ROOM * self.grid.spacing
+        group.low, group.high = wp.vec3(*(low - room)), wp.vec3(*(high + room))
 
     def remember(self, position: wp.array) -> None:
         """Store the positions of particles [m], shape (n,), before they move."""

@@ -58,6 +58,8 @@ class ThinGroup:
     shift_before: wp.vec3d
     turn: wp.mat33d
     shift: wp.vec3d
+    low: wp.vec3  # corners of a box around its shapes after the step, with some room [m]
+    high: wp.vec3
 
 
 SHAPES, GROUPS = wp.array(dtype=ThinShape), wp.array(dtype=ThinGroup)
@@ -365,6 +367,16 @@ def free_way(
 
 
 @wp.func
+def passes_by(group: ThinGroup, x: wp.vec3, y: wp.vec3):
+    """Return whether a path lies beside the box around a group's shapes after the step."""
+    result = bool(False)
+    for d in range(3):
+        if wp.max(x[d], y[d]) < group.low[d] or wp.min(x[d], y[d]) > group.high[d]:
+            result = True
+    return result
+
+
+@wp.func
 def into_group(turn: wp.mat33d, shift: wp.vec3d, x: wp.vec3d):
     """Return the position of a point in the frame of a group."""
     return wp.transpose(turn) * (x - shift)
@@ -409,9 +421,14 @@ def stop_kernel(
             if still != 0:
                 turn = group.turn
                 shift = group.shift
-            a = into_group(turn, shift, x)
-            b = into_group(group.turn, group.shift, y)
-            end, met = free_way(shapes, group.first, group.end, a, b, margin, planes, wedged < 2)
+            end = wp.vec3d()
+            met = bool(False)
+            if still == 0 or not passes_by(group, wp.vec3(x), wp.vec3(y)):
+                a = into_group(turn, shift, x)
+                b = into_group(group.turn, group.shift, y)
+                end, met = free_way(
+                    shapes, group.first, group.end, a, b, margin, planes, wedged < 2
+                )
             agreed += 1
             if met:
                 slid = group.turn * end + group.shift
