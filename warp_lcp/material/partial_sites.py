@@ -28,7 +28,6 @@ SAMPLES = {2: 6, 3: 3}  # sample points per site and axis, for its filled share
 DRAWS = 5
 # Steps of these numbers along x, y and z: square roots of primes are independent over the rationals
 STEPS = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47]).reshape(DRAWS, 3) % 1.0
-CORNER = 0.499  # of a site from its center, along each axis: a corner of it
 Region = Callable[[np.ndarray], np.ndarray]
 
 
@@ -42,7 +41,8 @@ class PartialSites:
         boundary: its solids.
         geometries: the regions; a point in several belongs to the first.
         per_axis: sites along an edge of a cell.
-        random_seed: seed of the draws.
+        jitter: width of the random displacement of lattice points, which full sites get.
+        random_seed: seed of the displacements and of the draws.
 
     Attributes:
         beside: the regions with a cell that a thin solid crosses.
@@ -55,10 +55,12 @@ class PartialSites:
         geometries: Sequence[Geometry],
         *,
         per_axis: int,
+        jitter: float,
         random_seed: int,
     ) -> None:
         self.grid, self.boundary, self.geometries = grid, boundary, list(geometries)
         self.per_axis, self.size = per_axis, grid.spacing / per_axis
+        self.jitter, self.random_seed = jitter, random_seed
         self._start = np.random.default_rng(random_seed).random(DRAWS)
         self.beside = self._beside()
 
@@ -115,15 +117,7 @@ class PartialSites:
         for geometry in self.beside:
             distance = signed_distance(geometry, centers, grid.device)
             result |= near & (distance < reach)
-            crossed = np.flatnonzero(np.abs(distance) < reach)
-            # A site with all of its corners in the region is full, as at the sides of the domain.
-            full = np.ones(len(crossed), dtype=bool)
-            for corner in np.ndindex(*(2,) * grid.dimension):
-                way = np.zeros(3)
-                way[: grid.dimension] = CORNER * (2.0 * np.array(corner) - 1.0)
-                at = centers[crossed] + way * self.size
-                full &= signed_distance(geometry, at, grid.device) < 0.0
-            result[crossed[~full]] = True
+            result |= np.abs(distance) < reach
         return result
 
     def fill(self, open_cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,43 +131,52 @@ class PartialSites:
         """
         grid = self.grid
         candidates = [
-            self._candidates(self._open_sites(plane, open_cells))
+            self._candidates(*self._open_sites(plane, open_cells))
             for plane in range(grid.origin[2], grid.origin[2] + grid.counts[2])
         ]
-        points, owner, keys = (np.concatenate(column) for column in list(zip(*candidates))[:3])
-        counts = grid.part.ranks.sum(np.sum([filled for *_, filled in candidates], axis=0))
-        everyone = grid.part.ranks.collect((owner, keys))
-        owners, all_keys = (np.concatenate(column) for column in zip(*everyone, strict=True))
-        kept = np.zeros(len(points), dtype=bool)
-        # The rounding of one region is made up for by the next one.
-        samples, total, placed = SAMPLES[grid.dimension] ** grid.dimension, 0, 0
-        for number, count in enumerate(counts.tolist()):
-            total += count
-            own = np.sort(all_keys[owners == number])
-            wanted = min(max(round(total / samples) - placed, 0), len(own))
-            if wanted:
-                kept |= (owner == number) & (keys <= own[wanted - 1])
-            placed += wanted
+        points, owner, count, draw = (np.concatenate(column) for column in zip(*candidates))
+        samples = SAMPLES[grid.dimension] ** grid.dimension
+        # Full sites are the first.
+        keys = np.where(count == samples, -1.0, draw - count / samples)
+        everyone = grid.part.ranks.collect((keys, int(count.sum())))
+        wanted = round(sum(filled for _, filled in everyone) / samples)
+        order = np.sort(np.concatenate([other for other, _ in everyone]))
+        kept = keys <= (order[wanted - 1] if wanted else -np.inf)
         return points[kept], owner[kept]
 
-    def _open_sites(self, plane: int, open_cells: np.ndarray) -> np.ndarray:
-        """Return this process's partially filled sites in a plane of cells, shape (n, 3)."""
+    def _open_sites(self, plane: int, open_cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return this process's partially filled sites in a plane of cells, and their points.
+
+        Sites and lattice points [m] have shape (n, 3).
+        """
         grid = self.grid
+        points = lattice(grid, self.per_axis, self.jitter, self.random_seed, plane)
         sites = self._sites_of(lattice(grid, self.per_axis, 0.0, 0, plane))
         cells = sites // self.per_axis - np.array(grid.origin)
         ours = ((cells >= 0) & (cells < np.array(grid.counts)))[:, :2].all(axis=1)
-        sites, cells = sites[ours], cells[ours]
-        sites = sites[open_cells[plane - grid.origin[2], cells[:, 1], cells[:, 0]]]
-        return sites[self._partial(sites)]
+        sites, cells, points = sites[ours], cells[ours], points[ours]
+        free = open_cells[plane - grid.origin[2], cells[:, 1], cells[:, 0]]
+        sites, points = sites[free], points[free]
+        partial = self._partial(sites)
+        return sites[partial], self._clipped(points[partial])
+
+    def _clipped(self, points: np.ndarray) -> np.ndarray:
+        """Return points [m], float32, at the distance of particles from the domain's sides."""
+        axes, margin = slice(self.grid.dimension), MARGIN * self.grid.spacing
+        result = points.astype(np.float32)
+        np.clip(result[:, axes], margin, self.grid.extent[axes] - margin, out=result[:, axes])
+        return result
 
     def _candidates(
-        self, sites: np.ndarray
+        self, sites: np.ndarray, usual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return a point in the filled part of each site that has one.
 
+        A full site gets its lattice point `usual` [m], shape (n, 3).
+
         Returns:
-            Points [m], float32, shape (n, 3); their regions, shape (n,); t - f, shape (n,); and the
-            number of sample points in each region, shape (regions,).
+            Points [m], float32, shape (n, 3); and, of shape (n,), their regions, the number of the
+            site's sample points in regions, and t.
         """
         grid, dimension = self.grid, self.grid.dimension
         each, axes = SAMPLES[dimension], slice(dimension)
@@ -182,28 +185,22 @@ class PartialSites:
         points = np.zeros((len(sites), len(steps), 3))
         points[..., axes] = sites[:, None, axes] + (steps + draws[:, None, axes]) / each
         points *= self.size
-        flat = points.reshape(-1, 3).astype(np.float32)
-        margin = MARGIN * grid.spacing
-        np.clip(flat[:, axes], margin, grid.extent[axes] - margin, out=flat[:, axes])
+        flat = self._clipped(points.reshape(-1, 3))
         free = self.boundary.admits(flat)
         owner = np.full(len(flat), -1)
         for number, geometry in enumerate(self.geometries):
             at = np.flatnonzero(free & (owner < 0))
             owner[at[inside([geometry], flat[at], device=grid.device)]] = number
-        filled = np.bincount(owner[owner >= 0], minlength=len(self.geometries))
         owner = owner.reshape(len(sites), len(steps))
         share = (owner >= 0).sum(axis=1)
         some = np.flatnonzero(share)
         # The chosen one among the sample points in regions.
         order = np.minimum((draws[some, 3] * share[some]).astype(int), share[some] - 1)
         chosen = (np.cumsum(owner[some] >= 0, axis=1) > order[:, None]).argmax(axis=1)
-        keys = draws[some, 4] - share[some] / len(steps)
-        return (
-            flat.reshape(len(sites), len(steps), 3)[some, chosen],
-            owner[some, chosen],
-            keys,
-            filled,
-        )
+        result = flat.reshape(len(sites), len(steps), 3)[some, chosen]
+        full = (share[some] == len(steps)) & self.boundary.admits(usual[some])
+        result[full] = usual[some[full]]
+        return result, owner[some, chosen], share[some], draws[some, 4]
 
 
 def seed_regions(
@@ -234,7 +231,9 @@ def seed_regions(
     Returns:
         Positions [m], float32, shape (n, 3), and the region of each, shape (n,).
     """
-    partial = PartialSites(grid, boundary, geometries, per_axis=per_axis, random_seed=random_seed)
+    partial = PartialSites(
+        grid, boundary, geometries, per_axis=per_axis, jitter=jitter, random_seed=random_seed
+    )
     position, owner = seed(
         grid,
         regions,
