@@ -235,12 +235,13 @@ def is_bent(S: WallKernelFields, cube: Cube, at: wp.vec3i, corner: int, axis: in
 
 @wp.func
 def shared_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, crossed: int):
-    """Return the vector area of the wall on an edge of corner 0, as a share.
+    """Return the vector area of the wall on an edge of corner 0, as a share, and its centroid.
 
-    A plane wall of one solid is divided among all edges that it crosses: the pressure is linear, so
+    The centroid is a vector from the crossing [cells], used where walls differ. A plane wall of one solid is divided among all edges that it crosses: the pressure is linear, so
     its mean over the wall is that at the wall's centroid, and the mean of the crossings is the
     centroid of a segment or triangle. Where several walls meet, each component belongs to the
-    walls on edges along its own axis; without such walls it is divided among all.
+    walls on edges along its own axis; without such walls it is divided among all. A wall that
+    ends at another one before the next edge has its centroid halfway to that.
     """
     counts = wp.vec3i()
     first = cube.number[0, crossed]
@@ -264,7 +265,12 @@ def shared_area(S: WallKernelFields, cube: Cube, at: wp.vec3i, found: int, cross
         if plane or axis == crossed or counts[axis] == 0:
             sharing = wp.where(plane or counts[axis] == 0, total, counts[axis])
             area[axis] = wall_area(S, cube, at, found, axis) / float(sharing)
-    return area
+    centroid = wp.vec3()
+    if not plane:
+        for axis in range(cube.planes + 1):
+            if axis != crossed and cube.distance[0, axis] != _OPEN:
+                centroid[axis] = 0.5 * float(cube.sides[axis]) * cube.distance[0, axis]
+    return area, centroid
 
 
 @cell_kernel("fluids.thin_forces")
@@ -307,17 +313,20 @@ def thin_pressure_kernel(
                 if solid > 0:
                     if values:
                         area = wp.vec3()
+                        more = wp.vec3()  # x at the centroids beyond that at the crossing, and area
                         for octant in range(4 * S.planes):
                             if ((octant >> axis) & 1 != 0) == (side < 0):
                                 cube = cube_at(S, octant, k, j, i)
-                                area += shared_area(
+                                part, centroid = shared_area(
                                     S, cube, wp.vec3i(i, j, k), connected(cube), axis
                                 )
-                        more = float(side) * distance * kick[axis]
+                                area += part
+                                more += wp.dot(centroid, kick) * part
+                        more += float(side) * distance * kick[axis] * area
                         place = cell_center(S, k, j, i)
                         way = wp.float64(float(side) * distance) * S.spacing
                         place[axis] = place[axis] + way
-                        force = scale * (x[k, j, i] + wp.float64(more)) * wp.vec3d(area)
+                        force = scale * (x[k, j, i] * wp.vec3d(area) + wp.vec3d(more))
                         put(e, solid, force, place - references[solid], owners, values)
                     e += 1
     counts[row] = e - begin
