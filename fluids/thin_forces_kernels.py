@@ -12,8 +12,11 @@ from warp_lcp.grid.cell_kernel import F64, INTS, U8, cell_kernel, next_to
 OPEN = -1.0  # distance along an edge that no wall crosses
 MIDWAY = 0.5  # cells: distance to other walls, which close a face between two cells
 PASSES = 4  # passes over the corners of a cube, to find which are connected
+# Share of a square by which the area in front of an inner corner exceeds that of a straight wall.
+BENT = 0.02
 
-_OPEN, _MIDWAY = wp.constant(OPEN), wp.constant(MIDWAY)
+
+_OPEN, _MIDWAY, _BENT = wp.constant(OPEN), wp.constant(MIDWAY), wp.constant(BENT)
 Distances = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 Numbers = wp.types.matrix(shape=(8, 3), dtype=wp.int32)
 
@@ -224,25 +227,57 @@ def wall_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, axi
 
 
 @wp.func
-def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, crossed: int):
-    """Return the vector area of the wall on an edge of corner 0, as a share.
+def is_bent(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis: int, other: int):
+    """Return whether the walls on two edges of a corner are two sides of an inner corner."""
+    bent = bool(False)
+    a = cube.distance[corner, axis]
+    b = cube.distance[corner, other]
+    if a != _OPEN and b != _OPEN:
+        lean_a = lean(S, cube, at, corner, axis, other)
+        lean_b = lean(S, cube, at, corner, other, axis)
+        bent = corner_area(a, b, lean_a, lean_b) > (0.5 + _BENT) * a * b
+    return bent
 
-    Each component belongs to the walls on edges along its own axis; without such walls it is
-    divided among all.
+
+@wp.func
+def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, crossed: int):
+    """Return the vector area of the wall on an edge of corner 0, as a share, and its centroid.
+
+    The centroid is a vector from the crossing [cells], used where walls differ. A plane wall of
+    one solid is divided among all edges that it crosses: the pressure is linear, so its mean over
+    the wall is that at the wall's centroid, and the mean of the crossings is the centroid of a
+    segment or triangle. Where several walls meet, each component belongs to the
+    walls on edges along its own axis; without such walls it is divided among all. A wall that
+    ends at another one before the next edge has its centroid halfway to that.
     """
     counts = wp.vec3i()
+    first = cube.number[0, crossed]
+    plane = bool(first > 0)
     for n in range(4 * cube.planes):
         if (found >> n) & 1 != 0:
             for axis in range(cube.planes + 1):
                 if cube.distance[n, axis] != _OPEN:
                     counts[axis] = counts[axis] + 1
+                    if cube.number[n, axis] != first:
+                        plane = False
+    if plane:
+        for n in range(4 * cube.planes):
+            if (found >> n) & 1 != 0:
+                for axis in range(cube.planes + 1):
+                    if is_bent(S, cube, at, n, axis, (axis + 1) % (cube.planes + 1)):
+                        plane = False
     total = counts[0] + counts[1] + counts[2]
     area = wp.vec3()
     for axis in range(cube.planes + 1):
-        if axis == crossed or counts[axis] == 0:
-            sharing = wp.where(counts[axis] == 0, total, counts[axis])
+        if plane or axis == crossed or counts[axis] == 0:
+            sharing = wp.where(plane or counts[axis] == 0, total, counts[axis])
             area[axis] = wall_area(S, cube, at, found, axis) / float(sharing)
-    return area
+    centroid = wp.vec3()
+    if not plane:
+        for axis in range(cube.planes + 1):
+            if axis != crossed and cube.distance[0, axis] != _OPEN:
+                centroid[axis] = 0.5 * float(cube.sides[axis]) * cube.distance[0, axis]
+    return area, centroid
 
 
 @cell_kernel("fluids.thin_forces")
@@ -285,17 +320,20 @@ def thin_pressure_kernel(
                 if solid > 0:
                     if values:
                         area = wp.vec3()
+                        more = wp.vec3()  # x at the centroids beyond that at the crossing, and area
                         for octant in range(4 * S.planes):
                             if ((octant >> axis) & 1 != 0) == (side < 0):
                                 cube = cube_at(S, octant, k, j, i)
-                                area += shared_area(
+                                part, centroid = shared_area(
                                     S, cube, wp.vec3i(i, j, k), connected(cube), axis
                                 )
-                        more = float(side) * distance * kick[axis]
+                                area += part
+                                more += wp.dot(centroid, kick) * part
+                        more += float(side) * distance * kick[axis] * area
                         place = cell_center(S, k, j, i)
                         way = wp.float64(float(side) * distance) * S.spacing
                         place[axis] = place[axis] + way
-                        force = scale * (x[k, j, i] + wp.float64(more)) * wp.vec3d(area)
+                        force = scale * (x[k, j, i] * wp.vec3d(area) + wp.vec3d(more))
                         put(e, solid, force, place - references[solid], owners, values)
                     e += 1
     counts[row] = e - begin

@@ -13,7 +13,6 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ ANGLES = [0.0, 0.0, 7.0, 15.0, 30.0, 45.0, 60.0, 80.0]  # degrees
 OFFSETS = 16  # of a cell
 GRAVITY, DENSITY = 9.81, 1000.0
 SLACK = 2e-3  # cells by which a particle may seem to be beyond a surface, for rounding
+STRIPS = 2.0  # strips per cell that fill a tilted bottle
 COUNTS = {2: 32, 3: 16}  # cells of the domain along an axis
 Sides = Callable[[np.ndarray, Any], np.ndarray]
 
@@ -106,21 +106,39 @@ def width_at(corners: np.ndarray, y: float) -> tuple[float, float]:
 
 
 def filled(
-    low: np.ndarray, high: np.ndarray, angle: float, share: float, dx: float
+    low: np.ndarray, high: np.ndarray, angle: float, share: float, dx: float, place: Tables
 ) -> list[Tables]:
-    """Return slabs that fill a share of a turned box, up to a level surface."""
-    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    corners = turned(corners, angle, (low + high) / 2.0)
-    heights = np.linspace(corners[:, 1].min(), corners[:, 1].max(), 4001)
-    widths = np.array([np.ptp(width_at(corners, y)) for y in heights])
-    areas = np.cumsum(0.5 * (widths[1:] + widths[:-1]) * np.diff(heights))
-    top = float(np.interp(share * areas[-1], areas, heights[1:]))
-    ends = np.linspace(heights[0], top, round((top - heights[0]) / (dx / 4.0)) + 1)
-    slabs = []
-    for a, b in pairwise(ends):
-        left, right = width_at(corners, (a + b) / 2.0)
-        slabs.append(box([left, a, *low[2:]], [right, b, *high[2:]]))
-    return slabs
+    """Return strips that fill a share of a turned box, up to a level surface.
+
+    The strips are boxes that are turned as the box itself is: they fill it up to its walls, and
+    their ends are stairs along the surface. A point at (p, q) from the center, in the box's own
+    frame, is p sin(angle) + q cos(angle) above the center.
+    """
+    slopes = np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
+    along = int(np.argmax(slopes))
+    across = 1 - along
+    half = 0.5 * (high - low)[:2]
+    ends = np.linspace(-half[across], half[across], round(2.0 * half[across] / dx * STRIPS) + 1)
+    middles = 0.5 * (ends[1:] + ends[:-1])
+    tops = np.linspace(-half.sum(), half.sum(), 100001)
+    reach = np.clip(
+        (tops[:, None] - slopes[across] * middles) / slopes[along], -half[along], half[along]
+    )
+    top = np.searchsorted((reach + half[along]).mean(axis=1), share * 2.0 * half[along])
+    strips = []
+    for a, b, end in zip(ends[:-1], ends[1:], reach[top], strict=True):
+        first, last = low.copy(), high.copy()
+        center = 0.5 * (low + high)
+        first[across], last[across] = center[across] + a, center[across] + b
+        last[along] = center[along] + end
+        if end + half[along] > 1.5 * dx:
+            strips.append(box(first, last, **place))
+    return strips
+
+
+def volume(boxes: list[Tables]) -> float:
+    """Return the volume of boxes that do not overlap [m^3; m^2 in 2-D]."""
+    return float(sum(np.prod(np.subtract(one["max"], one["min"])) for one in boxes))
 
 
 def bottle(
@@ -149,7 +167,7 @@ def bottle(
     solids = [one | where for one in shell]
     share = 0.6
     if angle and motion is None:
-        material = filled(low, high, angle, share, dx)
+        material = filled(low, high, angle, share, dx, where)
     else:
         top = [high[0], low[1] + share * (high[1] - low[1]), *high[2:]]
         material = [box(low, top, **{k: v for k, v in where.items() if k != "motion"})]
@@ -164,7 +182,7 @@ def bottle(
         inside = (own > low - SLACK * dx) & (own < high + SLACK * dx)
         return np.asarray(np.where(inside.all(axis=1), 1, -1))
 
-    weight = share * float(np.prod(high - low)) * DENSITY * GRAVITY
+    weight = volume(material) * DENSITY * GRAVITY
     kind = f"{'mesh ' if mesh else ''}bottle {motion or 'at rest'}"
     label = f"{kind} {thick} cells, offset {offset.tolist()}, {angle} degrees, CFL {cfl}"
     tables = scene(simulator, dimension, material, solids, cfl)

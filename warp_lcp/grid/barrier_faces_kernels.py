@@ -16,9 +16,7 @@ from warp_lcp.grid.barrier_geometry import (
     Barrier,
     nearest_wall,
     place_of,
-    room_at,
     sees,
-    sees_from,
     sight_code,
     sight_of,
     wall_between,
@@ -48,6 +46,8 @@ WHOLE = "warp_lcp.grid.barriers.whole"
 WIDEST = wp.constant(1.0)  # cells from a face's center up to which its open part may reach
 HALVINGS = 10  # halvings of the interval that the end of a face's open part lies in
 LEAST_OPEN = 0.02  # least open fraction of a crossed face
+STEPS = wp.constant(12)  # steps along a ray, in the integral of a cell's density kernel
+
 _AIR, _SOLID = wp.constant(wp.int8(AIR)), wp.constant(wp.int8(SOLID))
 
 
@@ -444,34 +444,52 @@ def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INT
             wp.atomic_add(gaps, int(number[k, j, i]), 1)
 
 
+@wp.func
+def kernel_along(way: wp.vec3, end: float, planes: int):
+    """Return the integral of a cell's density kernel over a thin pyramid, up to a constant.
+
+    The pyramid has its tip at the cell's center and is cut at `end` <= 1 of its length `way`
+    [cells]: the integral of s^(d - 1) B(s x) B(s y) B(s z) over s from 0 to `end`.
+    """
+    total = float(0.0)
+    step = end / float(STEPS)
+    for n in range(STEPS):
+        s = (float(n) + 0.5) * step
+        w = s * spline(s * way[0]) * spline(s * way[1])
+        if planes == 2:
+            w *= s * spline(s * way[2])
+        total += w * step
+    return total
+
+
 @cell_kernel(MODULE)
-def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
+def share_kernel(k, j, i, B: Barrier, rays: int, share: F32):
     """Find the share of a cell's density kernel that its center sees.
 
-    The kernel is sampled at points of equal distance, `parts` per cell and axis.
+    What the center sees is star-shaped. So the kernel is integrated along rays, each up to the
+    first solid: `rays` per edge of each side of the kernel's support, which is 3 cells wide. The
+    share is then smooth in the distance of a wall; with points that are seen or not it had steps.
     """
     result = float(1.0)
     if B.near[k, j, i] != wp.uint8(0):
         x = place_of(B, CENTERS, k, j, i)
-        room = room_at(B, x, REACH * B.dx)
         seen = float(0.0)
         all = float(0.0)
-        step = 1.0 / float(parts)
-        layers = wp.where(B.planes == 2, 3 * parts, 1)
-        for c in range(layers):
-            z = float(0.0)
-            if B.planes == 2:
-                z = (float(c) + 0.5) * step - 1.5
-            for b in range(3 * parts):
-                y = (float(b) + 0.5) * step - 1.5
-                for a in range(3 * parts):
-                    way = wp.vec3((float(a) + 0.5) * step - 1.5, y, z)
-                    w = spline(way[0]) * spline(y)
+        step = 3.0 / float(rays)
+        layers = wp.where(B.planes == 2, rays, 1)
+        for side in range(2 * (B.planes + 1)):
+            axis = side >> 1
+            for c in range(layers):
+                for b in range(rays):
+                    way = wp.vec3()
+                    way[axis] = 1.5 * float(2 * (side & 1) - 1)
+                    way[(axis + 1) % (B.planes + 1)] = (float(b) + 0.5) * step - 1.5
                     if B.planes == 2:
-                        w *= spline(z)
-                    all += w
-                    if sees_from(B, x, x + B.dx * way, room):
-                        seen += w
+                        way[(axis + 2) % 3] = (float(c) + 0.5) * step - 1.5
+                    found, t = wall_between(B, x, x + B.dx * way)
+                    all += kernel_along(way, 1.0, B.planes)
+                    free = wp.where(found > 0, wp.clamp(t, 0.0, 1.0), 1.0)
+                    seen += kernel_along(way, free, B.planes)
         result = seen / all
     share[k, j, i] = result
 

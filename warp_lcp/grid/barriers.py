@@ -35,10 +35,9 @@ from warp_lcp.operators.grid_poisson import FLUID
 # Cells. The level set and velocities are extrapolated two layers into thicker solids, which cut
 # cells; in thinner solids these layers would overlap those of the other side.
 BARRIER = 3.0
-# Sample points per cell and axis, for the share of its kernel that its center sees.
-PARTS = {2: 6, 3: 3}
-PARTS_MOVING = {2: 4, 3: 2}  # sample points per cell and axis if solids move, in each step
 SAMPLES = {2: 96, 3: 12}  # lines per axis of a face, for the part that a solid's edge leaves open
+# Rays per edge of the support of a cell's density kernel, for the share that its center sees.
+RAYS = {2: 16, 3: 6}
 COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
@@ -123,8 +122,8 @@ class Barriers:
         if self.walls.has_meshes:
             self._all.launch(faces_kernels.inside_kernel, [barrier, self.near])
         self._all.launch(faces_kernels.apart_kernel, [barrier, CENTERS, self.apart[-1]])
-        parts = (PARTS_MOVING if self.walls.moves else PARTS)[grid.dimension]
-        self._all.launch(faces_kernels.share_kernel, [barrier, parts, self._share])
+        rays = RAYS[grid.dimension]
+        self._all.launch(faces_kernels.share_kernel, [barrier, rays, self._share])
 
     def _around(self) -> Window:
         """Return the cells near the solids, cells of the ring included."""

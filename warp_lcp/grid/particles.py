@@ -846,6 +846,7 @@ def seed(
     per_axis: int,
     jitter: float,
     random_seed: int,
+    without: typing.Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill regions with particles on a jittered lattice.
 
@@ -860,6 +861,8 @@ def seed(
         jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter
             <= 1.
         random_seed: seed of the displacements; they do not depend on the regions.
+        without: function of points [m], shape (n, 3), that returns which get no particle, shape
+            (n,).
 
     Returns:
         Positions [m], float32, shape (n, 3), and the region of each, shape (n,).
@@ -885,6 +888,8 @@ def seed(
             points, cells = points[ours], cells[ours]
         free = open_cells[plane - grid.origin[2], cells[:, 1], cells[:, 0]]
         points = points[free]
+        if without is not None:
+            points = points[~without(points)]
         owner = np.full(len(points), -1)
         for number, region in enumerate(regions):
             if len(points):

@@ -312,22 +312,29 @@ class ThinWalls:
             cost=COST,
         )
 
+    def room(self, points: np.ndarray, reach: float) -> np.ndarray:
+        """Return the distance of points [m], shape (n, 3), from the nearest solid, shape (n,).
+
+        It is at most `reach` [m]; from a mesh it is measured to the surface on either side.
+        """
+        at = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=self.grid.device)
+        room = wp.empty(len(points), dtype=wp.float64, device=self.grid.device)
+        if len(points):
+            launch_list(
+                kernels.room_kernel,
+                len(points),
+                [at, self.shapes, self.groups, wp.float64(reach), room],
+                device=self.grid.device,
+                cost=COST,
+            )
+        return np.asarray(room.numpy())
+
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Return a mask of points [m], shape (n, 3), that keep their distance.
 
         A particle may start there.
         """
-        at = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=self.grid.device)
-        room = wp.empty(len(points), dtype=wp.float64, device=self.grid.device)
-        reach = wp.float64(2.0 * float(self._margin))
-        launch_list(
-            kernels.room_kernel,
-            len(points),
-            [at, self.shapes, self.groups, reach, room],
-            device=self.grid.device,
-            cost=COST,
-        )
-        result = room.numpy() >= float(self._margin)
+        result = self.room(points, 2.0 * float(self._margin)) >= float(self._margin)
         for group in self._groups:
             turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
             meshes = (

@@ -167,6 +167,24 @@ def inside(
     return result
 
 
+def signed_distance(geometry: Geometry, points: np.ndarray, device: wp.Device) -> np.ndarray:
+    """Return the signed distance of points from a geometry [m], shape (m,); negative inside.
+
+    Args:
+        geometry: the region.
+        points: [m], shape (m, 3); z = 0 in 2-D.
+        device: device on which distances are evaluated.
+    """
+    result = np.empty(len(points), dtype=np.float32)
+    for first in range(0, len(points), CHUNK):
+        part = slice(first, first + CHUNK)
+        positions = wp.array(points[part], dtype=wp.vec3, device=device)
+        distance = wp.empty(len(positions), dtype=wp.float32, device=device)
+        geometry.signed_distance(positions, distance)
+        result[part] = distance.numpy()
+    return result
+
+
 def start_notes(
     solids: Sequence[PlacedSolid], grid: StaggeredGrid, held: Collection[int] = ()
 ) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.grid.particles import seed
+from warp_lcp.material.partial_sites import seed_regions
 from warp_lcp.material.particle_assembly import region_of
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.shapes import MaterialProperties
@@ -37,10 +37,12 @@ def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -
     free = (cells == wl.AIR) & (grid.interior(boundary.base.numpy()) != wl.SOLID)
     i, j, k = simulation.particles.cells_of(simulation.particles.position.numpy()).T
     free[k, j, i] = False  # cells that material has entered since the last solve
-    region = region_of(shape.to_geometry(Path.cwd(), grid.dimension), boundary, grid.device)
-    points, _ = seed(
+    geometry = shape.to_geometry(Path.cwd(), grid.dimension)
+    points, _ = seed_regions(
         grid,
-        [region],
+        boundary,
+        [geometry],
+        [region_of(geometry, boundary, grid.device)],
         free,
         per_axis=settings.per_axis,
         jitter=settings.jitter,

@@ -38,6 +38,7 @@ from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
 from warp_lcp.material.domain_window import DomainWindow
 from warp_lcp.material.narrow_band import NarrowBand
+from warp_lcp.material.partial_sites import seed_regions
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_volume import ParticleVolume
 from warp_lcp.material.reseeding import Reseeding
@@ -378,8 +379,10 @@ def seed_materials(
     if without is not None:
         open_cells &= ~without
     grid.part.keep_own(open_cells)
-    position, owner = seed(
+    position, owner = seed_regions(
         grid,
+        boundary,
+        geometries,
         regions,
         open_cells,
         per_axis=settings.per_axis,
