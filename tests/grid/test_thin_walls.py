@@ -250,3 +250,68 @@ def test_thin_solids_are_recognized():
     )
     assert fills_cells(Box(lower=(0.0, 2 * CELL), upper=(1.0, 3 * CELL)), grid(2), 1e-2)
     assert not fills_cells(thin, grid(2), 1e-2)
+
+
+def relative_speed(motion, x, v, time, dt, bounds, reach):
+    """Return the largest speed of points relative to a solid within `reach` of a box around it."""
+    before, after = motion.pose(time), motion.pose(time + dt)
+    most = 0.0
+    corners = np.array(np.meshgrid(*np.asarray(bounds).T)).reshape(3, -1).T
+    placed = corners @ before.rotation.T + before.translation
+    low, high = placed.min(axis=0) - reach, placed.max(axis=0) + reach
+    for point, speed in zip(x, v, strict=True):
+        if (point >= low).all() and (point <= high).all():
+            own = before.rotation.T @ (point - before.translation)
+            moved = after.rotation @ own + after.translation
+            most = max(most, float(np.linalg.norm(speed - (moved - point) / dt)))
+    return most
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_material_goes_at_most_a_cell_in_the_frame_of_moving_solids(seed: int) -> None:
+    """A step is halved, or shortened in proportion, until it fits; step by step in NumPy."""
+    rng = np.random.default_rng(seed)
+    g = grid(3)
+    shape = Box(lower=(0.3, 0.4, 0.45), upper=(0.7, 0.41, 0.55))
+    motion = (
+        Sinusoid(period=0.1, amplitude=(0.1, 0.05, 0.0), center=(0.5, 0.5, 0.5), angle=20.0)
+        if seed % 2
+        else Rotation(rate=2000.0, center=(0.5, 0.4, 0.5), axis=(0.0, 0.0, 1.0))
+    )
+    walls, time, longest, reach = thin_walls(g, [shape], motion), 0.013, 0.02, 3.0 * CELL
+    walls.place(time)
+    x, v = rng.uniform(0.2, 0.8, (200, 3)), rng.normal(0.0, 3.0, (200, 3))
+    x, v = x.astype(np.float32), v.astype(np.float32)
+    position, velocity = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (x, v))
+    skin = 1e-4 * CELL
+    bounds = shape.bounds() + np.array([[-skin], [skin]])
+    dt = longest
+    while True:
+        way = dt * relative_speed(motion, x.astype(float), v.astype(float), time, dt, bounds, reach)
+        if way <= CELL * 1.001:
+            break
+        dt *= max(CELL / way, 0.5)
+    assert dt < 0.5 * longest
+    step = walls.longest_step(position, velocity, time, longest, reach)
+    assert step == pytest.approx(dt, rel=1e-9)
+    # No limit where the step is short enough, where nothing is near, and where nothing moves.
+    assert walls.longest_step(position, velocity, time, 0.5 * step, reach) == np.inf
+    far = wp.array(np.full((2, 3), 0.95, dtype=np.float32), dtype=wp.vec3, device="cpu")
+    assert walls.longest_step(far, velocity[:2], time, longest, 0.0) == np.inf
+    assert walls.longest_step(position[:0], velocity[:0], time, longest, reach) == np.inf
+
+
+def test_material_that_moves_with_the_solids_does_not_shorten_the_step() -> None:
+    motion = Rotation(rate=2000.0, center=(0.5, 0.5), axis=(0.0, 0.0, 1.0))
+    walls = thin_walls(grid(2), [Box(lower=(0.3, 0.4), upper=(0.7, 0.41))], motion)
+    rng = np.random.default_rng(5)
+    x = np.zeros((50, 3), dtype=np.float32)
+    x[:, :2] = rng.uniform(0.3, 0.7, (50, 2))
+    dt = 0.01
+    pose, later = motion.pose(0.0), motion.pose(dt)
+    moved = (x - pose.translation) @ pose.rotation @ later.rotation.T + later.translation
+    v = ((moved - x) / dt).astype(np.float32)
+    position, velocity = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (x, v))
+    assert walls.longest_step(position, velocity, 0.0, dt, CELL) == np.inf
+    velocity.assign(np.zeros_like(v))
+    assert walls.longest_step(position, velocity, 0.0, dt, CELL) < 0.5 * dt

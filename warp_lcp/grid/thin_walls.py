@@ -9,6 +9,7 @@ slides on, at the true surface and on its own side.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise, product
 
@@ -17,7 +18,7 @@ import warp as wp
 
 from warp_lcp.grid import thin_walls_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.motion import Motion, Motions
+from warp_lcp.grid.motion import Motion, Motions, RigidMotion
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.signed_distance import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -36,6 +37,10 @@ SHELL_SHARE = 0.8
 # Cells around a group's shapes that belong to their box: more than the distance that particles keep.
 BOX_ROOM = 0.05
 COST = 32  # work of a particle, in cells of a usual pass
+# Cells that material near moving thin solids may go in a step, in the frame of the solids.
+RELATIVE_WAY = 1.0
+WAY_ROUNDING = 1e-3  # relative excess of the way that does not shorten a step
+SHORTENINGS = 12  # most times that a step is shortened, to half its length at least each time
 SimpleShape = Box | Sphere | Capsule | TriangleMesh
 
 
@@ -198,6 +203,7 @@ class ThinWalls:
             )
         self._margin, self.least, self.most = wp.float64(margin), low, high
         self._start = wp.empty(0, dtype=wp.vec3, device=grid.device)
+        self._speed = wp.empty(0, dtype=wp.float64, device=grid.device)
         self.place(0.0)
         self.place(0.0)
 
@@ -248,11 +254,11 @@ class ThinWalls:
 
         Low and high corner [m], shape (3,) each.
         """
-        lows, highs = zip(*map(self._bounds_of, self._groups), strict=True)
-        return np.min(lows, axis=0), np.max(highs, axis=0)
+        boxes = np.array([self._bounds_of(group) for group in self._groups])
+        return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
 
     def _bounds_of(self, group: kernels.ThinGroup) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of a box around the shapes of a group at its current place."""
+        """Return the corners of a box around a group at its current place [m], (3,) each."""
         lows, highs = [], []
         turn, shift = np.array(group.turn).reshape(3, 3), np.array(group.shift)
         for geometry in self._geometries[group.first : group.end]:
@@ -269,6 +275,74 @@ class ThinWalls:
         low, high = self._bounds_of(group)
         room = BOX_ROOM * self.grid.spacing
         group.low, group.high = wp.vec3(*(low - room)), wp.vec3(*(high + room))
+
+    def longest_step(
+        self, position: wp.array, velocity: wp.array, time: float, dt: float, reach: float
+    ) -> float:
+        """Return the longest step [s] that resolves how material meets moving solids; collective.
+
+        Let w(x) be the velocity of a solid at x, its mean over the step. A particle goes
+
+            |v - w(x)| dt
+
+        in the frame of the solid, at most `RELATIVE_WAY` cells. In longer steps the material piles
+        up at the walls that it meets: its velocity, computed at the start of the step, still leads
+        into the wall when the wall is there. Material that moves with the solids, however fast,
+        does not shorten the step. Rigid bodies, whose velocities are not known beforehand, do not
+        count.
+
+        Args:
+            position: of the particles [m], shape (n,).
+            velocity: of the particles [m/s], shape (n,).
+            time: start of the step [s]; the solids have been placed there.
+            dt: longest step to consider [s].
+            reach: particles within this distance [m] of a box around a solid count.
+
+        Returns:
+            Infinity if `dt` is short enough.
+        """
+        if all(isinstance(motion, RigidMotion) for motion in self._motions.motions):
+            return math.inf
+        most, longest = RELATIVE_WAY * self.grid.spacing, dt
+        for _ in range(SHORTENINGS):
+            speed = self._relative_speed(position, velocity, time, dt, reach)
+            way = float(self.grid.part.ranks.max(speed)) * dt
+            # Also if a velocity is not a number, which the totals report.
+            if not way > most * (1.0 + WAY_ROUNDING):
+                break
+            # Where the solid starts to move, the way is proportional to dt^2: a step in proportion
+            # to the way would be too short.
+            dt *= max(most / way, 0.5)
+        return dt if dt < longest else math.inf
+
+    def _relative_speed(
+        self, position: wp.array, velocity: wp.array, time: float, dt: float, reach: float
+    ) -> float:
+        """Return the largest speed of particles relative to driven solids near them [m/s]."""
+        count = len(position)
+        if count == 0:  # a rank without material
+            return 0.0
+        turns, shifts = self._motions.velocity_fields(time, dt)
+        boxes = []
+        for place, motion, image in self._moving:
+            if isinstance(self._motions.motions[motion], RigidMotion):
+                continue
+            low, high = self._bounds_of(self._groups[place])
+            box = kernels.MovingBox()
+            box.low, box.high = wp.vec3d(*(low - reach)), wp.vec3d(*(high + reach))
+            box.turn = wp.mat33d(turns[motion])
+            # The point x of an image moves as x - image does.
+            box.shift = wp.vec3d(*(shifts[motion] - turns[motion] @ image))
+            boxes.append(box)
+        device = self.grid.device
+        if len(self._speed) < count:
+            self._speed = wp.empty(count + count // 4, dtype=wp.float64, device=device)
+        speed = self._speed[:count]
+        moving = wp.array(boxes, dtype=kernels.MovingBox, device=device)
+        launch_list(
+            kernels.relative_speed_kernel, count, [position, velocity, moving, speed], device=device
+        )
+        return float(speed.numpy().max())
 
     def remember(self, position: wp.array) -> None:
         """Store the positions of particles [m], shape (n,), before they move."""

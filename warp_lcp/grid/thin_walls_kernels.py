@@ -62,6 +62,19 @@ class ThinGroup:
     high: wp.vec3
 
 
+@wp.struct
+class MovingBox:
+    """Box around the shapes of a group that moves, with a margin, and the group's velocity.
+
+    A point x of the group moves at turn x + shift.
+    """
+
+    low: wp.vec3d  # [m]
+    high: wp.vec3d
+    turn: wp.mat33d  # [1/s]
+    shift: wp.vec3d  # [m/s]
+
+
 SHAPES, GROUPS = wp.array(dtype=ThinShape), wp.array(dtype=ThinGroup)
 
 
@@ -471,3 +484,30 @@ def room_kernel(
             d, _n = away(shapes[s], p, reach)
             least = wp.min(least, d)
     room[i] = least
+
+
+@list_kernel(MODULE)
+def relative_speed_kernel(
+    i,
+    position: POINTS,
+    velocity: POINTS,
+    boxes: wp.array(dtype=MovingBox),
+    speed: wp.array(dtype=wp.float64),
+):
+    """Compute the speed of a particle relative to the moving solids near it [m/s].
+
+    It is |v - (turn x + shift)|, the largest of all boxes that the particle is in; 0 outside of
+    all.
+    """
+    x = wp.vec3d(position[i])
+    v = wp.vec3d(velocity[i])
+    most = _ZERO
+    for b in range(boxes.shape[0]):
+        box = boxes[b]
+        near = bool(True)
+        for k in range(3):
+            if x[k] < box.low[k] or x[k] > box.high[k]:
+                near = False
+        if near:
+            most = wp.max(most, wp.length(v - (box.turn * x + box.shift)))
+    speed[i] = most

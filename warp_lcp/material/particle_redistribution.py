@@ -26,7 +26,7 @@ STATE = "density_correction"
 PACE = 2.0  # factor on sqrt(dx / g): time in which an automatic correction removes the excess
 # Fraction of a liquid in excess above which moving solids compress it faster than at that pace.
 # Splashes among solids at rest have up to 0.034. Motions of rigid bodies do not count.
-SEVERE, SEVERE_THIN = 0.03, 0.01
+SEVERE, SEVERE_THIN = 0.03, 0.003
 PASSES = 8  # most corrections in a step
 
 

@@ -252,6 +252,8 @@ class ParticleSimulation(ParticleCheckpoints):
         """Return the CFL time step: CFL dx / (v_max + sqrt(CFL g dx)) [s].
 
         v_max is the largest speed of the material, and of solids and sources in the near future.
+        A liquid near moving thin solids goes at most one cell in their frame, see
+        `warp_lcp.grid.thin_walls.ThinWalls.longest_step`.
         """
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
@@ -269,7 +271,19 @@ class ParticleSimulation(ParticleCheckpoints):
         speed = max(totals.max_speed, *driven) + math.sqrt(
             cfl * math.sqrt(self.gravity @ self.gravity) * dx
         )
-        return cfl * dx / speed if speed > 0.0 else math.inf
+        dt = cfl * dx / speed if speed > 0.0 else math.inf
+        thin = self.boundary.thin
+        if thin is None or not (thin.moves and self.scene.keeps_volume):
+            return dt
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            longest = thin.longest_step(
+                self.particles.position,
+                self.particles.velocity,
+                self.time,
+                min(dt, self.scene.time.dt_max),
+                (cfl + 1.0) * dx,
+            )
+        return min(dt, longest)
 
     def events(self, until: float) -> list[float]:
         """Return the times [s] of events later than now, up to `until`.
