@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation as Rotation3
-from warp_lcp.grid.solids import Box, Placement
+from warp_lcp.grid.signed_distance import Box, Placement
 
 from warp_lcp.grid import thin_walls_kernels as kernels
 from warp_lcp.grid.particle_loops import MARGIN

@@ -17,7 +17,7 @@ import numpy as np
 
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.particles import lattice, seed
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import inside, signed_distance
 from warp_lcp.material.boundary import Boundary
@@ -133,7 +133,7 @@ class PartialSites:
             self._candidates(*self._open_sites(plane, open_cells))
             for plane in range(grid.origin[2], grid.origin[2] + grid.counts[2])
         ]
-        points, owner, count, draw = (np.concatenate(column) for column in zip(*candidates))
+        points, owner, count, draw = (np.concatenate(column) for column in zip(*candidates, strict=True))
         samples = SAMPLES[grid.dimension] ** grid.dimension
         # Full sites are the first.
         keys = np.where(count == samples, -1.0, draw - count / samples)
