@@ -55,7 +55,8 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
     ignore = shutil.ignore_patterns(
         ".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis"
     )
-    shutil.copytree(ROOT, TREE, ignore=ignore, dirs_exist_ok=True)
+    # The links stay links: `warp_lcp/fluids` is the folder `fluids` that a mutant changes.
+    shutil.copytree(ROOT, TREE, symlinks=True, ignore=ignore, dirs_exist_ok=True)
     for name in PRELOADED:
         importlib.import_module(name)
 
@@ -160,7 +161,7 @@ def judge(mutant: Mutant) -> dict[str, object]:
     chosen_tests = (
         [FORMULAS[mutant.occurrence].tests]
         if mutant.operator == FORMULA
-        else tests_of(TREE, mutant.module)
+        else tests_of(TREE, mutant.module, mutant.line)
     )
     spent, verdict, by = 0.0, "alive", ""
     rounds = list(FILES)
