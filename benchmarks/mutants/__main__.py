@@ -22,7 +22,7 @@ import time
 import traceback
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from warp_lcp.benchmarks.mutants.formulas import FORMULAS
 from warp_lcp.benchmarks.mutants.mutations import FORMULA, Mutant, draw, mutated, of_formulas
@@ -55,7 +55,8 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
     ignore = shutil.ignore_patterns(
         ".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis"
     )
-    shutil.copytree(ROOT, TREE, ignore=ignore, dirs_exist_ok=True)
+    # The links stay links: `warp_lcp/fluids` is the folder `fluids` that a mutant changes.
+    shutil.copytree(ROOT, TREE, symlinks=True, ignore=ignore, dirs_exist_ok=True)
     for name in PRELOADED:
         importlib.import_module(name)
 
@@ -63,13 +64,28 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
 class MutantBudget:
     """Plug-in of pytest with a time budget for each file.
 
-    Tests that start after its end are left out. On request, each function runs with one parameter
-    only.
+    Tests that start after its end are left out. The compilation of changed kernels does not count.
+    On request, each function runs with one parameter only.
     """
 
     def __init__(self, seconds: float, *, brief: bool) -> None:
-        self.seconds, self.brief, self.began = seconds, brief, 0.0
+        self.seconds, self.brief, self.began, self.compiled = seconds, brief, 0.0, 0.0
         self.spent: defaultdict[str, float] = defaultdict(float)
+
+    def pytest_configure(self) -> None:
+        """Record the time in which Warp loads modules."""
+        import warp as wp
+
+        load = wp.Module.load
+
+        def timed_load(*arguments: Any, **options: Any) -> Any:
+            began = time.process_time()
+            try:
+                return load(*arguments, **options)
+            finally:
+                self.compiled += time.process_time() - began
+
+        wp.Module.load = timed_load
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Keep the first parameter of each function."""
@@ -86,11 +102,12 @@ class MutantBudget:
 
     def pytest_runtest_logstart(self) -> None:
         """Record the time."""
-        self.began = time.process_time()
+        self.began, self.compiled = time.process_time(), 0.0
 
     def pytest_runtest_logfinish(self, location: tuple[str, int, str]) -> None:
         """Add the time of a test to that of its file."""
-        self.spent[str(TREE / location[0])] += time.process_time() - self.began
+        passed = time.process_time() - self.began
+        self.spent[str(TREE / location[0])] += passed - self.compiled
 
 
 def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float]:
@@ -160,7 +177,7 @@ def judge(mutant: Mutant) -> dict[str, object]:
     chosen_tests = (
         [FORMULAS[mutant.occurrence].tests]
         if mutant.operator == FORMULA
-        else tests_of(TREE, mutant.module)
+        else tests_of(TREE, mutant.module, mutant.line)
     )
     spent, verdict, by = 0.0, "alive", ""
     rounds = list(FILES)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from warp_lcp.benchmarks.mutants.formulas import FORMULAS
+from warp_lcp.benchmarks.mutants.tests_of import _users as users_of
 from warp_lcp.benchmarks.mutants.tests_of import tests_of as chosen_for
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,3 +87,32 @@ def test_headers_have_the_tests_of_modules_that_name_them():
         "tests/kernels/test_persistent_kernel.py"
         in chosen_for(ROOT, "warp_lcp/kernels/headers/piece.h")[:2]
     )
+
+
+def test_a_line_of_a_header_has_the_tests_of_the_module_that_names_its_kernel():
+    header = "warp_lcp/solvers/headers/gradient_projection.h"
+    lines = (ROOT / header).read_text().splitlines()
+    for kernel, test in (("mprgp.", "test_mprgp"), ("subspace.", "test_subspace_minimization")):
+        line = next(n for n, text in enumerate(lines, 1) if text.startswith(f"// kernel {kernel}"))
+        assert f"tests/solvers/{test}" in chosen_for(ROOT, header, line)[0]
+
+
+def test_modules_of_a_simulator_have_the_tests_of_their_users():
+    users = users_of(ROOT)["fluids/viscosity_level.py"]
+    assert users == {"fluids/viscosity_bodies.py", "fluids/viscosity_multigrid.py"}
+
+
+def test_a_mutant_of_a_simulator_is_in_the_package_that_tests_import(tmp_path, monkeypatch):
+    pytest.importorskip("cosmic_ray")
+    from warp_lcp.benchmarks.mutants import __main__ as program
+
+    for name, value in {"ROOT": tmp_path / "root", "PRELOADED": (), "TREE": tmp_path}.items():
+        monkeypatch.setattr(program, name, value, raising=False)
+    (tmp_path / "root/fluids").mkdir(parents=True)
+    (tmp_path / "root/warp_lcp").mkdir()
+    (tmp_path / "root/fluids/a.py").write_text("1\n")
+    (tmp_path / "root/warp_lcp/fluids").symlink_to("../fluids")
+    program.prepare(str(tmp_path), program.FILES, program.SECONDS)
+    (program.TREE / "fluids/a.py").write_text("2\n")
+    assert (program.TREE / "warp_lcp/fluids/a.py").read_text() == "2\n"
+    assert (tmp_path / "root/fluids/a.py").read_text() == "1\n"

@@ -41,6 +41,12 @@ def test_spheres():
     assert len(world_of(ball([0, 0, 0], 1.0), ball([0, 0, 1.7], 0.5)).contacts(margin=0.1)) == 0
 
 
+def test_contacts_within_a_step_are_those_that_the_speed_closes():
+    world = world_of(ball([0, 0, 0], 0.5), ball([0, 0, 1.5], 0.5))  # the gap is 0.5 m
+    world.bodies[0].momentum = np.array([2.0, 0.0, 0.0])  # mass 1: 2 m/s; the other may do the same
+    assert [len(world.contacts(*dt)) for dt in ((), (0.12,), (0.13,))] == [0, 0, 1]
+
+
 def test_a_sphere_and_a_tilted_plane():
     normal = np.array([0.6, 0.0, 0.8])
     contacts = world_of(

@@ -52,6 +52,16 @@ def test_scenes_are_problems_that_repeat(name):
     )  # only its limits are drawn
 
 
+def test_gears_of_a_row_are_less_than_a_tooth_apart():
+    world = gear_pyramid(3)
+    centers = np.array([body.position for body in world.bodies])[:6]
+    reach, tooth = np.hypot(0.3, 0.05), 0.1  # a bar is 0.6 m long and 0.1 m wide
+    for row in (centers[:3], centers[3:5]):
+        gaps = np.diff(row[:, 0]) - 2 * reach
+        assert ((gaps > 0) & (gaps < tooth)).all()
+    np.testing.assert_allclose(centers[3:5, 0], (centers[:2, 0] + centers[1:3, 0]) / 2, atol=1e-14)
+
+
 @pytest.mark.parametrize("name", [n for n in SCENES if n not in ("driven-gears", "hanging-snake")])
 def test_lemke_and_newton_find_the_same_velocities(name):
     """Velocities of these scenes by independent methods.

@@ -137,6 +137,13 @@ def test_no_sand_at_all_is_refused() -> None:
         scene(size=[1.0, 0.5], resolution=16, sand=[])
 
 
+def test_sand_has_a_density_correction_and_no_forces_that_speed_it_up_in_flight() -> None:
+    model = scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.0], [0.2, 0.2])])
+    assert model.correction is not None
+    assert not model.settles
+    assert not model.speeds_up
+
+
 def test_a_material_gives_what_the_table_does_not() -> None:
     """Material with overrides: gravel's own density and angle, another wall friction."""
     data = {

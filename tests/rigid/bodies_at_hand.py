@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from warp_lcp.grid.part import ONE_PROCESS
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
@@ -12,7 +13,15 @@ SIDES = 0b111111
 
 
 def bodies_of(
-    geometries, dimension, *, solids=(), open_sides=0, density=500.0, settings=None, **common
+    geometries,
+    dimension,
+    *,
+    solids=(),
+    open_sides=0,
+    density=500.0,
+    settings=None,
+    ranks=ONE_PROCESS,
+    **common,
 ):
     """Return bodies of shapes; `settings` holds further settings of each."""
     bodies = [
@@ -27,7 +36,7 @@ def bodies_of(
     walls = domain_walls([1.0] * dimension, open_sides=open_sides)
     around = (walls, *(obstacle(solid, dimension) for solid in solids))
     return RigidBodies(
-        bodies, geometries, [1 + n for n in range(len(geometries))], around, dimension
+        bodies, geometries, [1 + n for n in range(len(geometries))], around, dimension, ranks=ranks
     )
 
 

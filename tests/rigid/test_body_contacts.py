@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from bodies_at_hand import GRAVITY, SIDES, bodies_of, run
 
+from warp_lcp.grid.grid_part import OneProcess
 from warp_lcp.grid.motion import Pose, Rotation, Translation
 from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
@@ -496,3 +497,46 @@ def test_a_side_of_an_axis_without_an_end_stops_the_run():
     assert "periodic x axis" in bodies.trouble([1.0, 1.0], (0,))
     bodies.bodies.momentum[0, 0] = np.inf
     assert "not finite" in bodies.trouble([1.0, 1.0], ())
+
+
+class SecondRank(OneProcess):
+    """Second of two ranks; it receives what the first one has shared."""
+
+    size, rank, is_root = 2, 1, False
+
+    def __init__(self, messages):
+        self.messages = messages
+
+    def share(self, value):
+        return self.messages.pop(0)
+
+
+class FirstRank(OneProcess):
+    """First of two ranks; it stores what it shares."""
+
+    size = 2
+
+    def __init__(self):
+        self.messages = []
+
+    def share(self, value):
+        self.messages.append(value)
+        return value
+
+
+def test_each_part_of_a_step_ends_with_the_bodies_of_the_first_rank():
+    first = FirstRank()
+    ball = Sphere(center=[0.5, 0.11], radius=0.1)
+    bodies = [bodies_of([ball], 2, ranks=ranks) for ranks in (first, SecondRank(first.messages))]
+    bodies[1].bodies[0].momentum = np.array([1e-9, 0.0, 0.0])  # the processors have differed
+    for _ in range(3):
+        for part in (
+            lambda b: b.begin_step(b.time, 0.01, GRAVITY, 0.01),
+            lambda b: b.end_step(0.01),
+        ):
+            for of_rank in bodies:
+                part(of_rank)
+            states = [of_rank.state() for of_rank in bodies]
+            np.testing.assert_array_equal(states[0]["bodies"], states[1]["bodies"])
+            assert not first.messages
+            bodies[1].bodies[0].momentum = bodies[1].bodies[0].momentum + 1e-9

@@ -95,6 +95,7 @@ def test_built_in_scenes_have_no_notes(name: str) -> None:
             {"solid": [{**BALL, "mass": 500.0}]},
             "the body has 50,000 kg/m^3 or more, 10 (foam) to 22,600 (osmium) are usual; if grams",
         ),
+        ({"solid": [{**BALL, "mass": 500.0}]}, "if grams were meant, it is 0.5"),
         (
             {"solid": [{**BALL, "density": 500.0, "angular_velocity": 6.2832}]},
             "angular_velocity = 6.2832 is in degrees/s; if radians were",
