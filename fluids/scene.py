@@ -75,6 +75,13 @@ class ViscositySettings(Table):
         allow_inf_nan=True,
         description='slip length of "separating" and "sticky" walls [m]',
     )
+    splitting_tolerance: float = Field(
+        default=math.inf,
+        ge=0,
+        allow_inf_nan=True,
+        description="velocity and pressure are solved together where solving them one after the "
+        "other may be wrong by more than this share; inf: never",
+    )
 
 
 class SurfaceTensionSettings(Table):
@@ -314,6 +321,16 @@ class LiquidScene(ParticleScene):
                 )
             )
         return [*models, *super().models()]
+
+    @property
+    def couples(self) -> bool:
+        """Return whether velocity and pressure of viscous liquid may be solved together."""
+        settings = self.viscosity
+        return (
+            settings is not None
+            and math.isfinite(settings.splitting_tolerance)
+            and self.pressure.model == "incompressible"
+        )
 
     @property
     def drags(self) -> list[float] | None:

@@ -14,6 +14,7 @@ from warp_lcp.fluids.forces import SolidForces, WallSums
 from warp_lcp.fluids.models import (
     LiquidModel,
     make_pressure,
+    make_stokes,
     make_surface,
     make_tension,
     make_viscosity,
@@ -21,6 +22,7 @@ from warp_lcp.fluids.models import (
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.stokes import STOKES_COLUMNS, StokesSolve
 from warp_lcp.fluids.surface_tension import REACH
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
@@ -138,6 +140,9 @@ class LiquidSimulation(ParticleSimulation):
             WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
+        self.stokes = make_stokes(
+            self.scene, grid, self.boundary, self.surface, self.viscosity, self.projection
+        )
         # Airborne momentum and spray corrections assume gravity alone.
         if self.models:
             self.flights = None
@@ -224,6 +229,9 @@ class LiquidSimulation(ParticleSimulation):
             else {}
         )
         projected = self._project(window, dt, speed)
+        if self.stokes is not None and viscous and projected.result is not None:
+            projected, coupled = self._couple(self.stokes, projected, window, dt, speed)
+            viscous |= coupled
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
@@ -339,6 +347,7 @@ class LiquidSimulation(ParticleSimulation):
         if self.tension is not None and self.scene.output.diagnostics:
             columns = (*columns, "surface_energy")
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
+        columns = columns if self.stokes is None else (*columns, *STOKES_COLUMNS)
         automatic = () if self.projection.automatic is None else ("tolerance", "time_error")
         return (*columns, *automatic, *model_columns)
 
@@ -430,6 +439,8 @@ class LiquidSimulation(ParticleSimulation):
         """
         projection = self.projection
         viscosity.keep(self.velocity)
+        if self.stokes is not None:
+            self.stokes.keep_start(self.velocity)
         momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
         if self._project(window, dt, speed).result is None:
             return {}
@@ -471,6 +482,8 @@ class LiquidSimulation(ParticleSimulation):
                 )
             total = result if total is None else result.after(total)
         assert total is not None
+        if self.stokes is not None:
+            self.stokes.keep_viscous(self.velocity)
         viscosity.undo(self.velocity)
         for body, values in zip(
             self.bodies.bodies if self.bodies is not None else (), momenta, strict=True
@@ -478,6 +491,22 @@ class LiquidSimulation(ParticleSimulation):
             body.restore_momenta(values)
         viscosity.push_bodies()
         return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
+
+    def _couple(
+        self, stokes: StokesSolve, projected: Projection, window: Window, dt: float, speed: float
+    ) -> tuple[Projection, Row]:
+        """Solve for velocity and pressure at once if the split step is not accurate enough.
+
+        Returns:
+            The projection of the step, and the log values of the coupled solve.
+        """
+        projection = self.projection
+        with self.watch.stage("coupled solve", *self.velocity, projection.pressure):
+            result = stokes.solve(self.velocity, window)
+            if result.iterations:
+                projected = stokes.project(self.velocity, window, dt, self.kick_dt, projected)
+                self._held(projected)
+        return projected, dict(zip(STOKES_COLUMNS, result.row(), strict=True))
 
     def _move_on(
         self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float

@@ -40,6 +40,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids import viscosity_barriers as thin
+from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
@@ -82,6 +83,25 @@ class ViscousFields(NamedTuple):
     u: Sequence[wp.array]
     kind: wp.array
     contact: wp.array
+
+
+@dataclass(frozen=True)
+class ViscousEquations:
+    """Equations of the last viscous step, for a coupled solve.
+
+    Attributes:
+        level: the equations on the grid.
+        window: cells, and faces at the upper ends of the domain, whose equations are set up.
+        distance: distance of each component's faces from walls [cells].
+        slip: slip length of those walls [cells].
+        tau: nu dt / dx^2.
+    """
+
+    level: ViscosityLevel
+    window: Window
+    distance: Sequence[wp.array]
+    slip: Sequence[wp.array]
+    tau: float
 
 
 @dataclass(frozen=True)
@@ -418,6 +438,20 @@ class Viscosity:
             np.add.at(six, owner, np.hstack([push, np.cross(x - points[owner], push)]))
         return six if grid.dimension == 3 else six[:, PLANAR]
 
+    def equations(self) -> ViscousEquations:
+        """Return the equations of the last step."""
+        return ViscousEquations(
+            self._fine, self._above, self._distance, self._slip, float(self._tau.value)
+        )
+
+    def force(self, fields: ViscousFields) -> float:
+        """Write the residual for the current `change`; return the energy dissipated.
+
+        The energy is in units of the mass of a cell.
+        """
+        _, lost, driven, _ = self._force(fields, changed=True)
+        return lost + driven
+
     def push_bodies(self) -> None:
         """Apply the impulses of the last step to the bodies, if any."""
         if self._bodies is not None:
@@ -519,19 +553,23 @@ class Viscosity:
         )
         if self.grid.barriers is not None:
             self._hold_apart(kind, contact)
+        self.set_diagonals(kind, contact)
+        self.multigrid.set_up()
+
+    def set_diagonals(self, kind: wp.array, contact: wp.array) -> None:
+        """Compute the diagonals from the weights of the links, and which faces walls hold."""
         for axis in range(self.grid.dimension):
             self._above.run(
-                passes.diagonal,
-                fine.rows(axis),
-                held=fine.hold[axis],
-                d=distance[axis],
-                h=slip[axis],
+                self._passes.diagonal,
+                self._fine.rows(axis),
+                held=self._fine.hold[axis],
+                d=self._distance[axis],
+                h=self._slip[axis],
                 kind=kind,
                 contact=contact,
-                planes=planes,
+                planes=self.grid.planes,
                 thin=self._thin[axis],
             )
-        self.multigrid.set_up()
 
     def _hold_apart(self, kind: wp.array, contact: wp.array) -> None:
         """Launch the kernels that cut links at thin solids, and link faces to the solids."""

@@ -1,0 +1,510 @@
+"""Coupled solve of velocity and pressure: one unsteady Stokes problem a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.stokes_kernels import stokes_kernels
+from warp_lcp.fluids.viscosity import Viscosity, ViscousFields
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
+from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.kernels.fields import zeros
+from warp_lcp.kernels.launch_graph import Launch, copy, launch_now
+from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.krylov.system import NORM
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.reduced.grid_system import GridSystem
+
+STOKES_COLUMNS = ("splitting_error", "stokes_iterations", "stokes_error")
+VECTORS = 20  # of a Krylov space before a restart
+TENTH = 0.1  # decrease of the residual after which the free cells are determined again
+
+
+@dataclass(frozen=True)
+class StokesResult:
+    """Result of a coupled solve.
+
+    Attributes:
+        splitting_error: |u - u2|_V / |u|_A, the bound of the error of the split step.
+        iterations: pairs of cycles, one of the velocity and one of the pressure.
+        error: estimate of |u - exact|_A / |u|_A after the solve.
+        converged: whether this is at most the tolerance.
+    """
+
+    splitting_error: float
+    iterations: int
+    error: float
+    converged: bool
+
+    def row(self) -> tuple[float, int, float]:
+        """Return the entries of `STOKES_COLUMNS`."""
+        return self.splitting_error, self.iterations, self.error
+
+
+class StokesSolve:
+    """Coupled solve of velocity and pressure."""
+
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        viscosity: Viscosity,
+        projection: PressureProjection,
+        *,
+        phi: wp.array | None,
+        splitting_tolerance: float,
+        tolerance: float,
+        max_iterations: int = 100,
+    ) -> None:
+        self.grid, self.boundary = grid, boundary
+        self.viscosity, self.projection, self._phi = viscosity, projection, phi
+        self.splitting_tolerance, self.tolerance = splitting_tolerance, tolerance
+        self.max_iterations = max_iterations
+        self._kernels = stokes_kernels(
+            cut=bool(boundary.open),
+            moving=bool(boundary.velocity),
+            ghost=phi is not None,
+            varies=bool(viscosity.relative),
+            bounded=projection.lower is not None,
+        )
+        self.start, self.viscous = grid.faces(), grid.faces()
+        self._leak, self._share = grid.faces(), grid.faces()
+        self._cell, self._mixed, self._coefficient = (grid.field() for _ in range(3))
+        deep = grid.dimension == 3
+        self._product_weight = grid.field() if deep else None
+        self._across = grid.field(wp.int8) if deep else None
+        self._contact, self._free = grid.field(wp.uint8), grid.field(wp.uint8)
+        self._y, self._sums = grid.field(), {}
+        self._size = grid.dimension * grid.size
+        self._krylov: GMRES | None = None
+
+    def keep_start(self, velocity: Sequence[wp.array]) -> None:
+        """Store u*, the velocity before viscosity and pressure."""
+        for kept, u in zip(self.start, velocity, strict=True):
+            copy(kept, u)
+
+    def keep_viscous(self, velocity: Sequence[wp.array]) -> None:
+        """Store u2, the velocity that viscosity has acted on."""
+        for kept, u in zip(self.viscous, velocity, strict=True):
+            copy(kept, u)
+
+    # -- equations ------------------------------------------------------------------------------
+
+    def set_up(self) -> None:
+        """Set up the equations of the step from those of the viscous solve."""
+        kernels, grid, b = self._kernels, self.grid, self.boundary
+        parts = self._parts = self.viscosity.equations()
+        level, window = parts.level, parts.window
+        kind, contact = self.projection.kind, self.projection.contact
+        (dx, dy, dz) = three_components(parts.distance)
+        for axis in range(grid.dimension):
+            window.run(
+                kernels.masses,
+                volume=level.volume[axis],
+                leak=self._leak[axis],
+                share=self._share[axis],
+                d=parts.distance[axis],
+                h=parts.slip[axis],
+                open=b.open[axis] if b.open else None,
+                phi=self._phi,
+                relative=self.viscosity.relative[axis] if self.viscosity.relative else None,
+                kind=kind,
+                contact=contact,
+                axis=axis,
+                planes=grid.planes,
+                tau=parts.tau,
+            )
+        window.run(
+            kernels.cells,
+            cell=level.cell,
+            mixed=level.mixed,
+            out_cell=self._cell,
+            out_mixed=self._mixed,
+            product=self._product_weight,
+            across=self._across,
+            dx=dx,
+            dy=dy,
+            dz=dz,
+            kind=kind,
+            touch=b.touch,
+            contact=contact,
+            out_contact=self._contact,
+            planes=grid.planes,
+        )
+        copy(level.cell, self._cell)
+        copy(level.mixed, self._mixed)
+        for (one, other), edge in level.edges.items():
+            window.run(
+                kernels.edges,
+                weight=edge,
+                da=parts.distance[one],
+                db=parts.distance[other],
+                va=level.volume[one],
+                vb=level.volume[other],
+                a=one,
+                b=other,
+            )
+        self.viscosity.set_diagonals(kind, self._contact)
+
+    def splitting_error(self, velocity: Sequence[wp.array]) -> tuple[float, float]:
+        """Return |u - u2|_V and |u|_M after the split step."""
+        level, window = self._parts.level, self._parts.window
+        p, q = self._vectors()
+        for axis, part in enumerate(self._components(p)):
+            window.run(
+                self._kernels.difference,
+                out=part,
+                a=velocity[axis],
+                b=self.viscous[axis],
+                volume=level.volume[axis],
+            )
+        self.viscosity.multigrid.product(p, q)
+        kinetic, power = self._energy(self._components(p), self._components(q))
+        size = self._energy(velocity, velocity)[0]
+        return math.sqrt(max(power - kinetic, 0.0)), math.sqrt(size)
+
+    def _energy(self, u: Sequence[wp.array], force: Sequence[wp.array]) -> np.ndarray:
+        """Return u'M u and u'force."""
+        level = self._parts.level
+        return self._sum_axes(
+            "energy",
+            lambda axis: {
+                "u": u[axis],
+                "force": force[axis],
+                "volume": level.volume[axis],
+                "diagonal": level.diagonal[axis],
+            },
+        )
+
+    def _sum_axes(self, name, arguments) -> np.ndarray:
+        """Launch a summing kernel for each component; return the sums."""
+        kernel, total = getattr(self._kernels, name), None
+        for axis in range(self.grid.dimension):
+            tally = self._sums.get((name, axis))
+            if tally is None:
+                tally = self._sums[name, axis] = WindowTally(kernel, self.grid)
+            tally.take(self._parts.window, **arguments(axis))
+            tally.changed()
+            found = np.array(tally.read())
+            total = found if total is None else total + found
+        return total
+
+    def _sum(self, name, **arguments) -> np.ndarray:
+        tally = self._sums.get((name, -1))
+        if tally is None:
+            tally = self._sums[name, -1] = WindowTally(getattr(self._kernels, name), self.grid)
+        tally.take(self._parts.window, **arguments)
+        tally.changed()
+        return np.array(tally.read())
+
+    # -- vectors --------------------------------------------------------------------------------
+
+    def _vectors(self):
+        if self._krylov is None:
+            size, device = self._size + self.grid.size, self.grid.device
+            self.r, self.z = (zeros(size, wp.float32, device) for _ in range(2))
+            self._krylov = GMRES(self._product, self, restart=VECTORS)
+            self._norm = Sums(rows_of(self.r))
+            self._pressure = GridSystem(self.projection.operator, wp.float32, bounded=False)
+            self._q = grid_vector = zeros(size, wp.float32, device)
+            del grid_vector
+        return self.r, self._q
+
+    def _components(self, vector: wp.array) -> list[wp.array]:
+        return self.viscosity.multigrid.components(vector)
+
+    def _scalar(self, vector: wp.array) -> wp.array:
+        """Return the view of a vector's pressure, in the stored shape."""
+        return vector[self._size : self._size + self.grid.size].reshape(self.grid.shape)
+
+    def _product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
+        """Write q = K p."""
+        level, window, b = self._parts.level, self._parts.window, self.boundary
+        self.viscosity.multigrid.product(p, q)
+        u, force, x = self._components(p), self._components(q), self._scalar(p)
+        for axis in range(self.grid.dimension):
+            window.run(
+                self._kernels.gradient,
+                out=force[axis],
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+                cell=level.cell,
+                u=u[axis],
+                rate=u[axis],
+                open=b.open[axis] if b.open else None,
+                x=x,
+                kind=self.projection.kind,
+                axis=axis,
+                sign=-1.0,
+            )
+        self._outflow(u, x, self._scalar(q))
+
+    def _outflow(self, u: Sequence[wp.array], x: wp.array, out: wp.array) -> None:
+        level, b = self._parts.level, self.boundary
+        (ux, uy, uz), (ax, ay, az) = three_components(u), three_components(b.open)
+        (vx, vy, vz), (lx, ly, lz) = (
+            three_components(level.volume),
+            three_components(self._leak),
+        )
+        self._parts.window.run(
+            self._kernels.outflow,
+            out=out,
+            x=x,
+            u=ux,
+            v=uy,
+            w=uz,
+            ax=ax,
+            ay=ay,
+            az=az,
+            vx=vx,
+            vy=vy,
+            vz=vz,
+            leak_x=lx,
+            leak_y=ly,
+            leak_z=lz,
+            free=self._free,
+            planes=self.grid.planes,
+        )
+
+    def apply(self) -> None:
+        """Write z = M r: a viscous cycle, then a pressure cycle plus c."""
+        self.estimate = self._apply()
+
+    def _apply(self) -> float:
+        multigrid, system, window = self.viscosity.multigrid, self._pressure, self._parts.window
+        level, grid = self._parts.level, self.grid
+        wp.copy(multigrid.r, self.r, count=self._size)
+        multigrid.apply()
+        cycle, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
+        total = self._sum_axes(
+            "velocity_correction",
+            lambda axis: {
+                "z": z[axis],
+                "cycle": cycle[axis],
+                "r": r[axis],
+                "volume": level.volume[axis],
+                "diagonal": level.diagonal[axis],
+                "cell": level.cell,
+                "kind": self.projection.kind,
+                "axis": axis,
+            },
+        )[0]
+        x, q, right = self._scalar(self.z), self._scalar(self._q), system.r.reshape(grid.shape)
+        x.zero_()
+        self._outflow(z, x, q)
+        window.run(
+            self._kernels.right_side,
+            out=right,
+            r=self._scalar(self.r),
+            q=q,
+            free=self._free,
+            sign=-1.0,
+        )
+        system.apply()
+        total += self._sum(
+            "correction",
+            z=x,
+            cycle=system.z.reshape(grid.shape),
+            r=right,
+            coefficient=self._coefficient,
+            free=self._free,
+        )[0]
+        return math.sqrt(max(total, 0.0))
+
+    # -- solve ----------------------------------------------------------------------------------
+
+    def _residual(self, velocity: Sequence[wp.array], look: int) -> tuple[int, float]:
+        """Write the residual to r; return the number of switched cells."""
+        kernels, b, grid, parts = self._kernels, self.boundary, self.grid, self._parts
+        level, window, x = parts.level, parts.window, self.projection.pressure
+        kind = self.projection.kind
+        for axis in range(grid.dimension):
+            window.run(
+                kernels.held,
+                u=velocity[axis],
+                before=self.start[axis],
+                leak=self._leak[axis],
+                share=self._share[axis],
+                open=b.open[axis] if b.open else None,
+                solid=b.velocity[axis] if b.velocity else None,
+                x=x,
+                kind=kind,
+                axis=axis,
+            )
+        (ux, uy, uz), (ax, ay, az) = three_components(velocity), three_components(b.open)
+        sx, sy, sz = three_components(b.velocity)
+        switching, square = self._sum(
+            "divergence",
+            y=self._y,
+            u=ux,
+            v=uy,
+            w=uz,
+            ax=ax,
+            ay=ay,
+            az=az,
+            solid_x=sx,
+            solid_y=sy,
+            solid_z=sz,
+            x=x,
+            lower=self.projection.lower,
+            kind=kind,
+            free=self._free,
+            planes=grid.planes,
+            look=look,
+            least_x=self._least_x,
+            least_y=self._least_y,
+        )
+        if look and self.projection.lower is not None:
+            window.run(
+                kernels.bound, x=x, lower=self.projection.lower, kind=kind, free=self._free
+            )
+        force = self._components(self.viscosity.multigrid.r)
+        for axis, change in enumerate(self.viscosity.change):
+            window.run(
+                kernels.difference,
+                out=change,
+                a=velocity[axis],
+                b=self.start[axis],
+                volume=level.volume[axis],
+            )
+        self.taken = self.viscosity.force(ViscousFields(velocity, kind, self._contact))
+        r = self._components(self.r)
+        wp.copy(self.r, self.viscosity.multigrid.r, count=self._size)
+        del force
+        for axis in range(grid.dimension):
+            window.run(
+                kernels.force,
+                out=r[axis],
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+                cell=level.cell,
+                u=velocity[axis],
+                rate=self.viscosity.change[axis],
+                open=b.open[axis] if b.open else None,
+                x=x,
+                kind=kind,
+                axis=axis,
+                sign=1.0,
+            )
+        window.run(
+            kernels.right_side,
+            out=self._scalar(self.r),
+            r=self._y,
+            q=self._y,
+            free=self._free,
+            sign=0.0,
+        )
+        return int(switching), float(square)
+
+    def solve(self, velocity: Sequence[wp.array], window: Window) -> StokesResult:
+        """Estimate the splitting error, and solve again if it exceeds its tolerance.
+
+        Args:
+            velocity: the velocity of the split step (updated).
+            window: cells that hold all liquid, with a margin.
+        """
+        self.set_up()
+        error, size = self.splitting_error(velocity)
+        share = error / size if size > 0.0 else 0.0
+        if not share > self.splitting_tolerance:
+            return StokesResult(share, 0, share, True)
+        return self._solve(velocity, share)
+
+    def project(
+        self,
+        velocity: Sequence[wp.array],
+        window: Window,
+        dt: float,
+        kick_dt: float,
+        split: Projection,
+    ) -> Projection:
+        """Make the velocity of a coupled solve free of divergence.
+
+        The pressure's LCP for a correction x' has the lower bound `lower - x`; x + x' is the
+        pressure of the step.
+        """
+        assert split.result is not None
+        projection = self.projection
+        return projection.correct(velocity, window, dt, kick_dt, split.result)
+
+    def _solve(self, velocity: Sequence[wp.array], share: float) -> StokesResult:
+        """Solve for velocity and pressure from the split step's (both updated)."""
+        self._vectors()
+        parts, projection, grid = self._parts, self.projection, self.grid
+        level, b = parts.level, self.boundary
+        self.viscosity.multigrid.set_up()
+        (ax, ay, az), (vx, vy, vz) = three_components(b.open), three_components(level.volume)
+        (gx, gy, gz), (lx, ly, lz) = (
+            three_components(level.diagonal),
+            three_components(self._leak),
+        )
+        hx, hy, hz = three_components(self._share)
+        parts.window.run(
+            self._kernels.scale,
+            coefficient=self._coefficient,
+            ax=ax,
+            ay=ay,
+            az=az,
+            vx=vx,
+            vy=vy,
+            vz=vz,
+            diagonal_x=gx,
+            diagonal_y=gy,
+            diagonal_z=gz,
+            leak_x=lx,
+            leak_y=ly,
+            leak_z=lz,
+            share_x=hx,
+            share_y=hy,
+            share_z=hz,
+            cell=level.cell,
+            kind=projection.kind,
+            planes=grid.planes,
+        )
+        self._free.zero_()
+        self._least_x = self._least_y = 0.0
+        self._pressure.refresh()
+        krylov, iterations, history = self._krylov, 0, []
+        _, square = self._residual(velocity, 2)
+        self._pressure.restrict(self._free.flatten())
+        first = True
+        while True:
+            if not first:
+                self._least_y = 0.0
+                switched, square = self._residual(velocity, 1)
+                if switched:
+                    _, square = self._residual(velocity, 0)
+                    self._pressure.restrict(self._free.flatten())
+            first = False
+            error = self._apply()
+            kinetic = self._energy(velocity, velocity)[0]
+            size = math.sqrt(kinetic + max(self.taken, 0.0))
+            relative = error / size if size > 0.0 else 0.0
+            history.append(relative)
+            if relative <= self.tolerance or iterations >= self.max_iterations:
+                break
+            if not math.isfinite(relative):
+                break
+            norm = float(np.sqrt(self._norm.of(NORM, r=self.r, w=None)[0]))
+            done, _ = krylov.solve(TENTH * norm, VECTORS)
+            iterations += done
+            more = self._components(krylov.x)
+            for axis, u in enumerate(velocity):
+                parts.window.run(
+                    self._kernels.add_velocity, u=u, more=more[axis], volume=level.volume[axis]
+                )
+            parts.window.run(
+                self._kernels.add_pressure,
+                x=projection.pressure,
+                more=self._scalar(krylov.x),
+                free=self._free,
+            )
+        self.history = history
+        return StokesResult(share, iterations, relative, relative <= self.tolerance)
