@@ -195,6 +195,7 @@ def make_stokes(
     surface: FreeSurface,
     viscosity: Viscosity | None,
     projection: PressureProjection,
+    bodies: RigidBodies | None,
 ) -> StokesSolve | None:
     """Return the coupled solve of velocity and pressure of a scene, or None."""
     if scene.viscosity is None or viscosity is None or not scene.couples:
@@ -207,4 +208,6 @@ def make_stokes(
         phi=surface.phi,
         splitting_tolerance=scene.viscosity.splitting_tolerance,
         tolerance=viscosity.tolerance,
+        density=scene.physics.density,
+        bodies=bodies,
     )

@@ -592,6 +592,7 @@ class PressureProjection:
         dt: float,
         kick_dt: float,
         earlier: wl.SolveResult,
+        moved: Callable[[], None],
     ) -> Projection:
         """Project a velocity that the pressure x has acted on already; x becomes the sum of both.
 
@@ -604,6 +605,7 @@ class PressureProjection:
             dt: time step [s].
             kick_dt: time that forces have acted [s].
             earlier: result of the step's first solve for x, whose residual is accurate enough.
+            moved: called when the velocities of bodies have changed.
         """
         before = self._before = self.grid.field(wp.float64) if self._before is None else self._before
         copy(before, self.pressure)
@@ -619,6 +621,8 @@ class PressureProjection:
         result = wl.solve(
             self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work
         )
+        self.push_bodies(result)
+        moved()
         projected = self.project(velocity, window, result, criteria)
         self._cells.run(SUM_PRESSURE, x=self.pressure, before=before, kind=self.kind)
         self._contacts.take(

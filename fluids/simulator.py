@@ -141,7 +141,7 @@ class LiquidSimulation(ParticleSimulation):
         )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
         self.stokes = make_stokes(
-            self.scene, grid, self.boundary, self.surface, self.viscosity, self.projection
+            self.scene, grid, self.boundary, self.surface, self.viscosity, self.projection, self.bodies
         )
         # Airborne momentum and spray corrections assume gravity alone.
         if self.models:
@@ -441,6 +441,8 @@ class LiquidSimulation(ParticleSimulation):
         viscosity.keep(self.velocity)
         if self.stokes is not None:
             self.stokes.keep_start(self.velocity)
+            if self.forces is not None:
+                self._impulses_before = self.forces.impulses.copy()
         momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
         if self._project(window, dt, speed).result is None:
             return {}
@@ -502,9 +504,19 @@ class LiquidSimulation(ParticleSimulation):
         """
         projection = self.projection
         with self.watch.stage("coupled solve", *self.velocity, projection.pressure):
-            result = stokes.solve(self.velocity, window)
+            def moved() -> None:
+                if self.bodies is not None:
+                    self.boundary.begin_step(self.time, dt)
+
+            result = stokes.solve(self.velocity, window, moved)
             if result.iterations:
-                projected = stokes.project(self.velocity, window, dt, self.kick_dt, projected)
+                if self.forces is not None and self.scene.output.forces:
+                    self.forces.impulses = self._impulses_before + stokes.impulses(
+                        self.velocity, self.forces.references
+                    )
+                projected = stokes.project(
+                    self.velocity, window, dt, self.kick_dt, projected, moved
+                )
                 self._held(projected)
         return projected, dict(zip(STOKES_COLUMNS, result.row(), strict=True))
 

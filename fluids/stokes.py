@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,9 @@ import warp as wp
 
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.stokes_kernels import stokes_kernels
+from warp_lcp.fluids.stokes_bodies import StokesBodies
 from warp_lcp.fluids.viscosity import Viscosity, ViscousFields
+from warp_lcp.fluids.viscosity_bodies import ViscousWalls
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.grid.window_reduction import WindowTally
 from warp_lcp.kernels.fields import zeros
@@ -19,11 +21,14 @@ from warp_lcp.kernels.launch_graph import Launch, copy, launch_now
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import NORM
-from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.reduced.grid_system import GridSystem
+from warp_lcp.rigid.bodies import RigidBodies
 
 STOKES_COLUMNS = ("splitting_error", "stokes_iterations", "stokes_error")
-VECTORS = 20  # of a Krylov space before a restart
+import os
+WEIGHTED = os.environ.get("WEIGHTED", "1") == "1"
+VECTORS = 30  # of a Krylov space before a restart
 TENTH = 0.1  # decrease of the residual after which the free cells are determined again
 
 
@@ -61,9 +66,11 @@ class StokesSolve:
         phi: wp.array | None,
         splitting_tolerance: float,
         tolerance: float,
+        density: float,
+        bodies: RigidBodies | None = None,
         max_iterations: int = 100,
     ) -> None:
-        self.grid, self.boundary = grid, boundary
+        self.grid, self.boundary, self._density = grid, boundary, density
         self.viscosity, self.projection, self._phi = viscosity, projection, phi
         self.splitting_tolerance, self.tolerance = splitting_tolerance, tolerance
         self.max_iterations = max_iterations
@@ -84,11 +91,19 @@ class StokesSolve:
         self._y, self._sums = grid.field(), {}
         self._size = grid.dimension * grid.size
         self._krylov: GMRES | None = None
+        self._bodies: StokesBodies | None = None
+        self._thin_bodies = projection.coupling is not None and projection.coupling.carried
+        if bodies is not None and viscosity.body_drag is not None:
+            assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
+            self._bodies = StokesBodies(grid, boundary, bodies, viscosity.body_drag, density)
+        self._rank = 0 if self._bodies is None else self._bodies.rank
 
     def keep_start(self, velocity: Sequence[wp.array]) -> None:
         """Store u*, the velocity before viscosity and pressure."""
         for kept, u in zip(self.start, velocity, strict=True):
             copy(kept, u)
+        if self._bodies is not None:
+            self._bodies.keep_start()
 
     def keep_viscous(self, velocity: Sequence[wp.array]) -> None:
         """Store u2, the velocity that viscosity has acted on."""
@@ -110,6 +125,7 @@ class StokesSolve:
                 volume=level.volume[axis],
                 leak=self._leak[axis],
                 share=self._share[axis],
+                free_part=None if self._bodies is None else self._bodies.free_parts[axis],
                 d=parts.distance[axis],
                 h=parts.slip[axis],
                 open=b.open[axis] if b.open else None,
@@ -208,9 +224,12 @@ class StokesSolve:
 
     def _vectors(self):
         if self._krylov is None:
-            size, device = self._size + self.grid.size, self.grid.device
+            size, device = self._size + self.grid.size + self._rank, self.grid.device
             self.r, self.z = (zeros(size, wp.float32, device) for _ in range(2))
-            self._krylov = GMRES(self._product, self, restart=VECTORS)
+            self._weight = zeros(size, wp.float32, device)
+            self._krylov = GMRES(
+                self._product, self, restart=VECTORS, weight=self._weight if WEIGHTED else None
+            )
             self._norm = Sums(rows_of(self.r))
             self._pressure = GridSystem(self.projection.operator, wp.float32, bounded=False)
             self._q = grid_vector = zeros(size, wp.float32, device)
@@ -245,6 +264,23 @@ class StokesSolve:
                 sign=-1.0,
             )
         self._outflow(u, x, self._scalar(q))
+        if self._bodies is not None:
+            V = self._tail(p)
+            self._bodies.add_forces(V, q)
+            self._bodies.add_outflow(
+                V, self._flat_scalar(q), self._free.flatten(), sign=-1.0
+            )
+            self._set_tail(q, self._bodies.rows(V, p, self._flat_scalar(p)))
+
+    def _flat_scalar(self, vector: wp.array) -> wp.array:
+        return vector[self._size : self._size + self.grid.size]
+
+    def _tail(self, vector: wp.array) -> np.ndarray:
+        """Return the velocities of the bodies in a vector."""
+        return vector[self._size + self.grid.size :].numpy().astype(np.float64)
+
+    def _set_tail(self, vector: wp.array, values: np.ndarray) -> None:
+        vector[self._size + self.grid.size :].assign(values.astype(np.float32))
 
     def _outflow(self, u: Sequence[wp.array], x: wp.array, out: wp.array) -> None:
         level, b = self._parts.level, self.boundary
@@ -307,6 +343,12 @@ class StokesSolve:
             free=self._free,
             sign=-1.0,
         )
+        if self._bodies is not None:
+            r_V = self._tail(self.r)
+            z_V = self._bodies.corrected(r_V, self.z)
+            total += self._bodies.square(z_V, r_V)
+            self._set_tail(self.z, z_V)
+            self._bodies.add_outflow(z_V, system.r, self._free.flatten(), sign=1.0)
         system.apply()
         total += self._sum(
             "correction",
@@ -401,21 +443,34 @@ class StokesSolve:
             free=self._free,
             sign=0.0,
         )
+        if self._bodies is not None:
+            V, force_x = self._bodies.velocities, self.projection.pressure.flatten()
+            u = self._flat_velocity(velocity)
+            self._set_tail(self.r, self._bodies.start - self._bodies.rows(V, u, force_x))
         return int(switching), float(square)
 
-    def solve(self, velocity: Sequence[wp.array], window: Window) -> StokesResult:
+    def _flat_velocity(self, velocity: Sequence[wp.array]) -> wp.array:
+        """Return a velocity as a flat field of all components."""
+        for part, u in zip(self._components(self._q), velocity, strict=True):
+            copy(part, u)
+        return self._q
+
+    def solve(
+        self, velocity: Sequence[wp.array], window: Window, moved: Callable[[], None]
+    ) -> StokesResult:
         """Estimate the splitting error, and solve again if it exceeds its tolerance.
 
         Args:
             velocity: the velocity of the split step (updated).
             window: cells that hold all liquid, with a margin.
+            moved: called when the velocities of bodies have changed.
         """
         self.set_up()
         error, size = self.splitting_error(velocity)
         share = error / size if size > 0.0 else 0.0
-        if not share > self.splitting_tolerance:
+        if self._thin_bodies or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, True)
-        return self._solve(velocity, share)
+        return self._solve(velocity, share, moved)
 
     def project(
         self,
@@ -424,6 +479,7 @@ class StokesSolve:
         dt: float,
         kick_dt: float,
         split: Projection,
+        moved: Callable[[], None],
     ) -> Projection:
         """Make the velocity of a coupled solve free of divergence.
 
@@ -432,14 +488,62 @@ class StokesSolve:
         """
         assert split.result is not None
         projection = self.projection
-        return projection.correct(velocity, window, dt, kick_dt, split.result)
+        return projection.correct(velocity, window, dt, kick_dt, split.result, moved)
 
-    def _solve(self, velocity: Sequence[wp.array], share: float) -> StokesResult:
+    def impulses(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
+        """Return the viscous impulses on solids, those of films at walls included.
+
+        Shape (1 + solids, 6), [N s] and [N m s].
+
+        Args:
+            velocity: the velocity after the solve [m/s].
+            points: reference points of the moments [m], shape (1 + solids, 3).
+        """
+        viscosity, grid, b = self.viscosity, self.grid, self.boundary
+        if self._bodies is not None:
+            self._bodies.settle()
+        found = viscosity.impulses(velocity, self.projection.kind, self._contact, points)
+        x, scale = self.projection.pressure.numpy(), self._density * grid.cell_volume
+        low, high = grid.domain.low, grid.domain.high
+        cells = tuple(slice(*ends) for ends in zip(low, high, strict=True))
+        for axis in range(grid.dimension):
+            leak = self._leak[axis].numpy()[cells]
+            at = np.argwhere(leak > 0.0)
+            below = at.copy()
+            below[:, 2 - axis] -= 1
+            here, there = tuple((at + low).T), tuple((below + low).T)
+            share = self._share[axis].numpy()[here].astype(np.float64)
+            a = b.open[axis].numpy()[here].astype(np.float64) if b.open else np.ones(len(at))
+            total = a * a / self._leak[axis].numpy()[here]  # m + drag
+            wall = b.velocity[axis].numpy()[here] if b.velocity else 0.0
+            slide = self.start[axis].numpy()[here] - wall
+            push = np.zeros((len(at), 3))
+            push[:, axis] = share * (a * (x[there] - x[here]) + (1.0 - share) * total * slide)
+            place = (at + low)[:, ::-1] + np.array(grid.origin) - 0.5
+            place[:, axis] -= 0.5
+            arms = place * grid.spacing
+            if grid.dimension == 2:
+                arms[:, 2] = 0.0
+            owner = np.zeros(len(at), dtype=int)
+            if isinstance(b, CutBoundary):
+                owner = np.maximum(b.cut.wall[axis].numpy()[here], 0).astype(int)
+            six = np.hstack([push, np.cross(arms - points[owner], push)])
+            np.add.at(found, owner, scale * six)
+        return found
+
+    def _solve(
+        self, velocity: Sequence[wp.array], share: float, moved: Callable[[], None]
+    ) -> StokesResult:
         """Solve for velocity and pressure from the split step's (both updated)."""
         self._vectors()
         parts, projection, grid = self._parts, self.projection, self.grid
         level, b = parts.level, self.boundary
         self.viscosity.multigrid.set_up()
+        self._weight.zero_()
+        if self._bodies is not None:
+            walls = ViscousWalls(parts.distance, parts.slip, projection.kind, self._contact)
+            self._bodies.take(level, walls, velocity)
+            self._set_tail(self._weight, self._bodies.weights)
         (ax, ay, az), (vx, vy, vz) = three_components(b.open), three_components(level.volume)
         (gx, gy, gz), (lx, ly, lz) = (
             three_components(level.diagonal),
@@ -449,6 +553,7 @@ class StokesSolve:
         parts.window.run(
             self._kernels.scale,
             coefficient=self._coefficient,
+            weight=self._scalar(self._weight),
             ax=ax,
             ay=ay,
             az=az,
@@ -468,6 +573,16 @@ class StokesSolve:
             kind=projection.kind,
             planes=grid.planes,
         )
+        for axis, weight in enumerate(self._components(self._weight)):
+            parts.window.run(
+                self._kernels.weights,
+                weight=weight,
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+                cell=level.cell,
+                kind=projection.kind,
+                axis=axis,
+            )
         self._free.zero_()
         self._least_x = self._least_y = 0.0
         self._pressure.refresh()
@@ -492,8 +607,11 @@ class StokesSolve:
                 break
             if not math.isfinite(relative):
                 break
-            norm = float(np.sqrt(self._norm.of(NORM, r=self.r, w=None)[0]))
-            done, _ = krylov.solve(TENTH * norm, VECTORS)
+            norm = float(np.sqrt(self._norm.of(NORM, r=self.r, w=self._weight if WEIGHTED else None)[0]))
+            share_of_norm = 0.5 * self.tolerance / relative
+            if self.projection.lower is not None:  # the free cells are looked at in between
+                share_of_norm = max(share_of_norm, TENTH)
+            done, _ = krylov.solve(min(share_of_norm, 0.5) * norm, VECTORS)
             iterations += done
             more = self._components(krylov.x)
             for axis, u in enumerate(velocity):
@@ -506,5 +624,8 @@ class StokesSolve:
                 more=self._scalar(krylov.x),
                 free=self._free,
             )
+            if self._bodies is not None:
+                self._bodies.move(self._tail(krylov.x))
+                moved()
         self.history = history
         return StokesResult(share, iterations, relative, relative <= self.tolerance)

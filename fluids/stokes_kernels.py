@@ -32,6 +32,7 @@ class StokesKernels:
     cells: StencilKernel
     edges: StencilKernel
     scale: StencilKernel
+    weights: StencilKernel
     gradient: StencilKernel
     force: StencilKernel
     outflow: StencilKernel
@@ -72,6 +73,7 @@ def stokes_kernels(
         cells=kernel("cells"),
         edges=kernel("edges"),
         scale=kernel("scale", CUT=cut),
+        weights=kernel("weights"),
         gradient=kernel("gradient", CUT=cut),
         force=kernel("force", CUT=cut),
         outflow=kernel("outflow", CUT=cut),

@@ -449,8 +449,13 @@ class Viscosity:
 
         The energy is in units of the mass of a cell.
         """
-        _, lost, driven, _ = self._force(fields, changed=True)
+        _, lost, driven, _ = self._force(fields, changed=True, answered=False)
         return lost + driven
+
+    @property
+    def body_drag(self) -> BodyDrag | None:
+        """The coupling with rigid bodies; None without any."""
+        return self._bodies
 
     def push_bodies(self) -> None:
         """Apply the impulses of the last step to the bodies, if any."""
@@ -606,8 +611,12 @@ class Viscosity:
         """Velocities of solids on the faces of each component."""
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
-    def _force(self, kernel_args: ViscousFields, *, changed: bool) -> list[float]:
+    def _force(
+        self, kernel_args: ViscousFields, *, changed: bool, answered: bool = True
+    ) -> list[float]:
         """Write the residual; return its norm and the energies of the step.
+
+        `answered`: whether the residual includes the response of the bodies.
 
         In this order: the norm, the energy lost by the force, the work of walls, the norm of the
         diagonal.
@@ -618,7 +627,7 @@ class Viscosity:
             sums.changed()
         for sums in self._sums:
             totals += sums.read()
-        if self._bodies is not None:
+        if self._bodies is not None and answered:
             self._bodies.answer(self.multigrid.r, self._change)
             totals[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
         if self._comm is not None:

@@ -21,9 +21,11 @@ const int edge =
 // kernel fluids.stokes.masses: Mass of a component's faces, m = a theta, in units of rho dx^d; and
 // faces in a wall that are partly open. A film as thick as half of the open part holds these:
 // drag = tau nu_rel / (a / 2 + slip length). `leak` = a^2 / (m + drag) is their outflow per
-// difference of pressures, `share` = drag / (m + drag) the wall's part of their velocity.
+// difference of pressures, `share` = drag / (m + drag) the wall's part of their velocity;
+// `free_part` = a (1 - share).
 //   compute    float32
-//   box        float32 volume, leak, share, d, h, open?, phi?, relative?; int8 kind; uint8 contact
+//   box        float32 volume, leak, share, free_part?, d, h, open?, phi?, relative?; int8 kind;
+//              uint8 contact
 //   numbers    int axis, planes; float32 tau
 //   constants  FLUID, SOLID, AIR, RELEASED, CLOSE, THETA_MIN, CUT, GHOST, VARIES
 #include "stokes_face"
@@ -53,6 +55,7 @@ for (int i = edge; i < last; ++i) {
     volume[i] = wall ? 0.0f : mass;
     leak[i] = wall && part > 0.0f ? part * part / (mass + drag) : 0.0f;
     share[i] = wall && part > 0.0f ? drag / (mass + drag) : 0.0f;
+    if (free_part) free_part[i] = fraction(i) * (1.0f - share[i]);
 }
 
 // kernel fluids.stokes.cells: Weights of the normal stresses of FLUID cells, 0 in other cells. A
@@ -122,10 +125,12 @@ for (int i = first; i < last; ++i) {
     weight[i] = cut ? 0.0f : weight[i];
 }
 
-// kernel fluids.stokes.scale: Weights 1 / c of the pressure's correction c (mu / dx^2 of a
-// uniform liquid), from the viscous part of the diagonals of the faces around a cell
+// kernel fluids.stokes.scale: Correction c of the pressure by an outflow, which approximates
+// mu / dx^2: the reciprocal of the sum of a^2 / K over the faces of a cell, with the viscous part K
+// of their diagonals. `weight`: c plus the reciprocal of the sum of a^2 / m, an estimate of the
+// diagonal of the inverse Schur complement
 //   compute    float32
-//   box        float32 coefficient, ax?, ay?, az?, vx, vy, vz?, diagonal_x, diagonal_y,
+//   box        float32 coefficient, weight, ax?, ay?, az?, vx, vy, vz?, diagonal_x, diagonal_y,
 //              diagonal_z?, leak_x, leak_y, leak_z?, share_x, share_y, share_z?, cell; int8 kind
 //   numbers    int planes
 //   constants  FLUID, SOLID, CUT
@@ -136,30 +141,45 @@ const float* diagonal[3] = {diagonal_x, diagonal_y, diagonal_z};
 const float* leak[3] = {leak_x, leak_y, leak_z};
 const float* share[3] = {share_x, share_y, share_z};
 for (int i = first; i < last; ++i) {
-    float sum = 0.0f;
+    float stiff = 0.0f, inert = 0.0f;
     bool loose = false;  // a face without viscous force
     for (int n = 0; n < 2 * planes + 2; ++n) {
         const int axis = n >> 1;
         const long long f = i + (n & 1) * steps[axis];
+        float by_force = 0.0f, by_mass = 0.0f;
         if (volume[axis][f] > 0.0f) {
             const float a = CUT ? open[axis][CUT ? f : 0] : 1.0f;
             // faces at open sides of the domain have no row in the viscous equations
-            const float link =
+            const float force =
                 diagonal[axis][f] > 0.0f ? diagonal[axis][f] - volume[axis][f] : cell[i];
-            if (link > 0.0f)
-                sum += a * a / link;
-            else
-                loose = true;
+            by_mass = a * a / volume[axis][f];
+            by_force = force > 0.0f ? a * a / force : 0.0f;
         } else if (leak[axis][f] > 0.0f) {
-            if (share[axis][f] > 0.0f)
-                sum += leak[axis][f] / share[axis][f];
-            else
-                loose = true;
+            by_mass = leak[axis][f];
+            by_force = share[axis][f] > 0.0f ? leak[axis][f] / share[axis][f] : 0.0f;
         }
+        inert += by_mass;
+        stiff += by_force;
+        loose = loose || (by_mass > 0.0f && !(by_force > 0.0f));
     }
-    const float uniform = planes == 2 ? 0.75f : 2.0f / 3.0f;
-    const bool stiff = (kind[i] == FLUID) & (sum > 0.0f) & !loose;
-    coefficient[i] = stiff ? uniform / sum : 0.0f;
+    const bool viscous = (kind[i] == FLUID) & (stiff > 0.0f) & !loose;
+    coefficient[i] = viscous ? 1.0f / stiff : 0.0f;
+    weight[i] = (kind[i] == FLUID) & (inert > 0.0f) ? coefficient[i] + 1.0f / inert : 0.0f;
+}
+
+// kernel fluids.stokes.weights: Reciprocal diagonals of a component's rows
+//   compute    float32
+//   box        float32 weight, volume, diagonal, cell; int8 kind
+//   numbers    int axis
+//   constants  FLUID
+const long long steps[3] = {1, s2, s1}, step = steps[axis];
+#include "stokes_edge"
+for (int i = first; i < last; ++i) {
+    float size = 1.0f;
+    if (i >= edge && volume[i] > 0.0f)
+        size = diagonal[i] > 0.0f ? diagonal[i]
+                                  : volume[i] + cell[kind[i] == FLUID ? i : i - step];
+    weight[i] = i >= edge && volume[i] > 0.0f ? 1.0f / size : 0.0f;
 }
 
 // snippet stokes_gradient: Add the pressure's force a (x_below - x_here) to the force on a
