@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warp_lcp.fluids.pressure import THETA_MIN
-from warp_lcp.fluids.viscosity_passes import CLOSE
+from warp_lcp.fluids.viscosity_passes import ALONG, CLOSE
 from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.material.boundary_kernels import LETS_GO, RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -19,6 +19,7 @@ CONSTANTS = {
     "RELEASED": RELEASED,
     "LETS_GO": LETS_GO,
     "CLOSE": CLOSE,
+    "ALONG": ALONG,
     "THETA_MIN": THETA_MIN,
 }
 KERNELS = KernelFile(Path(__file__).parent / "headers/stokes.h", CONSTANTS)
@@ -70,7 +71,7 @@ def stokes_kernels(
 
     return StokesKernels(
         masses=kernel("masses", CUT=cut, GHOST=ghost, VARIES=varies),
-        cells=kernel("cells"),
+        cells=kernel("cells", CUT=cut),
         edges=kernel("edges"),
         scale=kernel("scale", CUT=cut),
         weights=kernel("weights"),

@@ -66,7 +66,7 @@ for (int i = edge; i < last; ++i) {
 //   box        float32 cell, mixed, out_cell, out_mixed, product?, dx, dy, dz?; int8 kind;
 //              uint8 touch, contact; uint8 out_contact; int8 across?
 //   numbers    int planes
-//   constants  AIR, FLUID, RELEASED, LETS_GO, CLOSE
+//   constants  AIR, FLUID, RELEASED, LETS_GO, CLOSE, ALONG, CUT
 const long long steps[3] = {1, s2, s1};
 const float* d[3] = {dx, dy, planes == 2 ? dz : dx};
 for (int i = first; i < last; ++i) {
@@ -86,18 +86,24 @@ for (int i = first; i < last; ++i) {
         }
         if (touch[i] & LETS_GO) {
             int walls = 0;
-            for (int axis = 0; axis <= planes; ++axis)
-                if (d[axis][i] <= (float)CLOSE || d[axis][i + steps[axis]] <= (float)CLOSE) {
-                    ++walls;
-                    normal = axis;
-                }
-            weight += rest;
-            rest = 0.0f;
-            if (walls == 1) {
-                cross = weight;
-                weight *= 2.0f;
+            bool aligned = true;
+            for (int axis = 0; axis <= planes; ++axis) {
+                const float low = d[axis][i], high = d[axis][i + steps[axis]];
+                if (!(low <= (float)CLOSE) && !(high <= (float)CLOSE)) continue;
+                ++walls;
+                normal = axis;
+                const float rise = low < high ? high - low : low - high;
+                aligned = aligned && (!CUT || rise >= (float)ALONG);
             }
-            touching = RELEASED;  // no link to the wall along its normal
+            if (aligned && walls) {
+                weight += rest;
+                rest = 0.0f;
+                touching = RELEASED;  // no link to the wall along its normal
+                if (walls == 1) {
+                    cross = weight;
+                    weight *= 2.0f;
+                }
+            }
         }
     }
     out_cell[i] = weight;
@@ -162,9 +168,10 @@ for (int i = first; i < last; ++i) {
         stiff += by_force;
         loose = loose || (by_mass > 0.0f && !(by_force > 0.0f));
     }
-    const bool viscous = (kind[i] == FLUID) & (stiff > 0.0f) & !loose;
+    const bool viscous = (kind[i] == FLUID) & (stiff > 0.0f) & !loose,
+               moves = (kind[i] == FLUID) & (inert > 0.0f);
     coefficient[i] = viscous ? 1.0f / stiff : 0.0f;
-    weight[i] = (kind[i] == FLUID) & (inert > 0.0f) ? coefficient[i] + 1.0f / inert : 0.0f;
+    weight[i] = moves ? coefficient[i] + 1.0f / inert : 0.0f;
 }
 
 // kernel fluids.stokes.weights: Reciprocal diagonals of a component's rows
@@ -258,18 +265,20 @@ for (int i = edge; i < last; ++i) {
 }
 
 // kernel fluids.stokes.divergence: Outflow y of FLUID cells [m/s]. Cells beside separating walls
-// are free unless x is at its bound and y > 0; `switching`: cells that changed
+// are free unless x is at its bound and y > 0; `switching`: cells that changed; `worst`: largest |y|
+// of free cells; `most`: largest |x|
 //   compute    float64
 //   box        float32 y, u, v, w?, ax?, ay?, az?, solid_x?, solid_y?, solid_z?; float64 x, lower?;
 //              int8 kind; uint8 free
 //   numbers    int planes, look; float64 least_x, least_y
-//   sums       switching, square
+//   sums       switching
+//   largest    worst, most
 //   constants  FLUID, SOLID, CUT, MOVING, BOUNDED
 const long long steps[3] = {1, s2, s1};
 const float* open[3] = {ax, ay, az};
 const float* speed[3] = {u, v, w};
 const float* solid[3] = {solid_x, solid_y, solid_z};
-double changes = 0.0, total = 0.0;
+double changes = 0.0;
 for (int i = first; i < last; ++i) {
     double sum = 0.0;
     for (int n = 0; n < 2 * planes + 2; ++n) {
@@ -292,10 +301,12 @@ for (int i = first; i < last; ++i) {
     }
     free[i] = is_free;
     y[i] = fluid ? (float)sum : 0.0f;
-    total += is_free ? sum * sum : 0.0;
+    const double miss = is_free ? (sum < 0.0 ? -sum : sum) : 0.0,
+                 size = fluid ? (x[i] < 0.0 ? -x[i] : x[i]) : 0.0;
+    worst = miss > worst ? miss : worst;
+    most = size > most ? size : most;
 }
 switching = changes;
-square = total;
 
 // kernel fluids.stokes.bound: Set the pressure of cells that are not free to its bound
 //   compute    float64
