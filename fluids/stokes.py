@@ -264,6 +264,7 @@ class StokesSolve:
                 axis=axis,
                 sign=-1.0,
             )
+        self._add_products(u, force, 1.0)
         self._outflow(u, x, self._scalar(q))
         if self._bodies is not None:
             V = self._tail(p)
@@ -272,6 +273,26 @@ class StokesSolve:
                 V, self._flat_scalar(q), self._free.flatten(), sign=-1.0
             )
             self._set_tail(q, self._bodies.rows(V, p, self._flat_scalar(p)))
+
+    def _add_products(
+        self, u: Sequence[wp.array], force: Sequence[wp.array], sign: float
+    ) -> None:
+        """Add the products of strain rates along separating walls to the rows, in 3-D."""
+        if self._across is None or self.projection.lower is None:
+            return
+        for axis, out in enumerate(force):
+            self._parts.window.run(
+                self._kernels.beside_walls,
+                out=out,
+                volume=self._parts.level.volume[axis],
+                product=self._product_weight,
+                u=u[0],
+                v=u[1],
+                w=u[2],
+                across=self._across,
+                axis=axis,
+                sign=sign,
+            )
 
     def _flat_scalar(self, vector: wp.array) -> wp.array:
         return vector[self._size : self._size + self.grid.size]
@@ -414,7 +435,6 @@ class StokesSolve:
             window.run(
                 kernels.bound, x=x, lower=self.projection.lower, kind=kind, free=self._free
             )
-        force = self._components(self.viscosity.multigrid.r)
         for axis, change in enumerate(self.viscosity.change):
             window.run(
                 kernels.difference,
@@ -426,7 +446,6 @@ class StokesSolve:
         self.taken = self.viscosity.force(ViscousFields(velocity, kind, self._contact))
         r = self._components(self.r)
         wp.copy(self.r, self.viscosity.multigrid.r, count=self._size)
-        del force
         for axis in range(grid.dimension):
             window.run(
                 kernels.force,
@@ -442,6 +461,7 @@ class StokesSolve:
                 axis=axis,
                 sign=1.0,
             )
+        self._add_products(velocity, r, -1.0)
         window.run(
             kernels.right_side,
             out=self._scalar(self.r),
@@ -600,6 +620,7 @@ class StokesSolve:
             if not first:
                 switched = self._residual(velocity, 1)
                 settled = not switched
+                history.append(switched)
                 if switched:
                     self._residual(velocity, 0)
                     self._pressure.restrict(self._free.flatten())

@@ -36,6 +36,7 @@ class StokesKernels:
     weights: StencilKernel
     gradient: StencilKernel
     force: StencilKernel
+    beside_walls: StencilKernel
     outflow: StencilKernel
     held: StencilKernel
     divergence: StencilKernel
@@ -77,6 +78,7 @@ def stokes_kernels(
         weights=kernel("weights"),
         gradient=kernel("gradient", CUT=cut),
         force=kernel("force", CUT=cut),
+        beside_walls=kernel("beside_walls"),
         outflow=kernel("outflow", CUT=cut),
         held=kernel("held", CUT=cut, MOVING=moving),
         divergence=kernel("divergence", CUT=cut, MOVING=moving, BOUNDED=bounded),

@@ -223,6 +223,24 @@ for (int i = edge; i < last; ++i) {
 #include "stokes_edge"
 #include "stokes_gradient"
 
+// kernel fluids.stokes.beside_walls: Add the products c g_s g_t of the two strain rates along an
+// aligned separating wall to the rows of a component t, times `sign`: c g_s of the cell below minus
+// that of the cell above. 3-D only
+//   compute    float32
+//   box        float32 out, volume, product, u, v, w; int8 across
+//   numbers    int axis; float32 sign
+const long long steps[3] = {1, s2, s1}, step = steps[axis];
+const float* speed[3] = {u, v, w};
+#include "stokes_edge"
+const auto stress = [&](long long c) {
+    const int normal = across[c];
+    if (normal < 0 || normal == axis || !(product[c] > 0.0f)) return 0.0f;
+    const int other = 3 - axis - normal;
+    return product[c] * (speed[other][c + steps[other]] - speed[other][c]);
+};
+for (int i = edge; i < last; ++i)
+    if (volume[i] > 0.0f) out[i] += sign * (stress(i - step) - stress(i));
+
 // kernel fluids.stokes.outflow: Minus the outflow of free cells by velocities and leaks
 //   compute    float32
 //   box        float32 out, x, u, v, w?, ax?, ay?, az?, vx, vy, vz?, leak_x, leak_y, leak_z?;
