@@ -591,7 +591,7 @@ class PressureProjection:
         window: Window,
         dt: float,
         kick_dt: float,
-        earlier: wl.SolveResult,
+        residual: float,
         moved: Callable[[], None],
     ) -> Projection:
         """Project a velocity that the pressure x has acted on already; x becomes the sum of both.
@@ -604,19 +604,17 @@ class PressureProjection:
             window: see `project`.
             dt: time step [s].
             kick_dt: time that forces have acted [s].
-            earlier: result of the step's first solve for x, whose residual is accurate enough.
+            residual: norm of the outflow at which the solve ends [m/s].
             moved: called when the velocities of bodies have changed.
         """
-        before = self._before = self.grid.field(wp.float64) if self._before is None else self._before
+        if self._before is None:
+            self._before = self.grid.field(wp.float64)
+        before = self._before
         copy(before, self.pressure)
         self.prepare(velocity, dt, kick_dt, window)
         self._cells.run(LAST_BOUNDS, lower=self._lower, start=self._start, x=before)
         self._copy_cells()
-        criteria = wl.StoppingCriteria(
-            rtol=0.0,
-            atol=max(earlier.residual, 1e-300),
-            max_iterations=self.max_iterations,
-        )
+        criteria = wl.StoppingCriteria(rtol=0.0, atol=residual, max_iterations=self.max_iterations)
         assert self._problem is not None
         result = wl.solve(
             self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work

@@ -141,7 +141,13 @@ class LiquidSimulation(ParticleSimulation):
         )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
         self.stokes = make_stokes(
-            self.scene, grid, self.boundary, self.surface, self.viscosity, self.projection, self.bodies
+            self.scene,
+            grid,
+            self.boundary,
+            self.surface,
+            self.viscosity,
+            self.projection,
+            self.bodies,
         )
         # Airborne momentum and spray corrections assume gravity alone.
         if self.models:
@@ -230,7 +236,7 @@ class LiquidSimulation(ParticleSimulation):
         )
         projected = self._project(window, dt, speed)
         if self.stokes is not None and viscous and projected.result is not None:
-            projected, coupled = self._couple(self.stokes, projected, window, dt, speed)
+            projected, coupled = self._couple(self.stokes, projected, window, dt)
             viscous |= coupled
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
@@ -495,30 +501,33 @@ class LiquidSimulation(ParticleSimulation):
         return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
 
     def _couple(
-        self, stokes: StokesSolve, projected: Projection, window: Window, dt: float, speed: float
+        self, stokes: StokesSolve, projected: Projection, window: Window, dt: float
     ) -> tuple[Projection, Row]:
         """Solve for velocity and pressure at once if the split step is not accurate enough.
 
         Returns:
-            The projection of the step, and the log values of the coupled solve.
+            The projection of the step, and its log values.
         """
+
+        def moved() -> None:
+            if self.bodies is not None:
+                self.boundary.begin_step(self.time, dt)
+
         projection = self.projection
         with self.watch.stage("coupled solve", *self.velocity, projection.pressure):
-            def moved() -> None:
-                if self.bodies is not None:
-                    self.boundary.begin_step(self.time, dt)
-
-            result = stokes.solve(self.velocity, window, moved)
-            if result.iterations:
+            result = stokes.solve(self.velocity, self.kick_dt, moved)
+            if result.used:
+                assert projected.result is not None
                 if self.forces is not None and self.scene.output.forces:
                     self.forces.impulses = self._impulses_before + stokes.impulses(
                         self.velocity, self.forces.references
                     )
-                projected = stokes.project(
-                    self.velocity, window, dt, self.kick_dt, projected, moved
+                residual = projected.result.residual
+                projected = projection.correct(
+                    self.velocity, window, dt, self.kick_dt, residual, moved
                 )
                 self._held(projected)
-        return projected, dict(zip(STOKES_COLUMNS, result.row(), strict=True))
+        return projected, Row(result.row())
 
     def _move_on(
         self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float

@@ -49,9 +49,7 @@ class StokesBodies:
     ) -> None:
         self.bodies, self._dimension, self._drag = bodies, grid.dimension, drag
         self.free_parts = grid.faces()
-        self._flow = BodyCoupling(
-            grid, boundary, bodies, density, open_parts=self.free_parts
-        )
+        self._flow = BodyCoupling(grid, boundary, bodies, density, open_parts=self.free_parts)
         self._flow.columns.comm = drag.columns.comm
         self.rank = drag.columns.rank
         self._factors = wp.zeros(self.rank, dtype=wp.float64, device=grid.device)
@@ -66,9 +64,7 @@ class StokesBodies:
         """Store V*."""
         self.start = self.velocities
 
-    def take(
-        self, level: ViscosityLevel, walls: ViscousWalls, velocity: list[wp.array]
-    ) -> None:
+    def take(self, level: ViscosityLevel, walls: ViscousWalls, velocity: list[wp.array]) -> None:
         """Compute the coupling of a step."""
         self._drag.take(level, walls, velocity)
         self._flow.take(walls.kind)
@@ -101,9 +97,7 @@ class StokesBodies:
         self._factors.assign(V)
         self._drag.columns.scatter(self._factors, out, out, sign=-1.0)
 
-    def add_outflow(
-        self, V: np.ndarray, out: wp.array, free: wp.array, *, sign: float
-    ) -> None:
+    def add_outflow(self, V: np.ndarray, out: wp.array, free: wp.array, *, sign: float) -> None:
         """Add sign U V to outflows of free cells."""
         self._factors.assign(V)
         self._flow.columns.scatter(self._factors, out, out, mask=free, sign=sign)

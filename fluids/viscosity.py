@@ -438,19 +438,35 @@ class Viscosity:
             np.add.at(six, owner, np.hstack([push, np.cross(x - points[owner], push)]))
         return six if grid.dimension == 3 else six[:, PLANAR]
 
-    def equations(self) -> ViscousEquations:
-        """Return the equations of the last step."""
-        return ViscousEquations(
-            self._fine, self._above, self._distance, self._slip, float(self._tau.value)
-        )
+    def equations(self, kind: wp.array, contact: wp.array, dt: float) -> ViscousEquations:
+        """Return the equations of the last step, for another solve of the same step.
 
-    def force(self, fields: ViscousFields) -> float:
-        """Write the residual for the current `change`; return the energy dissipated.
+        They are set up again if that step was solved in several parts.
 
-        The energy is in units of the mass of a cell.
+        Args:
+            kind: see `solve`.
+            contact: see `solve`.
+            dt: time that viscosity acts [s].
+        """
+        tau = self._viscosity / self._density * dt / self.grid.spacing**2
+        if tau != self._tau.value:
+            self._tau.value = tau
+            self._graphs["_set_up"].run(kind, contact, variant=self._placed)
+        return ViscousEquations(self._fine, self._above, self._distance, self._slip, tau)
+
+    def force(self, fields: ViscousFields) -> tuple[float, float]:
+        """Write the residual for the current `change`, without the response of bodies.
+
+        Returns:
+            The energy dissipated, and the work of walls, in units of the mass of a cell.
         """
         _, lost, driven, _ = self._force(fields, changed=True, answered=False)
-        return lost + driven
+        return lost + driven, driven
+
+    @property
+    def change_field(self) -> wp.array:
+        """The flat field of `change`; a coupled solve may overwrite it."""
+        return self._change
 
     @property
     def body_drag(self) -> BodyDrag | None:

@@ -278,9 +278,7 @@ class BodyDrag:
 
     def factors(self) -> tuple[np.ndarray, np.ndarray]:
         """Return m and D of all bodies, block diagonal, see the class."""
-        m = [
-            self._scale * body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies
-        ]
+        m = [self._scale * body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
         return scipy.linalg.block_diag(*m), scipy.linalg.block_diag(*self._drag)
 
     def answer(self, residual: wp.array, change: wp.array) -> None:

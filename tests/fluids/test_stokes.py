@@ -64,12 +64,12 @@ def dense(simulation: LiquidSimulation) -> DenseProblem:
     """Return the equations at the current velocity and pressure."""
     stokes, projection = simulation.stokes, simulation.projection
     kind = projection.kind.numpy()
-    stokes._vectors()
+    stokes._allocate()
     stokes._free.assign((kind == FLUID).astype(np.uint8))
     stokes._residual(simulation.velocity, 0)
     r = stokes.r.numpy().astype(float)
     size = stokes._size
-    volume = np.concatenate([v.numpy().ravel() for v in stokes._parts.level.volume])
+    volume = np.concatenate([v.numpy().ravel() for v in stokes._equations.level.volume])
     faces, cells = np.flatnonzero(volume > 0.0), np.flatnonzero(kind.ravel() == FLUID)
     columns = np.concatenate([faces, size + cells])
     p, q = (wp.zeros(stokes.r.size, dtype=wp.float32, device="cpu") for _ in range(2))
@@ -91,7 +91,7 @@ def dense(simulation: LiquidSimulation) -> DenseProblem:
         D=-S[n:, :n],
         C=-S[n:, n:],
         r=r[columns[:n]],
-        y=stokes._y.numpy().ravel()[cells].astype(float),
+        y=stokes._outflows.numpy().ravel()[cells].astype(float),
         room=room,
         asymmetry=float(np.abs(K - K.T).max() / np.abs(K).max()),
     )
@@ -103,10 +103,10 @@ def coupled_step(simulation: LiquidSimulation, dt: float) -> tuple[DenseProblem,
     solve = simulation.stokes.solve
 
     def watched(*arguments: Any) -> Any:
-        simulation.stokes.set_up()
+        simulation.stokes.set_up(arguments[1])
         found.append(dense(simulation))
         # The equations of the viscous solve are those of before again.
-        found.append(simulation.stokes._solve(arguments[0], np.inf, arguments[2]))
+        found.append(simulation.stokes.couple(arguments[0], np.inf, arguments[2]))
         found.insert(1, dense(simulation))
         return found[2]
 
@@ -160,12 +160,18 @@ def test_it_solves_the_dense_problem(seed: int) -> None:
 
 
 if __name__ == "__main__":
-    for seed in (0,3,6,9,12,15,18,21,24,27):
+    for seed in (0, 3, 6, 9, 12, 15, 18, 21, 24, 27):
         simulation = drawn(seed)
         before, after, result = coupled_step(simulation, 0.02)
         print(
-            seed, len(before.r), len(before.y), "bounded", np.isfinite(before.room).sum(),
+            seed,
+            len(before.r),
+            len(before.y),
+            "bounded",
+            np.isfinite(before.room).sum(),
             f"asym {before.asymmetry:.1e} start {before.error():.2e} end {after.error():.2e}",
-            "min eig %.1e" % np.linalg.eigvalsh(before.A).min(), result, flush=True
+            "min eig %.1e" % np.linalg.eigvalsh(before.A).min(),
+            result,
+            flush=True,
         )
 _ = covering, GRAVITY
