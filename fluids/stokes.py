@@ -12,8 +12,9 @@ in units of the mass of a cell, rho dx^d.
 
 - M_f = a_f theta_f, with open fraction and distance of the surface as in `fluids.pressure`, so that
   K = 0 is the pressure projection of the step.
-- K is the matrix of `fluids.viscosity` with its walls and slip lengths; tau = nu kick_dt / dx^2. It
-  is symmetric and positive semi-definite, and K u = 0 for rigid motions.
+- K is the matrix of `fluids.viscosity` with its walls and slip lengths, and the harmonic mean of
+  viscosities that differ on edges; tau = nu kick_dt / dx^2. It is symmetric and positive
+  semi-definite, and K u = 0 for rigid motions.
 - D u is the outflow of cells through the open parts of their faces, d that of moving solids. The
   force of the pressure on a face is D'x = a (x_below - x_here).
 - Faces in a wall that are partly open are no unknowns. A film of half of the open part holds them,
@@ -74,6 +75,8 @@ STOKES_COLUMNS = ("splitting_error", "stokes_iterations", "stokes_error")
 VECTORS = 30  # of a Krylov space before a restart
 TENTH = 0.1  # decrease of the residual after which the free cells are determined again
 NOISE = 1e-6  # of the largest pressure: smaller ones have no sign
+# Splitting errors below this share of |u*|_M are smaller than errors of the pressure solves.
+FLOOR = 1e-3
 # A solve that misses its tolerance is used if it has reduced the error of its start to this share.
 USEFUL = 0.5
 KEEP, LOOK, FIRST = range(3)  # whether `_residual` determines the free cells, see `divergence`
@@ -217,7 +220,8 @@ class StokesSolve:
         self.set_up(kick_dt)
         error, size = self._splitting_error(velocity)
         share = error / size if size > 0.0 else 0.0
-        if self._refused or not share > self.splitting_tolerance:
+        small = error <= FLOOR * math.sqrt(self._energy(self.start, self.start)[0])
+        if self._refused or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
         return self.couple(velocity, share, moved)
 
@@ -227,6 +231,7 @@ class StokesSolve:
         """Set up the equations of the step from those of the viscous solve."""
         kernels, grid, b = self._kernels, self.grid, self.boundary
         kind, contact = self.projection.kind, self.projection.contact
+        relative: list[wp.array | None] = [*self.viscosity.relative] or [None] * grid.dimension
         equations = self._equations = self.viscosity.equations(kind, contact, kick_dt)
         level, window = equations.level, equations.window
         for axis in range(grid.dimension):
@@ -240,7 +245,7 @@ class StokesSolve:
                 h=equations.slip[axis],
                 open=self._open[axis],
                 phi=self._phi,
-                relative=self.viscosity.relative[axis] if self.viscosity.relative else None,
+                relative=relative[axis],
                 kind=kind,
                 contact=contact,
                 axis=axis,
@@ -275,6 +280,8 @@ class StokesSolve:
                 db=equations.distance[other],
                 va=level.volume[one],
                 vb=level.volume[other],
+                ma=relative[one],
+                mb=relative[other],
                 a=one,
                 b=other,
             )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.linalg
 import warp as wp
@@ -64,7 +66,9 @@ class StokesBodies:
         """Store V*."""
         self.start = self.velocities
 
-    def take(self, level: ViscosityLevel, walls: ViscousWalls, velocity: list[wp.array]) -> None:
+    def take(
+        self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
+    ) -> None:
         """Compute the coupling of a step."""
         self._drag.take(level, walls, velocity)
         self._flow.take(walls.kind)

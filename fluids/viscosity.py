@@ -40,8 +40,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids import viscosity_barriers as thin
-from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
+from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.domain_sides import open_sides_of

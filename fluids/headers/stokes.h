@@ -116,11 +116,12 @@ for (int i = first; i < last; ++i) {
 }
 
 // kernel fluids.stokes.edges: Cut the shear stress at edges that touch a face without mass: there
-// this face moves such that the stress vanishes
+// this face moves such that the stress vanishes. Viscosities that differ count by their harmonic
+// mean, as of layers along the edge
 //   compute    float32
-//   box        float32 weight, da, db, va, vb
+//   box        float32 weight, da, db, va, vb, ma?, mb?
 //   numbers    int a, b
-//   constants  CLOSE
+//   constants  CLOSE, VARIES
 const long long steps[3] = {1, s2, s1}, A = steps[a], B = steps[b];
 const auto light = [&](const float* d, const float* v, long long f) {
     return !(d[f] <= (float)CLOSE) && !(v[f] > 0.0f);
@@ -128,7 +129,23 @@ const auto light = [&](const float* d, const float* v, long long f) {
 for (int i = first; i < last; ++i) {
     const bool cut =
         light(da, va, i) || light(da, va, i - B) || light(db, vb, i) || light(db, vb, i - A);
-    weight[i] = cut ? 0.0f : weight[i];
+    float factor = 1.0f;
+    if (VARIES) {
+        float sum = 0.0f, inverse = 0.0f;
+        int count = 0;
+        const auto add = [&](float m) {
+            if (!(m > 0.0f)) return;
+            sum += m;
+            inverse += 1.0f / m;
+            ++count;
+        };
+        add(ma[VARIES ? i : 0]);
+        add(ma[VARIES ? i - B : 0]);
+        add(mb[VARIES ? i : 0]);
+        add(mb[VARIES ? i - A : 0]);
+        factor = count ? (float)(count * count) / (sum * inverse) : 1.0f;
+    }
+    weight[i] = cut ? 0.0f : factor * weight[i];
 }
 
 // kernel fluids.stokes.scale: Correction c of the pressure by an outflow, which approximates
