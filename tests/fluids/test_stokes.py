@@ -203,22 +203,26 @@ def test_a_step_that_needs_no_coupled_solve_has_the_same_bits() -> None:
 
 def channel(viscosity: float) -> LiquidSimulation:
     """Return a channel of 16 cells between sticky walls, with inflow and outflow."""
-    data = scene(
-        size=[1.0, 0.34375],
-        resolution=64,
-        wall="sticky",
-        liquid=[box([0.0, 0.03125], [1.0, 0.28125])],
-        solid=[box([-1.0, -1.0], [5.0, 0.03125]), box([-1.0, 0.28125], [5.0, 2.0])],
-        source=[box([0.0, 0.03125], [0.03125, 0.28125], velocity=[0.05, 0.0])],
-        viscosity={"value": viscosity, "splitting_tolerance": 0.05},
-        physics={"gravity": [0.0, -1e-6]},
-        probe=[
+    data = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {
+            "size": [1.0, 0.34375],
+            "resolution": 64,
+            "wall": "sticky",
+            "open": ["right"],
+        },
+        "liquid": [box([0.0, 0.03125], [1.0, 0.28125])],
+        "solid": [box([-1.0, -1.0], [5.0, 0.03125]), box([-1.0, 0.28125], [5.0, 2.0])],
+        "source": [box([0.0, 0.03125], [0.03125, 0.28125], velocity=[0.05, 0.0])],
+        "viscosity": {"value": viscosity, "splitting_tolerance": 0.05},
+        "physics": {"gravity": [0.0, -1e-6]},
+        "probe": [
             {"name": "a", "position": [0.4, 0.16], "quantity": "pressure"},
             {"name": "b", "position": [0.7, 0.16], "quantity": "pressure"},
             {"name": "u", "position": [0.55, 0.15625], "quantity": "velocity"},
         ],
-    ).model_dump()
-    data["domain"]["open"] = ["right"]
+    }
     return create(LiquidScene.model_validate(data))
 
 
