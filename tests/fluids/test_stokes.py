@@ -206,12 +206,7 @@ def channel(viscosity: float) -> LiquidSimulation:
     data = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 1.0},
-        "domain": {
-            "size": [1.0, 0.34375],
-            "resolution": 64,
-            "wall": "sticky",
-            "open": ["right"],
-        },
+        "domain": {"size": [1.0, 0.34375], "resolution": 64, "wall": "sticky", "open": ["right"]},
         "liquid": [box([0.0, 0.03125], [1.0, 0.28125])],
         "solid": [box([-1.0, -1.0], [5.0, 0.03125]), box([-1.0, 0.28125], [5.0, 2.0])],
         "source": [box([0.0, 0.03125], [0.03125, 0.28125], velocity=[0.05, 0.0])],
