@@ -43,6 +43,7 @@ class BodyCoupling:
         density: density of the liquid [kg/m^3].
         share: factor on U V in the outflow, for a problem in terms of mass, see
             `fluids.unilateral_pressure`.
+        open_parts: fields in place of the open fractions of the faces of each component.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class BodyCoupling:
         density: float,
         *,
         share: float = 1.0,
+        open_parts: Sequence[wp.array] = (),
     ) -> None:
         self.grid, self.boundary, self.bodies, self._solved = (
             grid,
@@ -75,6 +77,10 @@ class BodyCoupling:
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         S = kernels.CoupledBodies()
         S.walls, S.bodies = walls_of(grid, boundary), len(bodies.bodies)
+        if open_parts:
+            walls = S.walls
+            walls.open_x, walls.open_y, walls.open_z = (*open_parts, open_parts[0])[:3]
+            S.walls = walls
         S.low, S.rows, S.row = wp.vec3i(*low.tolist()), int((high - low)[1]), int((high - low)[2])
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)
         self._center = HostArray(len(bodies.bodies), wp.vec3d, grid.device)

@@ -11,6 +11,7 @@ import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.stokes import StokesSolve
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.fluids.unilateral_pressure import UnilateralPressure
@@ -183,5 +184,33 @@ def make_viscosity(
         phi=surface.phi,
         tolerance=tolerance,
         sources=bool(scene.source),
+        bodies=bodies,
+    )
+
+
+def make_stokes(
+    scene: LiquidScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    surface: FreeSurface,
+    viscosity: Viscosity | None,
+    projection: PressureProjection,
+    bodies: RigidBodies | None,
+) -> StokesSolve | None:
+    """Return the coupled solve of velocity and pressure of a scene, or None.
+
+    Ranks have none.
+    """
+    if scene.viscosity is None or viscosity is None or not scene.couples or grid.part.shared:
+        return None
+    return StokesSolve(
+        grid,
+        boundary,
+        viscosity,
+        projection,
+        phi=surface.phi,
+        splitting_tolerance=scene.viscosity.splitting_tolerance,
+        tolerance=viscosity.tolerance,
+        density=scene.physics.density,
         bodies=bodies,
     )

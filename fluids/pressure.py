@@ -46,6 +46,8 @@ CONSTANTS = {
 THETA_MIN = 1e-3  # least distance of the air from the center of a FLUID cell [cells]
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
+LAST_BOUNDS = KERNELS["fluids.pressure.last_bounds"]
+SUM_PRESSURE = KERNELS["fluids.pressure.sum_pressure"]
 
 
 @dataclass(frozen=True)
@@ -252,6 +254,7 @@ class PressureProjection:
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.jump: wp.array | None = None
         self.adhesion = 0.0
+        self._before: wp.array | None = None  # pressure before a correction; built at first use
         self._passes = pressure_passes(
             bool(boundary.open), bool(boundary.velocity), phi is not None, walls_separate
         )
@@ -571,6 +574,67 @@ class PressureProjection:
             threshold=self._threshold,
         )
         self.grid.part.fill(*velocity, *self.known, self.contact)
+
+    @property
+    def lower(self) -> wp.array | None:
+        """Lower bound of x in each cell; None without separating walls."""
+        return self._lower
+
+    @property
+    def operator(self) -> wl.GridPoisson:
+        """The matrix of the liquid, without bodies."""
+        return self._operator
+
+    def correct(
+        self,
+        velocity: Sequence[wp.array],
+        window: Window,
+        dt: float,
+        kick_dt: float,
+        residual: float,
+        moved: Callable[[], None],
+    ) -> Projection:
+        """Project a velocity that the pressure x has acted on already; x becomes the sum of both.
+
+        The correction x' is complementary to the outflow with the lower bound `lower - x`, so that
+        the sum keeps its own bound.
+
+        Args:
+            velocity: the velocity [m/s] (updated).
+            window: see `project`.
+            dt: time step [s].
+            kick_dt: time that forces have acted [s].
+            residual: norm of the outflow at which the solve ends [m/s].
+            moved: called when the velocities of bodies have changed.
+        """
+        if self._before is None:
+            self._before = self.grid.field(wp.float64)
+        before = self._before
+        copy(before, self.pressure)
+        self.prepare(velocity, dt, kick_dt, window)
+        self._cells.run(LAST_BOUNDS, lower=self._lower, start=self._start, x=before)
+        self._copy_cells()
+        criteria = wl.StoppingCriteria(rtol=0.0, atol=residual, max_iterations=self.max_iterations)
+        assert self._problem is not None
+        result = wl.solve(
+            self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work
+        )
+        self.push_bodies(result)
+        moved()
+        projected = self.project(velocity, window, result, criteria)
+        self._cells.run(SUM_PRESSURE, x=self.pressure, before=before, kind=self.kind)
+        self._contacts.take(
+            self._cells,
+            self._faces,
+            FaceVelocity.of(velocity),
+            touch=self.boundary.touch,
+            x=self.pressure,
+            contact=self.contact,
+            threshold=self._threshold,
+        )
+        self._contacts.changed()
+        self.grid.part.fill(self.contact)
+        return projected
 
     def counted(self) -> int:
         """Return the number of unknowns of the prepared problem; collective."""

@@ -25,6 +25,8 @@ TENSION_BYTES = 21
 UNILATERAL_BYTES = 1
 # Its fields, those of coarse levels, and the velocity before the pressure solve.
 VISCOUS_BYTES = {2: 140, 3: 220}
+# Fields of the coupled solve, its Krylov vectors, and the levels of its pressure cycle.
+STOKES_BYTES = {2: 520, 3: 690}
 # Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
 # at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5
@@ -74,6 +76,13 @@ class ViscositySettings(Table):
         ge=0,
         allow_inf_nan=True,
         description='slip length of "separating" and "sticky" walls [m]',
+    )
+    splitting_tolerance: float = Field(
+        default=math.inf,
+        ge=0,
+        allow_inf_nan=True,
+        description="error of the split step, relative to the velocity, above which velocity and "
+        "pressure are solved at once; inf: never",
     )
 
 
@@ -296,6 +305,8 @@ class LiquidScene(ParticleScene):
             )
         if self.viscosity is not None:
             models.append(SceneModel("viscosity", "viscosity.value"))
+        if self.couples:
+            models.append(SceneModel("coupled solve", "viscosity.splitting_tolerance"))
         if self.surface_tension is not None:
             models.append(
                 SceneModel(
@@ -318,6 +329,16 @@ class LiquidScene(ParticleScene):
                 )
             )
         return [*models, *super().models()]
+
+    @property
+    def couples(self) -> bool:
+        """Return whether velocity and pressure of viscous liquid may be solved together."""
+        settings = self.viscosity
+        return (
+            settings is not None
+            and math.isfinite(settings.splitting_tolerance)
+            and self.pressure.model == "incompressible"
+        )
 
     @property
     def drags(self) -> list[float] | None:
@@ -423,6 +444,7 @@ class LiquidScene(ParticleScene):
             "viscosity": cells
             * (self.viscosity is not None)
             * (VISCOUS_BYTES[self.dimension] + 4 * self.dimension * (self.kept(()) is not None)),
+            "coupled solve": cells * self.couples * STOKES_BYTES[self.dimension],
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "drag along walls": cells * 4 * self.dimension * (self.drags is not None),
             "surface": cells

@@ -14,6 +14,7 @@ from warp_lcp.fluids.forces import SolidForces, WallSums
 from warp_lcp.fluids.models import (
     LiquidModel,
     make_pressure,
+    make_stokes,
     make_surface,
     make_tension,
     make_viscosity,
@@ -21,6 +22,7 @@ from warp_lcp.fluids.models import (
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.stokes import STOKES_COLUMNS, StokesSolve
 from warp_lcp.fluids.surface_tension import REACH
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
@@ -138,6 +140,15 @@ class LiquidSimulation(ParticleSimulation):
             WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
+        self.stokes = make_stokes(
+            self.scene,
+            grid,
+            self.boundary,
+            self.surface,
+            self.viscosity,
+            self.projection,
+            self.bodies,
+        )
         # Airborne momentum and spray corrections assume gravity alone.
         if self.models:
             self.flights = None
@@ -224,6 +235,9 @@ class LiquidSimulation(ParticleSimulation):
             else {}
         )
         projected = self._project(window, dt, speed)
+        if self.stokes is not None and viscous and projected.result is not None:
+            projected, coupled = self._couple(self.stokes, projected, window, dt)
+            viscous |= coupled
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
@@ -339,6 +353,7 @@ class LiquidSimulation(ParticleSimulation):
         if self.tension is not None and self.scene.output.diagnostics:
             columns = (*columns, "surface_energy")
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
+        columns = columns if self.stokes is None else (*columns, *STOKES_COLUMNS)
         automatic = () if self.projection.automatic is None else ("tolerance", "time_error")
         return (*columns, *automatic, *model_columns)
 
@@ -430,6 +445,10 @@ class LiquidSimulation(ParticleSimulation):
         """
         projection = self.projection
         viscosity.keep(self.velocity)
+        if self.stokes is not None:
+            self.stokes.keep_start(self.velocity)
+            if self.forces is not None:
+                self._impulses_before = self.forces.impulses.copy()
         momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
         if self._project(window, dt, speed).result is None:
             return {}
@@ -471,6 +490,8 @@ class LiquidSimulation(ParticleSimulation):
                 )
             total = result if total is None else result.after(total)
         assert total is not None
+        if self.stokes is not None:
+            self.stokes.keep_viscous(self.velocity)
         viscosity.undo(self.velocity)
         for body, values in zip(
             self.bodies.bodies if self.bodies is not None else (), momenta, strict=True
@@ -478,6 +499,35 @@ class LiquidSimulation(ParticleSimulation):
             body.restore_momenta(values)
         viscosity.push_bodies()
         return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
+
+    def _couple(
+        self, stokes: StokesSolve, projected: Projection, window: Window, dt: float
+    ) -> tuple[Projection, Row]:
+        """Solve for velocity and pressure at once if the split step is not accurate enough.
+
+        Returns:
+            The projection of the step, and its log values.
+        """
+
+        def moved() -> None:
+            if self.bodies is not None:
+                self.boundary.begin_step(self.time, dt)
+
+        projection = self.projection
+        with self.watch.stage("coupled solve", *self.velocity, projection.pressure):
+            result = stokes.solve(self.velocity, self.kick_dt, moved)
+            if result.used:
+                assert projected.result is not None
+                if self.forces is not None and self.scene.output.forces:
+                    self.forces.impulses = self._impulses_before + stokes.impulses(
+                        self.velocity, self.forces.references
+                    )
+                residual = projected.result.residual
+                projected = projection.correct(
+                    self.velocity, window, dt, self.kick_dt, residual, moved
+                )
+                self._held(projected)
+        return projected, Row(result.row())
 
     def _move_on(
         self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float

@@ -41,6 +41,7 @@ import warp as wp
 
 from warp_lcp.fluids import viscosity_barriers as thin
 from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWallCoupling, ViscousWalls
+from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.domain_sides import open_sides_of
@@ -82,6 +83,25 @@ class ViscousFields(NamedTuple):
     u: Sequence[wp.array]
     kind: wp.array
     contact: wp.array
+
+
+@dataclass(frozen=True)
+class ViscousEquations:
+    """Equations of the last viscous step, for a coupled solve.
+
+    Attributes:
+        level: the equations on the grid.
+        window: cells, and faces at the upper ends of the domain, whose equations are set up.
+        distance: distance of each component's faces from walls [cells].
+        slip: slip length of those walls [cells].
+        tau: nu dt / dx^2.
+    """
+
+    level: ViscosityLevel
+    window: Window
+    distance: Sequence[wp.array]
+    slip: Sequence[wp.array]
+    tau: float
 
 
 @dataclass(frozen=True)
@@ -418,6 +438,41 @@ class Viscosity:
             np.add.at(six, owner, np.hstack([push, np.cross(x - points[owner], push)]))
         return six if grid.dimension == 3 else six[:, PLANAR]
 
+    def equations(self, kind: wp.array, contact: wp.array, dt: float) -> ViscousEquations:
+        """Return the equations of the last step, for another solve of the same step.
+
+        They are set up again if that step was solved in several parts.
+
+        Args:
+            kind: see `solve`.
+            contact: see `solve`.
+            dt: time that viscosity acts [s].
+        """
+        tau = self._viscosity / self._density * dt / self.grid.spacing**2
+        if tau != self._tau.value:
+            self._tau.value = tau
+            self._graphs["_set_up"].run(kind, contact, variant=self._placed)
+        return ViscousEquations(self._fine, self._above, self._distance, self._slip, tau)
+
+    def force(self, fields: ViscousFields) -> tuple[float, float]:
+        """Write the residual for the current `change`, without the response of bodies.
+
+        Returns:
+            The energy dissipated, and the work of walls, in units of the mass of a cell.
+        """
+        _, lost, driven, _ = self._force(fields, changed=True, answered=False)
+        return lost + driven, driven
+
+    @property
+    def change_field(self) -> wp.array:
+        """The flat field of `change`; a coupled solve may overwrite it."""
+        return self._change
+
+    @property
+    def body_drag(self) -> BodyDrag | None:
+        """The coupling with rigid bodies; None without any."""
+        return self._bodies
+
     def push_bodies(self) -> None:
         """Apply the impulses of the last step to the bodies, if any."""
         if self._bodies is not None:
@@ -519,19 +574,23 @@ class Viscosity:
         )
         if self.grid.barriers is not None:
             self._hold_apart(kind, contact)
+        self.set_diagonals(kind, contact)
+        self.multigrid.set_up()
+
+    def set_diagonals(self, kind: wp.array, contact: wp.array) -> None:
+        """Compute the diagonals from the weights of the links, and which faces walls hold."""
         for axis in range(self.grid.dimension):
             self._above.run(
-                passes.diagonal,
-                fine.rows(axis),
-                held=fine.hold[axis],
-                d=distance[axis],
-                h=slip[axis],
+                self._passes.diagonal,
+                self._fine.rows(axis),
+                held=self._fine.hold[axis],
+                d=self._distance[axis],
+                h=self._slip[axis],
                 kind=kind,
                 contact=contact,
-                planes=planes,
+                planes=self.grid.planes,
                 thin=self._thin[axis],
             )
-        self.multigrid.set_up()
 
     def _hold_apart(self, kind: wp.array, contact: wp.array) -> None:
         """Launch the kernels that cut links at thin solids, and link faces to the solids."""
@@ -568,8 +627,12 @@ class Viscosity:
         """Velocities of solids on the faces of each component."""
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
-    def _force(self, kernel_args: ViscousFields, *, changed: bool) -> list[float]:
+    def _force(
+        self, kernel_args: ViscousFields, *, changed: bool, answered: bool = True
+    ) -> list[float]:
         """Write the residual; return its norm and the energies of the step.
+
+        `answered`: whether the residual includes the response of the bodies.
 
         In this order: the norm, the energy lost by the force, the work of walls, the norm of the
         diagonal.
@@ -580,7 +643,7 @@ class Viscosity:
             sums.changed()
         for sums in self._sums:
             totals += sums.read()
-        if self._bodies is not None:
+        if self._bodies is not None and answered:
             self._bodies.answer(self.multigrid.r, self._change)
             totals[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
         if self._comm is not None:

@@ -278,6 +278,11 @@ class BodyDrag:
         self._weights = 0.5 * (W + W.T)
         self._response.assign(self._weights)
 
+    def factors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return m and D of all bodies, block diagonal, see the class."""
+        m = [self._scale * body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
+        return scipy.linalg.block_diag(*m), scipy.linalg.block_diag(*self._drag)
+
     def answer(self, residual: wp.array, change: wp.array) -> None:
         """Add the bodies' response to a change of the liquid's velocity to a residual."""
         self.change = self._weights @ (self._pulled.ravel() + self.columns.gather(change).numpy())
@@ -294,6 +299,10 @@ class BodyDrag:
             device=self.grid.device,
         )
         self.columns.scatter(self._factors, q, q, sign=-1.0, launch=launch)
+
+    def settle(self) -> None:
+        """Forget the response of the last solve: the bodies have the step's velocities."""
+        self.change = np.zeros(self.columns.rank)
 
     def velocities(self) -> np.ndarray:
         """Return the bodies' velocities after the step [m/s, 1/s].

@@ -332,3 +332,18 @@ for (int i = first; i < last; ++i) {
     const float az = fraction(2, i + sz, sz) - fraction(2, i, sz);
     wetted += (double)(f * sqrtf(ax * ax + ay * ay + az * az));
 }
+
+// kernel fluids.pressure.last_bounds: Lower bound and first guess of the last projection, which
+// corrects a pressure x: lower - x and 0
+//   compute    float64
+//   box        float64 start, lower?, x
+for (int i = first; i < last; ++i) {
+    if (lower) lower[i] = lower[i] - x[i];
+    start[i] = 0.0;
+}
+
+// kernel fluids.pressure.sum_pressure: Add the pressure before the last projection
+//   compute    float64
+//   box        float64 x, before; int8 kind
+//   constants  FLUID
+for (int i = first; i < last; ++i) x[i] += kind[i] == FLUID ? before[i] : 0.0;

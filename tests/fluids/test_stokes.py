@@ -1,0 +1,255 @@
+"""Coupled solve of velocity and pressure: dense solutions, bounds, exact states, channel, rod."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from default_run import few
+from small_liquids import GRAVITY, box, create, scene
+from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.operators.grid_poisson import FLUID
+
+ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
+
+
+@dataclass
+class DenseProblem:
+    """Dense equations of a coupled solve, about a velocity and a pressure.
+
+    A du - D'dx = r and y + D du + C dx >= 0, complementary to x + dx >= lower.
+    """
+
+    A: np.ndarray
+    D: np.ndarray
+    C: np.ndarray
+    r: np.ndarray
+    y: np.ndarray
+    room: np.ndarray  # lower - x, -inf without bound
+    asymmetry: float
+
+    def velocity_change(self) -> np.ndarray:
+        """Return du of the exact solution."""
+        inverse = np.linalg.inv(self.A)
+        S = self.D @ inverse @ self.D.T + self.C
+        q = self.y + self.D @ (inverse @ self.r)
+        dx = np.zeros(len(q))
+        bounded = np.isfinite(self.room)
+        free = ~bounded
+        if not bounded.any():
+            dx = -np.linalg.lstsq(S, q, rcond=1e-10)[0]
+        else:
+            # Unknowns without bound are eliminated; Lemke's method solves the rest.
+            F, B = np.flatnonzero(free), np.flatnonzero(bounded)
+            inner = np.linalg.pinv(S[np.ix_(F, F)], rcond=1e-10) if len(F) else np.zeros((0, 0))
+            M = S[np.ix_(B, B)] - S[np.ix_(B, F)] @ inner @ S[np.ix_(F, B)]
+            b = q[B] - S[np.ix_(B, F)] @ inner @ q[F]
+            problem = wl.LCP(M, b + M @ self.room[B], 0.0, np.inf)
+            dx[B] = self.room[B] + np.asarray(wl.solve(problem, wl.Lemke()).x.numpy()).ravel()
+            dx[F] = -inner @ (q[F] + S[np.ix_(F, B)] @ dx[B])
+        return inverse @ (self.r + self.D.T @ dx)
+
+    def error(self) -> float:
+        """Return the error of the velocity in the norm of A."""
+        du = self.velocity_change()
+        return float(np.sqrt(du @ self.A @ du))
+
+
+def dense(simulation: LiquidSimulation) -> DenseProblem:
+    """Return the equations at the current velocity and pressure."""
+    stokes, projection = simulation.stokes, simulation.projection
+    kind = projection.kind.numpy()
+    stokes._allocate()
+    stokes._free.assign((kind == FLUID).astype(np.uint8))
+    stokes._residual(simulation.velocity, 0)
+    r = stokes.r.numpy().astype(float)
+    size = stokes._size
+    volume = np.concatenate([v.numpy().ravel() for v in stokes._equations.level.volume])
+    faces, cells = np.flatnonzero(volume > 0.0), np.flatnonzero(kind.ravel() == FLUID)
+    columns = np.concatenate([faces, size + cells])
+    p, q = (wp.zeros(stokes.r.size, dtype=wp.float32, device="cpu") for _ in range(2))
+    K = np.zeros((len(columns), len(columns)))
+    for number, column in enumerate(columns):
+        unit = np.zeros(p.size, dtype=np.float32)
+        unit[column] = 1.0
+        p.assign(unit)
+        q.zero_()
+        stokes._product(p, q)
+        K[:, number] = q.numpy()[columns]
+    n = len(faces)
+    lower = projection.lower
+    x = projection.pressure.numpy().ravel()[cells]
+    room = np.full(len(cells), -np.inf) if lower is None else lower.numpy().ravel()[cells] - x
+    S = 0.5 * (K + K.T)
+    return DenseProblem(
+        A=S[:n, :n],
+        D=-S[n:, :n],
+        C=-S[n:, n:],
+        r=r[columns[:n]],
+        y=stokes._outflows.numpy().ravel()[cells].astype(float),
+        room=room,
+        asymmetry=float(np.abs(K - K.T).max() / np.abs(K).max()),
+    )
+
+
+def coupled_step(simulation: LiquidSimulation, dt: float) -> tuple[DenseProblem, DenseProblem, Any]:
+    """Take a step; return the equations before and after its coupled solve, and its result."""
+    found: list[Any] = []
+    solve = simulation.stokes.solve
+
+    def watched(*arguments: Any) -> Any:
+        simulation.stokes.set_up(arguments[1])
+        found.append(dense(simulation))
+        # The equations of the viscous solve are those of before again.
+        found.append(simulation.stokes.couple(arguments[0], np.inf, arguments[2]))
+        found.insert(1, dense(simulation))
+        return found[2]
+
+    simulation.stokes.solve = watched
+    simulation.step(dt)
+    simulation.stokes.solve = solve
+    return found[0], found[1], found[2]
+
+
+def drawn(seed: int) -> LiquidSimulation:
+    """Return a drawn pool or block with a solid or two, on few cells."""
+    rng = np.random.default_rng(seed)
+    dimension = 2 if seed % 3 else 3
+    wall = ["sticky", "separating", "separating", "free-slip"][seed % 4]
+    low = rng.uniform(0.0, 0.3, dimension)
+    high = np.minimum(low + rng.uniform(0.4, 0.7, dimension), 1.0)
+    velocity = rng.uniform(-1.0, 1.0, dimension).tolist()
+    solids = [
+        {
+            "shape": "sphere",
+            "center": rng.uniform(0.2, 0.8, dimension).tolist(),
+            "radius": float(rng.uniform(0.1, 0.25)),
+            "wall": str(rng.choice(["sticky", "separating"])),
+        }
+    ]
+    slip = {"slip_length": float(rng.uniform(0.0, 0.1))} if rng.random() < 0.4 else {}
+    viscosity = {"value": float(10.0 ** rng.uniform(1.0, 4.0)), **slip}
+    return create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=10 if dimension == 2 else 6,
+            wall=wall,
+            liquid=[box(low.tolist(), high.tolist(), velocity=velocity)],
+            solid=solids,
+            solids=str(rng.choice(["cut-cell", "voxel"])),
+            viscosity={**viscosity, "splitting_tolerance": ALWAYS},
+            solver={"tolerance": 1e-5},
+        )
+    )
+
+
+@pytest.mark.parametrize("seed", few(range(12), 5))
+def test_it_solves_the_dense_problem(seed: int) -> None:
+    simulation = drawn(seed)
+    before, after, result = coupled_step(simulation, 0.02)
+    assert before.asymmetry < 1e-6
+    assert np.linalg.eigvalsh(before.A).min() > 0.0
+    assert result.converged
+    assert after.error() <= max(3e-4 * before.error(), 3e-5)
+
+
+@pytest.mark.parametrize("wall", ["separating", "sticky"])
+def test_liquid_at_rest_and_in_flight_needs_no_coupled_solve(wall: str) -> None:
+    pool = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=16,
+            wall=wall,
+            liquid=[box([0.0, 0.0], [1.0, 0.5])],
+            viscosity={"value": 1e3, "splitting_tolerance": 0.05},
+        )
+    )
+    block = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=16,
+            liquid=[box([0.25, 0.5], [0.75, 1.0])],
+            viscosity={"value": 1e3, "splitting_tolerance": 0.05},
+        )
+    )
+    for simulation in pool, block:
+        for _ in range(2):
+            row = simulation.step(0.02)
+            assert row["stokes_iterations"] == 0
+    assert block.step(0.02)["splitting_error"] < 1e-3
+
+
+def test_a_step_that_needs_no_coupled_solve_has_the_same_bits() -> None:
+    rows = []
+    for tolerance in float("inf"), 1e9:
+        simulation = create(
+            scene(
+                size=[1.0, 0.5],
+                resolution=16,
+                liquid=[box([0.0, 0.0], [0.4, 0.4])],
+                viscosity={"value": 1.0, "splitting_tolerance": tolerance},
+            )
+        )
+        for _ in range(3):
+            simulation.step(0.02)
+        rows.append([field.numpy().copy() for field in simulation.velocity])
+    assert all(np.array_equal(one, other) for one, other in zip(*rows, strict=True))
+
+
+def channel(viscosity: float) -> LiquidSimulation:
+    """Return a channel of 16 cells between sticky walls, with inflow and outflow."""
+    data = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 0.34375], "resolution": 64, "wall": "sticky", "open": ["right"]},
+        "liquid": [box([0.0, 0.03125], [1.0, 0.28125])],
+        "solid": [box([-1.0, -1.0], [5.0, 0.03125]), box([-1.0, 0.28125], [5.0, 2.0])],
+        "source": [box([0.0, 0.03125], [0.03125, 0.28125], velocity=[0.05, 0.0])],
+        "viscosity": {"value": viscosity, "splitting_tolerance": 0.05},
+        "physics": {"gravity": [0.0, -1e-6]},
+        "probe": [
+            {"name": "a", "position": [0.4, 0.16], "quantity": "pressure"},
+            {"name": "b", "position": [0.7, 0.16], "quantity": "pressure"},
+            {"name": "u", "position": [0.55, 0.15625], "quantity": "velocity"},
+        ],
+    }
+    return create(LiquidScene.model_validate(data))
+
+
+def test_a_channel_has_the_gradient_and_the_profile_of_poiseuille() -> None:
+    viscosity, height, speed = 500.0, 0.25, 0.05
+    simulation = channel(viscosity)
+    for _ in range(3):
+        row = simulation.step(0.02)
+    assert row["stokes_iterations"] <= 40
+    found = simulation.measured["probes"]
+    gradient = (found["a_pressure"] - found["b_pressure"]) / 0.3
+    assert abs(gradient / (12.0 * viscosity * speed / height**2) - 1.0) < 0.02
+    assert abs(found["u_vx"] / (1.5 * speed) - 1.0) < 0.02
+
+
+def test_a_rod_sinks_at_the_speed_of_faxen_and_carries_its_weight() -> None:
+    rod = {"shape": "sphere", "center": [0.02, 0.04], "radius": 0.005, "density": 7800.0}
+    simulation = create(
+        scene(
+            size=[0.04, 0.08],
+            resolution=32,
+            liquid=[box([0.0, 0.0], [0.04, 0.075])],
+            solid=[rod],
+            viscosity={"value": 10.0, "splitting_tolerance": 0.05},
+            output={"forces": True},
+        )
+    )
+    for _ in range(5):
+        row = simulation.step(0.02)
+    k, weight = 0.25, 7800.0 * GRAVITY * np.pi * 0.005**2
+    sinking = (7800.0 - 1000.0) * GRAVITY * np.pi * 0.005**2
+    walls = np.log(1 / k) - 0.9157 + 1.7244 * k**2 - 1.7302 * k**4
+    speed = sinking * walls / (4.0 * np.pi * 10.0)
+    assert abs(-row["body0_vy"] / speed - 1.0) < 0.09
+    assert abs(simulation.measured["forces"]["solid0_fy"] / weight - 1.0) < 0.02
