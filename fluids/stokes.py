@@ -60,16 +60,16 @@ from warp_lcp.fluids.stokes_kernels import stokes_kernels
 from warp_lcp.fluids.viscosity import Viscosity, ViscousFields
 from warp_lcp.fluids.viscosity_bodies import ViscousWalls
 from warp_lcp.grid.staggered import StaggeredGrid, three_components
-from warp_lcp.grid.window_reduction import WindowTally
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.launch_graph import Launch, copy, launch_now
-from warp_lcp.kernels.vectors import Sums, rows_of
+from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import NORM
 from warp_lcp.material.boundary import Boundary, CutBoundary
-from warp_lcp.reduced.grid_system import GridSystem
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.subproblems.grid_system import GridSystem
 
 STOKES_COLUMNS = ("splitting_error", "stokes_iterations", "stokes_error")
 VECTORS = 20  # of a Krylov space before a restart
@@ -189,7 +189,7 @@ class StokesSolve:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = StokesBodies(grid, boundary, bodies, viscosity.body_drag, density)
         self._rank = 0 if self._bodies is None else self._bodies.rank
-        self._tallies: dict[tuple[str, int], WindowTally] = {}
+        self._tallies: dict[tuple[str, int], WindowReduction] = {}
         self._krylov: GMRES | None = None  # built, with its vectors, at the first use
 
     def keep_start(self, velocity: Sequence[wp.array]) -> None:
@@ -355,7 +355,7 @@ class StokesSolve:
         """Launch a kernel that reduces; return its results."""
         tally = self._tallies.get((name, part))
         if tally is None:
-            tally = self._tallies[name, part] = WindowTally(kernel, self.grid)
+            tally = self._tallies[name, part] = WindowReduction(kernel, self.grid)
         tally.take(self._equations.window, **arguments)
         tally.changed()
         return np.array(tally.read())
@@ -370,7 +370,7 @@ class StokesSolve:
                 zeros(size, wp.float32, device) for _ in range(4)
             )
             self._krylov = GMRES(self._product, self, restart=VECTORS, weight=self._weight)
-            self._norm = Sums(rows_of(self.r))
+            self._norm = RowReduction(rows_of(self.r))
             self._pressure = GridSystem(self.projection.operator, wp.float32, bounded=False)
             self._free_cells = self._free.flatten()
             self._split_pressure = self.grid.field(wp.float64)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation as Rotation3
-from warp_lcp.grid.signed_distance import Box, Placement
 
 from warp_lcp.grid import barrier_faces_kernels as kernels
 from warp_lcp.grid.barrier_geometry import Barrier
 from warp_lcp.grid.barriers import SAMPLES, Barriers
 from warp_lcp.grid.cell_kernel import F32, POINTS
 from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.signed_distance import Box, Placement
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.thin_walls import SKIN, ThinWalls
 from warp_lcp.grid.voxelize import PlacedSolid

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation as Rotation3
-from warp_lcp.grid.signed_distance import Box, Placement
 
 from warp_lcp.grid import thin_walls_kernels as kernels
 from warp_lcp.grid.particle_loops import MARGIN
+from warp_lcp.grid.signed_distance import Box, Placement
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.thin_walls import SKIN, ThinWalls
 from warp_lcp.grid.voxelize import PlacedSolid

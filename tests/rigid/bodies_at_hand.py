@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from warp_lcp.grid.part import ONE_PROCESS
+from warp_lcp.grid.grid_part import ONE_PROCESS
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties

@@ -133,7 +133,9 @@ class PartialSites:
             self._candidates(*self._open_sites(plane, open_cells))
             for plane in range(grid.origin[2], grid.origin[2] + grid.counts[2])
         ]
-        points, owner, count, draw = (np.concatenate(column) for column in zip(*candidates, strict=True))
+        points, owner, count, draw = (
+            np.concatenate(column) for column in zip(*candidates, strict=True)
+        )
         samples = SAMPLES[grid.dimension] ** grid.dimension
         # Full sites are the first.
         keys = np.where(count == samples, -1.0, draw - count / samples)
