@@ -179,7 +179,7 @@ class MomentumWorkspace(StressWorkspace):
     def __init__(self, stress: Stress, method: HeavyBallProjectedGradient) -> None:
         super().__init__(stress)
         self.method = method
-        self._ahead = (
+        self._device_iteration = (
             StressDeviceIteration(stress, method) if StressDeviceIteration.suits(stress) else None
         )
         self._leads = False  # whether the device started the solve and decides on its steps
@@ -200,12 +200,12 @@ class MomentumWorkspace(StressWorkspace):
             steps: most steps of this solve without the host.
         """
         self._leads, self._news = False, None
-        if self._ahead is None or not isinstance(criteria, wl.StoppingCriteria):
+        if self._device_iteration is None or not isinstance(criteria, wl.StoppingCriteria):
             return None
         self._leads = steps > 0 and criteria.rtol == 0.0
         if not self._leads:
             return None
-        self._ahead.begin(criteria.atol, steps)
+        self._device_iteration.begin(criteria.atol, steps)
         self._steps_counted = 0
         reference = self._take(kernels.FIRST)
         self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None
@@ -213,8 +213,8 @@ class MomentumWorkspace(StressWorkspace):
 
     def _take(self, place: int) -> float:
         """Read a residual that the device has computed; return its norm."""
-        assert self._ahead is not None
-        sums = self._ahead.decisions()[place : place + 2]
+        assert self._device_iteration is not None
+        sums = self._device_iteration.decisions()[place : place + 2]
         self.norm, self.current = math.hypot(*self.problem.take_residual(*map(float, sums))), True
         return self.norm
 
@@ -227,14 +227,14 @@ class MomentumWorkspace(StressWorkspace):
 
         The decisions are: evaluate the residual, and progress has ended.
         """
-        if self._ahead is None or not self._leads:
+        if self._device_iteration is None or not self._leads:
             steps_taken = self.method.check_every * PERIOD
             return steps_taken, *self.judge(
                 self.problem.advance(self.method.check_every), steps_taken
             )
-        if self._ahead.decisions()[kernels.DONE] == self._steps_counted:
-            self._ahead.resume()
-        found = self._ahead.decisions()
+        if self._device_iteration.decisions()[kernels.DONE] == self._steps_counted:
+            self._device_iteration.resume()
+        found = self._device_iteration.decisions()
         steps_taken, self._steps_counted = (
             int(found[kernels.DONE]) - self._steps_counted,
             int(found[kernels.DONE]),
@@ -246,8 +246,8 @@ class MomentumWorkspace(StressWorkspace):
 
         The minimum holds for any residual.
         """
-        if self._ahead is not None and self._leads:
-            return bool(self._ahead.decisions()[kernels.LEAST] > 0.0)
+        if self._device_iteration is not None and self._leads:
+            return bool(self._device_iteration.decisions()[kernels.LEAST] > 0.0)
         stress, method = self.problem, self.method
         pressure_step, shear_step, lookahead = method.steps(stress)
         stress.restart(

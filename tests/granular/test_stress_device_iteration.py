@@ -116,8 +116,8 @@ def workspaces(
         alone.setattr(StressDeviceIteration, "suits", lambda stress: False)
         host = method.init(stress)
     device = method.init(stress)
-    assert host._ahead is None
-    assert device._ahead is not None
+    assert host._device_iteration is None
+    assert device._device_iteration is not None
     return host, device
 
 

@@ -15,7 +15,7 @@ import warp_lcp as wl
 from default_run import few
 from warp_lcp.problem import workspace_cache
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.workspace_cache import KEPT, MOST_CELLS
+from warp_lcp.problem.workspace_cache import CACHE, MOST_CELLS
 
 pytestmark = pytest.mark.cpu_form("workspaces are kept on the CPU")
 
@@ -27,7 +27,7 @@ METHODS += [wl.ProjectedMultigrid(monotone_cycles=0), wl.ProjectedMultigrid(pati
 def nothing_kept(monkeypatch):
     """Begin and end without a spare workspace."""
     wl.release_workspace()
-    monkeypatch.setattr(KEPT, "last", None)
+    monkeypatch.setattr(CACHE, "last", None)
     before = wl.get_threads()
     yield
     wl.release_workspace()
@@ -97,7 +97,7 @@ def ready(problem, method):
     """Solve twice, so that a workspace is spare."""
     for _ in range(2):
         wl.solve(problem, method)
-    assert KEPT.workspace is not None
+    assert CACHE.workspace is not None
 
 
 @pytest.mark.parametrize("seed", few(range(12), 5))
@@ -143,7 +143,7 @@ def test_problems_of_other_forms_have_workspaces_of_their_own():
 
     def form(*sides, method=method, cells=cells, b=b, **options):
         wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu", **options), b, *sides), method)
-        return KEPT.last
+        return CACHE.last
 
     forms = [
         form(),
@@ -202,11 +202,11 @@ def test_problems_without_copies(monkeypatch):
     for problem in own:
         for _ in range(3):
             wl.solve(problem, method)
-            assert problem.form is None and KEPT.workspace is None
+            assert problem.form is None and CACHE.workspace is None
     monkeypatch.setattr(workspace_cache, "MOST_CELLS", 8 * 9 * 11 - 1)
     for _ in range(3):
         wl.solve(wl.LCP(A, b), method)
-        assert KEPT.workspace is None
+        assert CACHE.workspace is None
 
 
 def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
@@ -225,7 +225,7 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
         + [weakref.ref(p.b) for p in problems]
     )
     references += [weakref.ref(guess)]
-    work = KEPT.workspace.work
+    work = CACHE.workspace.work
     held = sum(a.capacity for a in (work.x, work.problem.b, work._p)) + work.hierarchy.nbytes
     assert held < 140 * work.problem.layout.size
     first = [result.x.numpy().copy() for result in results]
@@ -241,7 +241,7 @@ def test_the_kept_workspace_keeps_no_problem_and_can_be_freed():
     assert [
         np.array_equal(result.x.numpy(), x) for result, x in zip(results, first, strict=True)
     ] == [True] * 3
-    work = weakref.ref(KEPT.workspace.work)
+    work = weakref.ref(CACHE.workspace.work)
     wl.release_workspace()
     gc.collect()
     assert work() is None
@@ -262,11 +262,11 @@ def test_solves_that_end_badly_and_rows_alone_keep_nothing():
         wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=1)).status
         is wl.SolveStatus.MAX_ITERATIONS
     )
-    assert KEPT.workspace is None
+    assert CACHE.workspace is None
     ready(problem, method)
     with pytest.raises(ValueError, match="x0 holds"):
         wl.solve(problem, method, x0=np.full((6, 7, 9), np.nan))
-    assert KEPT.workspace is None
+    assert CACHE.workspace is None
     cells = np.full((1, 1, 40), wl.FLUID, np.int8)
     cells[..., -1] = wl.AIR
     row = wl.LCP(

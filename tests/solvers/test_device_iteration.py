@@ -110,7 +110,7 @@ def test_solves_are_those_of_the_host(
             )
         for one, other in zip(*found, strict=True):
             assert one == other
-        begun += ahead._ahead is not None
+        begun += ahead._device_iteration is not None
         wp.copy(guess, alone.x)
         if rng.random() < 0.3:
             guess.assign(rng.standard_normal(guess.size) * (problem.unknown.numpy() == 1))
@@ -169,8 +169,8 @@ def test_solves_with_bodies_are_those_of_the_host(
     with monkeypatch.context() as patch:
         patch.setattr(DeviceIteration, "suits", lambda work: False)
         alone = SOLVER.init(problem)
-    assert alone._ahead is None
-    assert ahead._ahead is not None
+    assert alone._device_iteration is None
+    assert ahead._device_iteration is not None
     solved_in_turn(problem, b, rng, (alone, ahead), bodies)
 
 

@@ -361,7 +361,7 @@ class ReusableWorkspace(Protocol):
 class HasWorkspaceCache(Protocol):
     """A method that keeps the workspace of a solve for later ones."""
 
-    def spare(self, problem: Any) -> ReusableWorkspace | None:
+    def cached_workspace(self, problem: Any) -> ReusableWorkspace | None:
         """Return a workspace for the problem, None if `init` has to create one."""
 
 
@@ -377,17 +377,17 @@ def is_method(solver: object) -> TypeGuard[Solver]:
     return not isinstance(solver, type) and _implements(kind, Solver)
 
 
-def keeps_workspace(solver: Solver) -> TypeGuard[HasWorkspaceCache]:
+def caches_workspace(solver: Solver) -> TypeGuard[HasWorkspaceCache]:
     """Return whether a method keeps workspaces."""
     return _implements(type(solver), HasWorkspaceCache)
 
 
-def spare_of(solver: Solver, problem: Any) -> ReusableWorkspace | None:
+def cached_workspace_of(solver: Solver, problem: Any) -> ReusableWorkspace | None:
     """Return a workspace of an earlier solve with a problem's data, or None.
 
     The method must have kept one.
     """
-    return solver.spare(problem) if keeps_workspace(solver) else None
+    return solver.cached_workspace(problem) if caches_workspace(solver) else None
 
 
 def solve(
@@ -426,9 +426,9 @@ def solve(
     deadline = Deadline(
         stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, comm
     )
-    if workspace is None and (spare := spare_of(solver, problem)) is not None:
-        result = loop(problem, solver, stopping, deadline, spare.work, callback).run(x0)
-        spare.give_back(result)
+    if workspace is None and (cached := cached_workspace_of(solver, problem)) is not None:
+        result = loop(problem, solver, stopping, deadline, cached.work, callback).run(x0)
+        cached.give_back(result)
         return result
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
     return loop(problem, solver, stopping, deadline, work, callback).run(x0)

@@ -54,7 +54,7 @@ class CachedWorkspace:
         within = x.ptr <= result.x.ptr < x.ptr + x.capacity
         if result.status is SolveStatus.CONVERGED and not within:
             self.work.forget_solve()
-            KEPT.workspace = self
+            CACHE.workspace = self
 
 
 class WorkspaceCache:
@@ -79,10 +79,10 @@ class WorkspaceCache:
             return (workspace if workspace.form == form else None), again
 
 
-KEPT = WorkspaceCache()
+CACHE = WorkspaceCache()
 
 
-def lend(problem: LCP, solver: Solver) -> CachedWorkspace | None:
+def cached_or_new_workspace(problem: LCP, solver: Solver) -> CachedWorkspace | None:
     """Return a kept or new workspace with a problem's data, or None.
 
     The kept one, or at the second consecutive solve of a form a new one. Results have the same bits
@@ -97,7 +97,7 @@ def lend(problem: LCP, solver: Solver) -> CachedWorkspace | None:
     if form is None or team() is None:
         return None
     form = form, type(solver), solver, get_threads()
-    found, again = KEPT.take(form)
+    found, again = CACHE.take(form)
     if found is not None:
         found.work.problem.take(problem)
         return found
@@ -117,4 +117,4 @@ def release_workspace() -> None:
         >>> import warp_lcp as wl
         >>> wl.release_workspace()
     """
-    KEPT.workspace = None
+    CACHE.workspace = None

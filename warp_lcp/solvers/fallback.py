@@ -26,12 +26,12 @@ from warp_lcp.problem.solve_loop import (
     VariationalInequality,
     Workspace,
     WorkspaceDefaults,
+    cached_workspace_of,
     evaluate_unless_current,
     is_method,
     method_name,
     method_step,
     refusal,
-    spare_of,
     takes_floating,
 )
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
@@ -253,10 +253,10 @@ class Fallback(MethodChain):
         """
         return FallbackWorkspace(problem, self.entries, self.entries[0].method.init(problem))
 
-    def spare(self, problem: LCP) -> CachedChain | None:
+    def cached_workspace(self, problem: LCP) -> CachedChain | None:
         """Return the workspace of an earlier solve, if the first method keeps one."""
         first = self.entries[0].method
-        lent = spare_of(first, problem)
+        lent = cached_workspace_of(first, problem)
         return (
             None
             if lent is None

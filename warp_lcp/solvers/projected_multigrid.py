@@ -15,7 +15,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.operator_protocol import HasLowRankTerm, HasStencil, check_taken, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve_loop import PrecisionName, Step
-from warp_lcp.problem.workspace_cache import CachedWorkspace, lend
+from warp_lcp.problem.workspace_cache import CachedWorkspace, cached_or_new_workspace
 from warp_lcp.settings import Count, CountOrZero, Settings
 from warp_lcp.subproblems.multigrid_coupled import CoupledWorkspace
 from warp_lcp.subproblems.multigrid_workspace import MultigridWorkspace
@@ -85,13 +85,13 @@ class ProjectedMultigrid(Settings):
             )
         return CoupledWorkspace(problem, *terms, self)
 
-    def spare(self, problem: LCP) -> CachedWorkspace | None:
+    def cached_workspace(self, problem: LCP) -> CachedWorkspace | None:
         """Return a kept workspace of an earlier solve with the problem's data.
 
         Returns None if `init` has to create one. From the second consecutive solve of a form on,
         one workspace is kept, see `wl.release_workspace`.
         """
-        return lend(problem, self) if type(self) is ProjectedMultigrid else None
+        return cached_or_new_workspace(problem, self) if type(self) is ProjectedMultigrid else None
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle or a truncated one.

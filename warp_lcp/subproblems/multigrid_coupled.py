@@ -105,7 +105,9 @@ class CoupledWorkspace(MultigridWorkspace):
         )
         self._low = low
         self.correction = WoodburyCorrection(low, self.hierarchy)
-        self._ahead = DeviceIteration(self, rebuilds=False) if DeviceIteration.suits(self) else None
+        self._device_iteration = (
+            DeviceIteration(self, rebuilds=False) if DeviceIteration.suits(self) else None
+        )
         self._evaluation = LaunchGraph(
             problem.device, self._launch_evaluation, at_once=problem.layout.comm is not None
         )

@@ -142,8 +142,12 @@ class MultigridWorkspace(WorkspaceBase):
         self._past, self._stored = 0, False
         self.cycles_left, self.energy_monitor = 0, EnergyMonitor(self.precision.epsilon)
         self._tolerance, self._steps_taken = 0.0, 0  # steps of this solve
-        self._ahead = DeviceIteration(self) if ahead and DeviceIteration.suits(self) else None
-        self._one_table = self._ahead is not None  # whether nothing is read back within a step
+        self._device_iteration = (
+            DeviceIteration(self) if ahead and DeviceIteration.suits(self) else None
+        )
+        self._one_table = (
+            self._device_iteration is not None
+        )  # whether nothing is read back within a step
         self._built = 0  # the version of the free set that the hierarchy was built for
         # Steps that the device may take without the host; whether it has begun the solve.
         self._budget, self._started = 0, False
@@ -164,8 +168,8 @@ class MultigridWorkspace(WorkspaceBase):
         """
         self.floating = None
         self._p.zero_()
-        if self._ahead is not None:
-            self._ahead.forget_guess()
+        if self._device_iteration is not None:
+            self._device_iteration.forget_guess()
 
     def begin_on_device(
         self, guess: DeviceArray | None, criteria: StoppingCriteria | MeanCriteria, steps: int
@@ -180,17 +184,17 @@ class MultigridWorkspace(WorkspaceBase):
             steps: largest number of steps without the host in this solve.
         """
         self._budget = steps
-        if self._ahead is None or guess is None or guess.ptr == self.x.ptr or steps <= 0:
+        if self._device_iteration is None or guess is None or guess.ptr == self.x.ptr or steps <= 0:
             return None
         self.floating = None
-        reference = self._ahead.begin(guess, criteria, min(steps, AHEAD))
+        reference = self._device_iteration.begin(guess, criteria, min(steps, AHEAD))
         self._started = reference is not None
         return reference
 
     @property
     def begins_on_gpu(self) -> bool:
         """Whether a GPU can begin a solve without the host."""
-        return self._ahead is not None and self.A.device.is_cuda
+        return self._device_iteration is not None and self.A.device.is_cuda
 
     @property
     def exact(self) -> bool:
@@ -224,7 +228,11 @@ class MultigridWorkspace(WorkspaceBase):
         It was x, or the x of one step ago.
         """
         if not self._stored and self._past == (1 if self.exact else 0):
-            if self._ahead is not None and self._ahead.rows and not self.exact:
+            if (
+                self._device_iteration is not None
+                and self._device_iteration.rows
+                and not self.exact
+            ):
                 self._stored = True  # the device has stored it, and x has moved on
             else:
                 self._keep_stored(by_undoing=self.exact)
@@ -312,7 +320,7 @@ class MultigridWorkspace(WorkspaceBase):
     @property
     def has_device_steps(self) -> bool:
         """Whether the device has taken steps that the host has not read yet."""
-        return self._ahead is not None and bool(self._ahead.rows)
+        return self._device_iteration is not None and bool(self._device_iteration.rows)
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
@@ -418,7 +426,7 @@ class MultigridWorkspace(WorkspaceBase):
 
         Returns whether it has; the results of one step are then read.
         """
-        ahead, left = self._ahead, min(self._budget + 1, AHEAD - self._steps_taken)
+        ahead, left = self._device_iteration, min(self._budget + 1, AHEAD - self._steps_taken)
         if ahead is None or self.floating is not None:
             return False
         # From the best iterate, where steps cannot be undone.
