@@ -21,6 +21,7 @@ INLINE_LATER = (
     "fluids.viscosity",
     "warp_lcp.interior_point.",
     "warp_lcp.nonsmooth_map.",
+    "fluids.wall_drag",
     "warp_lcp.grid.mesh_crossings",
     "warp_lcp.grid.barriers",
     "warp_lcp.grid.thin_walls",
