@@ -31,15 +31,23 @@ def precisions(cls):
 
 
 def cases():
-    for name, cls in METHODS.items():
-        for family in FAMILIES:
-            for bounds in BOUNDS:
-                for precision in precisions(cls):
-                    if family in families(cls) and (bounds == "lcp" or getattr(cls, "boxed", True)):
-                        # emulated, what blocks of threads do to each other is the same in each type
-                        marks = (
-                            pytest.mark.slow if EMULATED and precision != precisions(cls)[0] else ()
-                        )
+    """Yield each method with its operators, bounds and precisions.
+
+    By default each method and operator has all bounds in its first precision, and one kind of
+    bounds, in turn, in each of the others: row functions are the same for all types. Emulated, what
+    blocks of threads do to each other is the same in each type and for all bounds: one kind of
+    bounds, in turn, in the first precision.
+    """
+    for number, name in enumerate(METHODS):
+        cls = METHODS[name]
+        kinds = BOUNDS if getattr(cls, "boxed", True) else BOUNDS[:1]
+        for turn, family in enumerate(FAMILIES, number):
+            for bounds in kinds:
+                for later, precision in enumerate(precisions(cls)):
+                    if family in families(cls):
+                        own = bounds == kinds[(turn + later) % len(kinds)]
+                        by_default = own and not later if EMULATED else own or not later
+                        marks = () if by_default else pytest.mark.slow
                         yield pytest.param(
                             name,
                             family,
