@@ -38,7 +38,7 @@ def test_sizes_stop_where_memory_ends(monkeypatch):
 
 
 def test_estimate_of_memory_bounds_what_a_solve_takes(tmp_path):
-    records = measured(tmp_path, "--size", 48)
+    records = measured(tmp_path, "--size", 32)
     most = max(
         r["figures"]["bytes_per_cell"]["value"]
         for r in records.values()

@@ -148,6 +148,6 @@ def test_wrong_input_exits_with_2(arguments, expected):
 
 def test_a_suite_that_fails_exits_with_1(tmp_path):
     (tmp_path / "file").touch()
-    result = invoke("bench", "kernels", "--out", tmp_path / "file")
+    result = invoke("bench", "kernels", "--size", 8, "--repeat", 1, "--out", tmp_path / "file")
     assert result.exit_code == 1
     assert "the suite kernels ended with exit code 1" in result.stderr

@@ -14,8 +14,8 @@ import pytest
 import tomli_w
 
 from command_line import succeed
-from default_run import few
-from particle_scenes import particle_scenes
+from default_run import chosen, few
+from particle_scenes import particle_scenes, stepped_by_default
 from scenes_of_every_table import MOTIONS, SHAPES, SIDES, scene_of_every_table
 from warp_lcp.cli import view_commands as shown
 from warp_lcp.material.particle_scene import ParticleScene
@@ -107,7 +107,10 @@ def written(seed: int, tmp_path: Path) -> Path:
     return file
 
 
-@pytest.mark.parametrize("name", built_in_scenes())
+# Scenes that `tests/run/test_threads.py` steps are slow ones.
+@pytest.mark.parametrize(
+    "name", chosen(built_in_scenes(), set(built_in_scenes()) - set(stepped_by_default()))
+)
 def test_every_built_in_scene_is_checked(name: str) -> None:
     told = "whole run" if name in particle_scenes() else "disk"
     assert told in succeed("check", name, "--device", "cpu", "--set", small(name))

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from pydantic import ValidationError
 
-from default_run import chosen
+from default_run import chosen, covering
 from grid_fields import particles_of_cells
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
@@ -376,8 +376,7 @@ def test_a_state_belongs_to_its_band():
         tank().restore(tank(particles={}).state())
 
 
-@pytest.mark.parametrize("resolution", [24, 40])
-@pytest.mark.parametrize("particles", [BAND, {}], ids=["band", "everywhere"])
+@pytest.mark.parametrize(("resolution", "particles"), covering([24, 40], [BAND, {}]), ids=str)
 def test_another_resolution(resolution, particles):
     """Transfer to another resolution.
 

@@ -75,16 +75,19 @@ def lost(simulation: LiquidSimulation, depth: float, c: float) -> float:
 
 
 @pytest.mark.parametrize(
-    ("dimension", "c", "floor"), [(2, 0.1, 0.0), (2, 0.01, 0.0), (2, 0.01, 1.0), (3, 0.1, 1.0)]
+    ("sheet_of", "surface"),
+    covering(
+        [(2, 0.1, 0.0), (2, 0.01, 0.0), (2, 0.01, 1.0), (3, 0.1, 1.0)], [({}, 0.05), (VOXEL, 1e-3)]
+    ),
 )
-@pytest.mark.parametrize(("tables", "bound"), [({}, 0.05), (VOXEL, 1e-3)])
 def test_a_sheet_slows_down_by_its_law(
-    dimension: int, c: float, floor: float, tables: dict[str, Any], bound: float
+    sheet_of: tuple[int, float, float], surface: tuple[dict[str, Any], float]
 ) -> None:
     """Deceleration of a sheet a cell deep.
 
     To the accuracy of the thickness that the surface shows.
     """
+    (dimension, c, floor), (tables, bound) = sheet_of, surface
     simulation = sheet(1.0, c, dimension, floor=floor, **tables)
     advance(simulation, 0.3)
     assert lost(simulation, 1.0, c) == pytest.approx(1.0, abs=bound)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from default_run import covering
 from small_liquids import advance, box, create, scene
 from small_runs import run_into
 from warp_lcp.material.resample import resampled
@@ -88,9 +89,15 @@ def test_a_finer_grid_is_filled_evenly():
     assert counts[13:].sum() == 0  # at most the share of a particle at the surface
 
 
-@pytest.mark.parametrize(("before", "after"), [(16, 24), (24, 16), (16, 32), (32, 20)])
-@pytest.mark.parametrize("tables", [{}, {"solids": "voxel"}, {"particles": {"transfer": "flip"}}])
-def test_a_simulation_goes_on(before, after, tables):
+@pytest.mark.parametrize(
+    ("cells", "tables"),
+    covering(
+        [(16, 24), (24, 16), (16, 32), (32, 20)],
+        [{}, {"solids": "voxel"}, {"particles": {"transfer": "flip"}}],
+    ),
+)
+def test_a_simulation_goes_on(cells, tables):
+    before, after = cells
     old = dam(before, **tables)
     advance(old, 0.25)  # the front is at the ball
     new = dam(after, **tables)

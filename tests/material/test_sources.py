@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from default_run import slow
+from default_run import covering, slow
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.material.sources import Sources
@@ -319,8 +319,12 @@ def test_a_drain_takes_what_is_in_it() -> None:
     assert "emitted" not in simulation.columns()
 
 
-@pytest.mark.parametrize("particles", [{}, {"transfer": "flip"}])
-@pytest.mark.parametrize("tables", [{}, {"solid": [BALL]}, {"pressure": {"model": "unilateral"}}])
+@pytest.mark.parametrize(
+    ("tables", "particles"),
+    covering(
+        [{}, {"solid": [BALL]}, {"pressure": {"model": "unilateral"}}], [{}, {"transfer": "flip"}]
+    ),
+)
 def test_an_interrupted_run_goes_on_bit_for_bit(
     tables: dict[str, Any], particles: dict[str, Any]
 ) -> None:

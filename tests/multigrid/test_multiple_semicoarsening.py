@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import slow
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.multiple_semicoarsening import MultipleSemicoarsening, make_hierarchy, turns
 from warp_lcp.multigrid.stencil_level import StencilLevel
@@ -137,9 +138,16 @@ def solved(shape, strengths, lower=-np.inf, upper=np.inf, solver=None):
     return result, norms[0] / norms[1]
 
 
-@pytest.mark.parametrize("strengths", [turn, circles, waves, halves, patch])
-@pytest.mark.parametrize("n", [64, 256])
-def test_the_default_solves_turning_anisotropy(strengths, n):
+@pytest.mark.parametrize(
+    ("n", "strengths"),
+    [
+        *((64, strengths) for strengths in (turn, circles, waves, halves)),
+        (256, patch),
+        *(slow((256, strengths)) for strengths in (turn, circles, waves, halves)),
+        slow((64, patch)),
+    ],
+)
+def test_the_default_solves_turning_anisotropy(n, strengths):
     """Default method on varying anisotropy of 1:1000.
 
     Without the additional hierarchies it needs 40 to 190 iterations at 256^2. With bounds it needs

@@ -140,7 +140,7 @@ assert solved(16)[0].A.layout.padding.small_pages  # kernels are loaded
 for grid_operator.LARGE in (1 << 20, 1 << 40):
     forget_peak()
     before = resident_bytes()
-    kept = solved(64)
+    kept = solved(32)
     print(resident_bytes() - before)
     del kept
 """

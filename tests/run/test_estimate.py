@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from default_run import slow
 from small_runs import run_into
 from warp_lcp.cli.commands import app
 from warp_lcp.grid.triangle_mesh import builtin_mesh
@@ -35,7 +36,7 @@ def told(**tables):
 
 
 @pytest.mark.parametrize(
-    "name", ["dam-break-2d", "splash-in-circle", "tap-and-drain", "column-collapse-2d"]
+    "name", ["tap-and-drain", "column-collapse-2d", slow("dam-break-2d"), slow("splash-in-circle")]
 )
 def test_steps_and_bytes_are_those_of_the_run(name: str, tmp_path: Path) -> None:
     scene = load_scene(name, ["domain.resolution=32"])

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
-from default_run import slow
-from particle_scenes import particle_scenes
+from default_run import chosen
+from particle_scenes import particle_scenes, stepped_by_default
 from warp_lcp.kernels import thread_pool as team
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -45,24 +45,18 @@ def digests(name: str, count: int, steps: int) -> list[str]:
     return found
 
 
-# Scenes of more than three seconds, otherwise like shorter ones.
-LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")
+# Scenes that run with each number of threads: a liquid, sand. The others run with 3.
+EVERY_COUNT = ("splash-in-circle", "column-collapse-2d")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        slow(name) if name in LONG or number % 2 else name
-        for number, name in enumerate(particle_scenes())
-    ],
-)
+@pytest.mark.parametrize("name", chosen(particle_scenes(), stepped_by_default()))
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
     for module in ("thread_pool", "launch_graph", "fused_kernel"):
         monkeypatch.setattr(f"warp_lcp.kernels.{module}.CELLS", 100)
     before = wl.get_threads()
     try:
         expected = digests(name, 1, 3)
-        for count in (2, 3, 7):
+        for count in (2, 3, 7) if name in EVERY_COUNT else (3,):
             assert digests(name, count, 3) == expected, f"{count} threads"
             assert team.shared_seconds() > 0
     finally:

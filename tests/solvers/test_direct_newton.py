@@ -52,7 +52,7 @@ def test_default_solves_random_problems(family, device):
     P-matrices have one solution, so that a residual by NumPy decides; few unknowns are enumerated
     as well.
     """
-    for seed in range(5300, 5325):
+    for seed in range(5300, 5310):
         p = FAMILIES[family](seed)
         result = wl.solve(lcp(p, device), stopping=TIGHT, x0=p.start)
         own, reference = residuals(p, result.x.numpy())

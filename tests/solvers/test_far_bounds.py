@@ -9,7 +9,7 @@ from default_run import covering
 from oracle import boxed
 from warp_lcp.problem.protocol import families
 
-DRAWS = 4  # problems for each method, dense and sparse, each with two sizes of bounds
+DRAWS = 2  # problems for each method, dense and sparse, each with two sizes of bounds
 SIZES = (1e15, 1e20, 1e30, 1e60, 1e100, 1e160, 1e200, 1e300, 1e308)
 # Dense: these methods always solve it.
 ANSWERS = (

@@ -112,7 +112,7 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
     steps.
     """
     lengths = []
-    for seed in (4205, 4207, 4209, 4213, 4218):
+    for seed in (4205, 4207, 4209):
         A, b, lower, upper, x0 = unlike_rows(seed)
         plain = PlainMap("fischer" if share == 1 else "penalized", A, b, lower, upper, share=share)
         assert plain.rows(x0)[3].sum() >= 3

@@ -317,13 +317,13 @@ def test_semidefinite_matrices(zeros):
 def test_minimum_map_newton_leaves_the_cycle_of_period_three():
     """Minimum-map Newton on the cycle of period three.
 
-    From 200 random starts, half of them with random sets at the bound; plain Newton-min cycles from
+    From 80 random starts, half of them with random sets at the bound; plain Newton-min cycles from
     most of them.
     """
     problem, rng = posed_dense(PERIOD_THREE, -np.ones(3)), np.random.default_rng(3)
     solver = wl.MinimumMapNewton()
     work = solver.init(problem)
-    for k in range(200):
+    for k in range(80):
         x0 = (
             np.where(rng.random(3) < 0.5, 0.0, rng.uniform(0.1, 5.0, 3))
             if k % 2
