@@ -97,24 +97,18 @@ SMALL = 1e-2
 # differ; the others launch the same kernels: they are slow ones, half a minute each.
 CHOSEN = (
     "carried-box-2d",
-    "ceiling-drop",
-    "column-collapse",
     "crown-splash",
     "floating-bodies",
     "gear-pyramid",
     "honey-coil",
     "hourglass",
     "incline",
-    "inclined-layer",
-    "mesh-obstacle",
     "reach",
-    "retracting-wall",
     "sliding-drop",
     "snake",
     "splash-unilateral",
     "stirred-tank",
     "tap-and-drain",
-    "waterfall",
 )
 EMULATED = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"

@@ -190,7 +190,7 @@ def test_tolerances_are_tightened_until_the_residual_is_as_asked(question):
 
 def test_suite_without_foreign_peers(tmp_path, monkeypatch):
     monkeypatch.setenv("WARP_LCP_PETSC_PYTHON", "/no/such/python")
-    arguments = ["bench", "peers", "--out", str(tmp_path), "--repeat", "1", "--size", "12"]
+    arguments = ["bench", "peers", "--out", str(tmp_path), "--repeat", "1", "--size", "8"]
     result = CliRunner().invoke(cli.app, arguments)
     assert result.exit_code == 0, result.stderr
     records = {r["name"]: r for r in json.loads((tmp_path / "peers.json").read_text())}
@@ -198,7 +198,7 @@ def test_suite_without_foreign_peers(tmp_path, monkeypatch):
     assert peers["petsc"].startswith("missing: /no/such/python, which WARP_LCP_PETSC_PYTHON names")
     assert peers["siconos"].startswith("missing")
     assert peers["pyamg"][:1].isdigit()
-    pyamg, ours = records["12^3 linear PyAMG SA-CG"], records["12^3 linear ProjectedMultigrid"]
+    pyamg, ours = records["8^3 linear PyAMG SA-CG"], records["8^3 linear ProjectedMultigrid"]
     for r in (pyamg, ours):
         assert r["figures"]["residual"]["value"] <= 1.01e-6
     ratio = pyamg["figures"]["total"]["value"] / ours["figures"]["total"]["value"]

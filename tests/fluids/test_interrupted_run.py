@@ -25,7 +25,7 @@ OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_eve
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
-        ("dam-break-2d", OVERRIDES),
+        slow(("dam-break-2d", OVERRIDES)),
         slow(("dam-break", [*OVERRIDES, "time.duration=0.1"])),
         ("splash-in-circle", [*OVERRIDES, "particles.transfer=flip", "pressure.surface=voxel"]),
         slow(("retracting-wall", MOVING)),
