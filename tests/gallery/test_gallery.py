@@ -23,6 +23,8 @@ from warp_lcp.gallery import (
     skewed,
     splash,
 )
+from warp_lcp.gallery.planted import random_cells
+from warp_lcp.operators.grid_poisson import AIR
 
 PLANTS = [
     PlantedSolution(),
@@ -211,3 +213,17 @@ def test_a_splash_makes_its_problem_by_its_bounds():
     np.testing.assert_array_equal(found.x.numpy(), expected.x.numpy())
     with pytest.warns(DeprecationWarning, match=r"Splash\.problem is now Splash\.lcp"):
         assert scene.problem("walls", "cpu").b.shape == scene.lcp("walls", device="cpu").b.shape
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (3, 4, 5)])
+def test_a_ring_of_air_goes_around_random_cells(shape):
+    draw = {"air": 0.2, "solid": 0.3}
+    inside, ringed = (
+        random_cells(shape, np.random.default_rng(3), ring=ring, **draw) for ring in (False, True)
+    )
+    assert inside.shape == shape
+    assert ringed.shape == tuple(n + 2 for n in shape)
+    middle = np.zeros(ringed.shape, bool)
+    middle[(slice(1, -1),) * len(shape)] = True
+    assert (ringed[~middle] == AIR).all()
+    assert (ringed[middle] != AIR).any()

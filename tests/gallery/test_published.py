@@ -3,6 +3,7 @@
 import itertools
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -151,6 +152,19 @@ def test_european_puts_by_the_closed_form(correlation):
     )
     assert fine < 5e-4
     assert fine < coarse / 2.8  # order two
+
+
+def test_extrapolated_prices_have_no_error_of_second_order(monkeypatch):
+    """Prices with an error in h^2, h the sides of the grid: the extrapolation removes it."""
+
+    def put(self, ns, nv, steps, *, american, device):
+        error = 3.0 / ns**2 + 2.0 / nv**2 + 5.0 / steps**2
+        return SimpleNamespace(at=lambda spot, variance: spot + variance + error)
+
+    monkeypatch.setattr(Heston, "put", put)
+    spots = np.array([9.0, 10.0, 11.0])
+    found = Heston().extrapolated(spots, 0.0625, 16, 8, 4)
+    np.testing.assert_allclose(found, spots + 0.0625, rtol=1e-14)
 
 
 def test_steady_variance_is_black_and_scholes():

@@ -10,7 +10,7 @@ from warp_lcp.grid.active_rows import ActiveRows, spread
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import SEGMENT, DirtyRegion, StaggeredGrid, Window, pieces_of
+from warp_lcp.grid.staggered import COPY, SEGMENT, DirtyRegion, StaggeredGrid, Window, pieces_of
 
 GRID = StaggeredGrid((37, 20, 12), 0.1, 3, "cpu")
 PLANE = StaggeredGrid((61, 40, 1), 0.1, 2, "cpu")
@@ -154,3 +154,16 @@ def test_runs_end_with_their_row() -> None:
     runs = [[[0, 0], [8, 20]], [[0, 1], [0, 8]], [[1, 1], [0, 20]]]
     assert pieces_of(near, (0, 0, 0), (2, 2, 20)).tolist() == runs
     assert pieces_of(near, (1, 0, 3), (2, 2, 9)).tolist() == [[[1, 1], [3, 9]]]
+
+
+def test_a_copy_of_a_box_writes_its_cells_only() -> None:
+    low, high = (1, 3, 2), (4, 9, 20)
+    source = np.random.default_rng(11).random(GRID.shape, dtype=np.float32)
+    field = GRID.field()
+    Window(low, high, GRID.device).run(
+        COPY, source=wp.array(source, dtype=wp.float32, device="cpu"), field=field
+    )
+    expected = np.zeros(GRID.shape, np.float32)
+    box = tuple(map(slice, low, high))
+    expected[box] = source[box]
+    np.testing.assert_array_equal(field.numpy(), expected)

@@ -156,6 +156,28 @@ def test_particles_as_a_liquid_has_them_put_the_surface_within_a_tenth_of_a_cell
     assert errors.std() < 0.06
 
 
+def test_a_cell_with_little_room_has_the_distance_of_its_neighbors() -> None:
+    """Full liquid around a hole of 3 x 3 cells without particles, whose capacity is what is left.
+
+    The kernel of the cell in the middle lies in the hole: without its neighbors it would be air.
+    """
+    grid, hole = FLAT, (7, 8)
+    points = fill(grid, [0.0, 0.0, 0.0], [14.0, 16.0, 1.0], 4)
+    center = np.array([hole[0] + 0.5, hole[1] + 0.5])
+    points = points[(np.abs(points[:, :2] - center) > 1.5).any(axis=1)]
+    base, capacity = box_of(grid), grid.field()
+    whole_cell_capacity(grid, on_device(base), capacity)
+    share = [0.0, 1 / 6, 5 / 6, 1.0, 5 / 6, 1 / 6]  # of kernels within 1.5 cells of the middle
+    room = capacity.numpy().copy()
+    for row in range(-2, 3):
+        for column in range(-2, 3):
+            place = 1, hole[1] + 1 + row, hole[0] + 1 + column
+            room[place] -= share[row + 3] * share[column + 3]
+    phi = grid.interior(level_set(grid, points, 16, capacity=room).phi.numpy())
+    assert room.min() < 0.2
+    assert (phi < 0).all()
+
+
 @GRIDS
 def test_a_surface_that_meets_cut_walls_at_right_angles_is_not_biased(grid: StaggeredGrid) -> None:
     """Surface that meets cut walls at right angles, without bias.

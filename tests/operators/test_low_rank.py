@@ -41,6 +41,14 @@ def test_rows_that_two_blocks_share_are_added_up(device):
     np.testing.assert_allclose(out.numpy(), base + np.where(mask, U @ f, 0.0), atol=1e-14)
 
 
+@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
+def test_the_diagonal_is_of_the_type_of_the_fields(dtype, device):
+    U = np.random.default_rng(41).standard_normal((12, 6))
+    diagonal = wl.LowRankOperator(U, np.eye(6), dtype=dtype, device=device).diagonal()
+    assert diagonal.dtype is dtype
+    np.testing.assert_allclose(diagonal.numpy(), (U**2).sum(axis=1), rtol=1e-6, atol=1e-14)
+
+
 def test_an_operator_takes_what_its_columns_have_become(device):
     columns, U = columns_on(device, 31)
     W = np.diag([1.0, 2.0, 0.5, 0.0, 3.0, 1.0])

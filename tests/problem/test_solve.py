@@ -455,3 +455,10 @@ def test_a_blob_that_moves_through_a_reused_workspace(method, arrays, device):
             fresh.x.numpy(),
             atol=1e-5 * np.abs(fresh.x.numpy()).max(),
         )
+
+
+def test_a_result_is_shown_without_its_history_and_problem():
+    result = wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), np.array([-1.0, 1.0])))
+    assert len(result.history) > 1
+    assert "history" not in repr(result)
+    assert "problem" not in repr(result)

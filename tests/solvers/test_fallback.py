@@ -390,6 +390,13 @@ def test_newton_and_active_sets_end_in_a_status_of_their_own(kind, method):
         assert solved.method != method_name(method)
 
 
+def test_an_operator_without_rows_has_no_methods_on_rows_after_the_active_set():
+    A = wl.LinearOperator(lambda x: 2.0 * x, (4,), symmetric=True)
+    chain = wl.default_chain(wl.PrimalDualActiveSet(), wl.LCP(A, -np.ones(4)))
+    methods = [method_name(entry.method) for entry in chain.entries]
+    assert methods == ["primal-dual-active-set", "minimum-map-newton"]
+
+
 def maze(n=61):
     """Return a comb of channels one cell wide, where cycles of whole blocks are slow."""
     cells = np.full((n, n), wl.SOLID)

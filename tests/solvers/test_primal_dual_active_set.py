@@ -21,7 +21,8 @@ from warp_lcp.gallery import (
     skewed,
     splash,
 )
-from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
+from warp_lcp.solvers.primal_dual_active_set import LOWER, PrimalDualActiveSet, _basic_solution
+from warp_lcp.subproblems.dense_problem import DenseProblem
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 
@@ -172,3 +173,14 @@ def test_an_unknown_that_turns_to_its_other_bound_makes_another_set():
             assert "least index" not in {r.step for r in result.history}
             turned += turns
     assert turned > 5
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-20, 1e20])
+def test_violations_of_a_basic_solution_are_relative_to_b(size):
+    """With x = 0 at its bounds y = b: only y_0 = -size is a violation, y_1 is rounding of size."""
+    b = size * np.array([-1.0, -1e-13, 1.0])
+    data = DenseProblem(np.arange(3), np.eye(3), b, np.zeros(3), np.full(3, np.inf))
+    x, wrong, singular = _basic_solution(data, np.full(3, LOWER))
+    assert x.tolist() == [0.0, 0.0, 0.0]
+    assert wrong.tolist() == [0]
+    assert not singular
