@@ -151,6 +151,36 @@ def test_gaps_narrower_than_a_cell_are_reported() -> None:
     assert len(notes(0.4 * CELL)) == 1 and "lets nothing through" in notes(0.4 * CELL)[0]
 
 
+def flux_through_a_slot(thickness: float, width: float, offset: float) -> float:
+    """Return how many particles fall through a slot, per second and cell of its width.
+
+    Args:
+        thickness: of the plate with the slot [cells].
+        width: of the slot [cells].
+        offset: of the slot's middle from a face of cells [cells].
+    """
+    n, top = 32, 0.45
+    left, right = 0.5 + (offset - 0.5 * width) / n, 0.5 + (offset + 0.5 * width) / n
+    low = top - thickness / n
+    plates = [box([-0.2, low], [left, top]), box([right, low], [1.2, top])]
+    pool = box([0.0, top], [1.0, top + 10.0 / n])
+    simulation = create(scene(size=[1.0, 1.0], resolution=n, liquid=[pool], solid=plates))
+    passed = []
+    for time in (0.1, 0.3):
+        advance(simulation, time, dt_max=0.01)
+        passed.append(np.count_nonzero(simulation.particles.position.numpy()[:, 1] < low))
+    return float(passed[1] - passed[0]) / 0.2 / width
+
+
+@pytest.mark.parametrize(("width", "offset"), [(4.81, -0.07), (2.5, 0.49)])
+def test_a_slot_in_a_thin_plate_lets_as_much_through_as_in_a_thick_one(
+    width: float, offset: float
+) -> None:
+    """Of a slot of whole cells the flux would be 19 % too small, and 10 % too large."""
+    thick, thin = (flux_through_a_slot(t, width, offset) for t in (3.05, 0.3))
+    assert thin == pytest.approx(thick, rel=0.06)
+
+
 def test_built_in_scenes_have_no_thin_solids() -> None:
     """Built-in scenes without thin solids: unchanged bits."""
     for name in built_in_scenes():

@@ -243,8 +243,8 @@ def ends_within(C: Crossings, axis: int, d: int, side: int, k: int, j: int, i: i
 def way_to_wall(C: Crossings, d: int, side: int, k: int, j: int, i: int):
     """Return the distance [cells] from a cell's center to a thin solid before the next one.
 
-    The next cell is that along axis d, on the upper `side` (1) or the lower one (0). Without a solid
-    the distance is WIDEST.
+    The next cell is that along axis d, on the upper `side` (1) or the lower one (0). The distance is
+    WIDEST without a solid.
     """
     c, b, a = next_to(d, side, k, j, i)
     result = WIDEST
@@ -336,13 +336,13 @@ def edge_kernel(
 ):
     """Set the open fraction of faces that a thin solid blocks in part.
 
-    A solid ends within such a face, or it crosses the next one. Without this the width of an opening
-    would be a whole number of cells.
+    Without this the width of an opening would be a whole number of cells.
 
-    - A solid that crosses a face and ends before the next one leaves the free lines of the face open.
-      The next face has those that are free of its own.
-    - Other whole faces beside a crossed one reach as far as the solid (`open_width`), where a solid
-      goes on between the cells and their neighbors.
+    - A solid crosses a face and ends before the next one: on both faces the free lines between the
+      two cells are open.
+    - A solid goes on beside the two cells of a face that is open: the face reaches as far as the
+      solid (`open_width`), since the part of the next cell before the solid belongs to these cells.
+      The fraction is then up to 1.5 along each axis.
     """
     code = wp.uint8(0)
     inside = i > 0 and j > 0 and i + 1 < open.shape[2] and j + 1 < open.shape[1]
@@ -377,7 +377,7 @@ def edge_kernel(
                 if d != axis:
                     width = open_width(B, C, axis, d, 0, k, j, i)
                     area *= width + open_width(B, C, axis, d, 1, k, j, i)
-            open[k, j, i] = area
+            open[k, j, i] = wp.max(area, LEAST_OPEN)
             code = sight_code(axis, wp.vec3())
         elif known and ends:
             share, way = open_lines(B, axis, samples, k, j, i)
