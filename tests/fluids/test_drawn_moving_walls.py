@@ -1,0 +1,47 @@
+"""Thin solids that move fast, drawn at random: nothing passes, and the liquid is not compressed."""
+
+import numpy as np
+import pytest
+
+from drawn_moving_walls import CROWDED, KINDS, drawn, excess, run
+
+SEEDS = range(6)
+LOST = 0.01  # mean share of the volume that crowded cells lack
+# Single draws in which a few hundred particles form a layer of two to three cells, at 10 m/s.
+MOST_LOST = 0.03
+
+
+@pytest.mark.parametrize(("seed", "kind"), [(2, "shaken"), (2, "piston"), (2, "blade")])
+def test_no_particle_passes_and_the_volume_stays(seed: int, kind: str) -> None:
+    draw = drawn(seed, kind, 2)
+    outcome = run(draw)
+    assert outcome.passed == 0, draw.label
+    assert outcome.crowded < LOST, draw.label
+
+
+def test_crowded_cells_are_counted_with_what_they_lack() -> None:
+    """Four particles a cell on a lattice fill a room; pressed into half of it they lack half."""
+    low, high, dx = np.array([0.3, 0.1]), np.array([0.7, 0.5]), 0.1
+    places = (np.arange(8) + 0.5) * 0.05
+    lattice = low + np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    assert excess(lattice, (low, high), dx, dx**2 / 4.0) == pytest.approx(0.0, abs=1e-12)
+    pressed = low + (lattice - low) * np.array([0.5, 1.0])
+    half = (low, np.array([0.5, 0.5]))
+    lacks = 0.16 - CROWDED * 0.08
+    assert excess(pressed, half, dx, dx**2 / 4.0) == pytest.approx(lacks, rel=1e-12)
+
+
+def test_draws_are_the_same_again() -> None:
+    one, other = (drawn(3, "shaken", 2) for _ in range(2))
+    assert one.tables == other.tables
+    assert all(drawn(1, kind, 3).tables["solid"] for kind in KINDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_volumes_of_drawn_rooms(kind: str, dimension: int) -> None:
+    outcomes = [run(drawn(seed, kind, dimension)) for seed in SEEDS]
+    assert all(outcome.passed == 0 for outcome in outcomes)
+    assert np.mean([outcome.crowded for outcome in outcomes]) < LOST
+    assert max(outcome.crowded for outcome in outcomes) < MOST_LOST
