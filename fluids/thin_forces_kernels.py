@@ -15,7 +15,6 @@ PASSES = 4  # passes over the corners of a cube, to find which are connected
 # Share of a square by which the area in front of an inner corner exceeds that of a straight wall.
 BENT = 0.02
 
-
 _OPEN, _MIDWAY, _BENT = wp.constant(OPEN), wp.constant(MIDWAY), wp.constant(BENT)
 Distances = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 Numbers = wp.types.matrix(shape=(8, 3), dtype=wp.int32)
@@ -243,12 +242,13 @@ def is_bent(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis
 def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, crossed: int):
     """Return the vector area of the wall on an edge of corner 0, as a share, and its centroid.
 
-    The centroid is a vector from the crossing [cells], used where walls differ. A plane wall of
-    one solid is divided among all edges that it crosses: the pressure is linear, so its mean over
-    the wall is that at the wall's centroid, and the mean of the crossings is the centroid of a
-    segment or triangle. Where several walls meet, each component belongs to the
-    walls on edges along its own axis; without such walls it is divided among all. A wall that
-    ends at another one before the next edge has its centroid halfway to that.
+    The centroid is a vector from the crossing [cells], 0 for plane walls.
+
+    A plane wall of one solid is divided among all edges that it crosses: the pressure is linear, so
+    its mean over the wall is that at the wall's centroid, and the mean of the crossings is the
+    centroid of a segment or triangle. Where several walls meet, each component belongs to the walls
+    on edges along its own axis; without such walls it is divided among all. A wall that ends at
+    another one before the next edge has its centroid halfway to that.
     """
     counts = wp.vec3i()
     first = cube.number[0, crossed]

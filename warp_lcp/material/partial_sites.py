@@ -1,11 +1,11 @@
 """Seeding of regions beside thin solids: the amount of material is right to one particle.
 
-A lattice point lies in a region or not, and so do all points of a row beside a wall: a box ten
-cells wide gets up to 6 % too many or too few particles. Here a site of the lattice (a cube around a
-lattice point) that the region or a thin solid fills in part gets a particle with the probability of
-its filled share f. The draws are numbers t of a sequence that is even along rows; the site gets a
-particle where t - f is below a limit, and the limit makes the number of particles that of the sum
-of f.
+A lattice point lies in a region or not, and so do all points of a row beside a wall: a box seven
+cells wide gets up to 6 % too many or too few particles. Here a site of the lattice is a cube around
+a lattice point, and f is the share of a site that lies in regions and outside of solids. A site
+with f < 1 gets a particle in that share, at a random place, where t - f is below a limit. The
+numbers t, from 0 to 1, are those of a sequence that is even along rows; the limit is such that the
+number of particles is the sum of f.
 """
 
 from __future__ import annotations
@@ -180,6 +180,9 @@ class PartialSites:
             site's sample points in regions, and t.
         """
         grid, dimension = self.grid, self.grid.dimension
+        if not len(sites):
+            none = np.zeros(0, dtype=np.int64)
+            return usual, none, none, np.zeros(0)
         each, axes = SAMPLES[dimension], slice(dimension)
         draws = (sites @ STEPS.T + self._start) % 1.0
         steps = np.array(list(np.ndindex(*(each,) * dimension)), dtype=np.float64)
@@ -192,16 +195,16 @@ class PartialSites:
         for number, geometry in enumerate(self.geometries):
             at = np.flatnonzero(free & (owner < 0))
             owner[at[inside([geometry], flat[at], device=grid.device)]] = number
-        owner = owner.reshape(len(sites), len(steps))
-        share = (owner >= 0).sum(axis=1)
-        some = np.flatnonzero(share)
+        owners = owner.reshape(len(sites), len(steps))
+        count = (owners >= 0).sum(axis=1)
+        some = np.flatnonzero(count)
         # The chosen one among the sample points in regions.
-        order = np.minimum((draws[some, 3] * share[some]).astype(int), share[some] - 1)
-        chosen = (np.cumsum(owner[some] >= 0, axis=1) > order[:, None]).argmax(axis=1)
+        order = np.minimum((draws[some, 3] * count[some]).astype(int), count[some] - 1)
+        chosen = (np.cumsum(owners[some] >= 0, axis=1) > order[:, None]).argmax(axis=1)
         result = flat.reshape(len(sites), len(steps), 3)[some, chosen]
-        full = (share[some] == len(steps)) & self.boundary.admits(usual[some])
+        full = (count[some] == len(steps)) & self.boundary.admits(usual[some])
         result[full] = usual[some[full]]
-        return result, owner[some, chosen], share[some], draws[some, 4]
+        return result, owners[some, chosen], count[some], draws[some, 4]
 
 
 def seed_regions(
