@@ -26,7 +26,7 @@ UNILATERAL_BYTES = 1
 # Its fields, those of coarse levels, and the velocity before the pressure solve.
 VISCOUS_BYTES = {2: 140, 3: 220}
 # Fields of the coupled solve, its Krylov vectors, and the levels of its pressure cycle.
-STOKES_BYTES = {2: 520, 3: 690}
+STOKES_BYTES = {2: 750, 3: 1000}
 # Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
 # at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5

@@ -72,7 +72,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.subproblems.grid_system import GridSystem
 
 STOKES_COLUMNS = ("splitting_error", "stokes_iterations", "stokes_error")
-VECTORS = 20  # of a Krylov space before a restart
+VECTORS = 40  # of a Krylov space before a restart
 TENTH = 0.1  # decrease of the residual after which the free cells are determined again
 NOISE = 1e-6  # of the largest pressure: smaller ones have no sign
 # Splitting errors below this share of |u*|_M are smaller than errors of the pressure solves.
