@@ -29,9 +29,11 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 # ruff: isort: split
 
 import argparse
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -45,7 +47,8 @@ import warp_lcp as wl
 from benchmarks.gpu_launches import LaunchCounter
 from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.benchmarks.problems import splash
-from warp_lcp.kernels import StencilKernel
+from warp_lcp.grid import staggered
+from warp_lcp.kernels import StencilKernel, layout
 from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.scene.scene_file import load_scene
@@ -71,6 +74,9 @@ SCENES = {"liquid": "dam-break", "sand": "column-collapse"}
 CLUSTERS = ("H100 SXM", "H200")  # that have clusters of blocks
 SIZES = (128, 256, 512, 1024)
 STEP_SIZES = (64, 128, 256)
+COUNTED = 64  # cells along x of the largest steps that are counted
+# Numbers of cells from which threads take several planes of a row, or blocks of it.
+LARGE = {layout: ("MANY_CELLS", "SUMMED_CELLS", "MANY_CELLS_OF_BLOCKS"), staggered: ("MANY_CELLS",)}
 
 
 @dataclass
@@ -505,14 +511,43 @@ def counted(
         yield one
 
 
+def as_large(levels: int) -> AbstractContextManager[object]:
+    """Return a context in which threads share a grid as they share one 2^levels times as fine.
+
+    The numbers of cells from which threads take several planes or blocks are divided by 8^levels.
+    """
+    layout._flat.cache_clear()
+    stack = ExitStack()
+    for module, names in LARGE.items():
+        smaller = {name: getattr(module, name) >> 3 * levels for name in names}
+        stack.enter_context(mock.patch.multiple(module, **smaller))
+    return stack
+
+
+def step_of_size(n: int, name: str, counter: LaunchCounter) -> RecordedWork:
+    """Return the work of some steps of a scene with n cells along x.
+
+    More than `COUNTED` cells are scaled from so many: threads share the cells as they do on the
+    larger grid, and launches grow as from `COUNTED` / 2 to `COUNTED`. Loops of a thread that grow
+    with the grid, as sums of the rows of a window, are as long as counted.
+    """
+    levels = max(round(math.log2(n / COUNTED)), 0)
+    with as_large(levels):
+        work = step(min(n, COUNTED), name, counter)
+    return work.grown(step(COUNTED // 2, name), levels) if levels else work
+
+
 def print_steps(sizes: Iterable[int]) -> None:
     """Print what holds a step of the scenes, and a table of its kernels."""
     for kind, name in SCENES.items():
         for n in sizes:
             with tempfile.TemporaryDirectory() as folder:
                 counter = LaunchCounter(Path(folder))
-                work = step(n, name, counter)
+                work = step_of_size(n, name, counter)
             print(f"\n## A step of {name} ({kind}), {n} cells along x\n")
+            print(
+                f"{len(work.bytes) / HEARD:.0f} launches, {work.readbacks / HEARD:.0f} readbacks\n"
+            )
             for gpu_name, gpu in gpu_counts.GPUS.items():
                 terms = {k: 1e3 * ms / HEARD for k, ms in work.terms(gpu, counter.counts).items()}
                 said = ", ".join(f"{k} {us:.0f}" for k, us in terms.items() if us >= 0.5)

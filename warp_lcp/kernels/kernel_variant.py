@@ -309,10 +309,7 @@ class KernelVariant:
             for section, used in (("stencil", d.stencil), ("bounds", d.bounds))
             if used
         ]
-        before = [
-            shared("native.h"),
-            '#line 1 "types"',
-            *head,
+        tasks = [
             shared("piece.h", "piece"),
             shared("piece.h", "tasks"),
             '#line 1 "fields"',
@@ -321,21 +318,41 @@ class KernelVariant:
         ]
         # In a block of its own, local names may be those of the declaration.
         body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]
-        closed = ["}"] * bool(d.listed)
+        body += ["}"] * bool(d.listed)
+        body += ['#line 1 "sums"', *(sums if d.found else []), '#line 1 "end"', "}}}"]
+        body = [*tasks, *common, *body]
+        if d.box and not (d.listed or d.stencil or d.bounds):
+            body = ["#ifdef __CUDA_ARCH__", *self._tasks_of_box(sums), "#else", *body, "#endif"]
         macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
-        tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
-        return "\n".join(
-            [
-                "",
-                *before,
-                *common,
-                *body,
-                *closed,
-                '#line 1 "sums"',
-                *(sums if d.found else []),
-                *tail,
-            ]
-        )
+        before = [shared("native.h"), '#line 1 "types"', *head]
+        return "\n".join(["", *before, *body, *(f"#undef {n}" for n in macros), ""])
+
+    def _tasks_of_box(self, sums: list[str]) -> list[str]:
+        """Return C++ of a thread's task over a box on CUDA.
+
+        The row function is there twice: for one cell, and for any number of cells.
+        """
+        d = self.declared
+        box = f"given.{next(iter(d.box))}"
+        lines = [f"const long long s2 = {box}.shape[2], s1 = s2*{box}.shape[1];", shared("box.h")]
+        fields = []
+        for n in d.box:
+            pointer = f"given.{n}.data + offset_"
+            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
+            fields.append(f"auto* {n} = {pointer};")
+        whole = [n for n in d.arrays if n not in d.box and not (d.found and n == "out")]
+        fields += [f"auto* {n} = given.{n}.data;" for n in whole]
+        fields += [f"const auto {n} = given.{n};" for n in d.numbers if n not in PLACE]
+        fields += [f"double {n} = 0;" for n in d.found]
+        function = ['#line 1 "fields"', *fields, "{", text(d.header, d.declared), "}"]
+        function += ['#line 1 "sums"', *(sums if d.found else []), '#line 1 "end"', "}"]
+        planes = ["long long offset_ = corner_; int at_ = begin_ * L.rows + row_;"]
+        planes += ["for (int k_i = begin_; k_i < end_; ++k_i, at_ += L.rows, offset_ += s1) {"]
+        planes += ["const Piece P = {n, k_i + plane_, j_, from_, at_, place_, k_i > begin_};"]
+        planes += ["const int k = P.k + k0, last = first + n;"]
+        one = ["if (L.grain == 1 && !L.pieces.data) {", "constexpr int n = 1;"]
+        rest = ["} else {", "const int n = to_ > from_ ? to_ - from_ : 0;"]
+        return [*lines, *one, *planes, *function, *rest, *planes, *function, "}"]
 
     def _source_of_quads(self, head: list[str], macros: dict[str, float], type_of: Resolver) -> str:
         """Return the kernel's body for quads in C++.
@@ -533,6 +550,13 @@ class KernelVariant:
                     touch(0)
                 first = first_task(L)
                 run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
+        elif self.declared.box:
+
+            def alone(L: RowLayout, F: Fields):
+                i, j, c = wp.tid()
+                first = first_task(L)
+                q = task_of_box(L, i + first[0], j + first[1], c + first[2])
+                run(L, F, q[0], q[1], q[2], wp.max(L.end - L.begin, 1))
         else:
 
             def alone(L: RowLayout, F: Fields):
@@ -597,6 +621,23 @@ def first_task(L: RowLayout) -> wp.vec3i:
     """Compute slab, row and chunk of a range's first task.
 
     They are 0 on CUDA, where a thread has a task of its own.
+    """
+
+
+@wp.func_native("""
+#ifdef __CUDACC__
+const unsigned t = blockIdx.x*blockDim.x + threadIdx.x, line = t / (unsigned)L.chunks;
+slab = (int)(line / (unsigned)L.rows);
+return wp::vec3i(slab, (int)(line - slab*L.rows), (int)(t - line*L.chunks));
+#else
+return wp::vec3i(slab, row, chunk);
+#endif
+""")
+def task_of_box(L: RowLayout, slab: int, row: int, chunk: int) -> wp.vec3i:
+    """Return slab, row and chunk of a thread of a launch over a box.
+
+    On CUDA they are computed from the number of the thread, because Warp divides it in 64 bits. A
+    launch has a thread for each task, and less than 2^32 threads.
     """
 
 
