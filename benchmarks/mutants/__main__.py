@@ -180,7 +180,7 @@ def judge(mutant: Mutant) -> dict[str, object]:
         else tests_of(TREE, mutant.module, mutant.line)
     )
     spent, verdict, by = 0.0, "alive", ""
-    rounds = list(FILES)
+    rounds = sorted(set(FILES))
     while rounds and verdict == "alive":
         path.write_text(mutated(source, mutant.operator, mutant.occurrence))
         outcome, text, took = tests(
@@ -200,7 +200,7 @@ def judge(mutant: Mutant) -> dict[str, object]:
                 outcome
                 if outcome == "timeout"
                 else "killed"
-                if names or outcome == "crashed"
+                if names or outcome == "crashed" or "while loading conftest" in text
                 else "broken test"
             )
             by = names[0] if names else text[-300:]
@@ -267,7 +267,7 @@ def options() -> argparse.Namespace:
         type=int,
         nargs=2,
         default=FILES,
-        help="numbers of test files: first try, and again if a mutant survives",
+        help="numbers of test files: first try, and again if a mutant survives; equal: no second",
     )
     parser.add_argument(
         "--seconds",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, cell_below, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, cell_below, cell_kernel, spline
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels import Rows, StencilKernel
 
@@ -200,3 +200,23 @@ def test_a_pass_over_entries(grain: int | None, tmp_path: Path) -> None:
     np.testing.assert_array_equal(z.numpy(), 10 if grain is None else [4] * 8 + [2] * 2)
     with pytest.raises(ValueError, match="fields have the shapes"):
         passed.bind(Rows.entries(10, GRID.device), x=x, y=y, z=z[:9])
+
+
+@wp.kernel(enable_backward=False, module="tests.cell_kernel")
+def spline_kernel(d: wp.array(dtype=float), out: wp.array(dtype=float)):
+    """Evaluate the B-spline."""
+    out[wp.tid()] = spline(d[wp.tid()])
+
+
+def test_the_spline_is_the_convolution_of_three_boxes():
+    n = 200
+    box = np.full(n, 1.0 / n)
+    kernel = n * np.convolve(
+        np.convolve(box, box), box
+    )  # from -1.5 to 1.5, centers of 3 n - 2 parts
+    at = (np.arange(3 * n - 2) - 1.5 * (n - 1)) / n
+    at, expected = np.r_[-2.5, at, 1.6], np.r_[0.0, kernel, 0.0]
+    distances = wp.array(at, dtype=float, device="cpu")
+    out = wp.zeros(at.size, dtype=float, device="cpu")
+    wp.launch(spline_kernel, at.size, [distances, out], device="cpu")
+    np.testing.assert_allclose(out.numpy(), expected, atol=1e-4)

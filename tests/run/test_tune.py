@@ -178,6 +178,11 @@ def test_if_no_setting_is_accurate_enough_the_most_accurate_is_chosen(
     found = tuned(monkeypatch, ModeledTrials(0.5))
     assert not found.met
     nearest = min(c.distance for c in found.tried)
+    header, *rows = found.rows()
+    assert [row[header.index("distance")] for row in rows] == [
+        f"{c.distance:.4f}" for c in found.tried
+    ]
+    assert len(header) == len(rows[0])
     assert nearest <= found.chosen.distance <= 1.05 * nearest
     assert found.scene.time.cfl == price_table()["fluids"].steps[-1][0]
     assert found.scene.solver.tolerance == 0.1, (
