@@ -170,7 +170,13 @@ class Faces:
         return min(float(self.entry(self.center(cell), self.center(self.next(cell, d, side)))), 1.0)
 
     def lines(self, cell, axis, ways):
-        """Return which lines between the centers beside a face are free, shifted by ways [cells]."""
+        """Return which lines between the centers beside a face are free.
+
+        Args:
+            cell: the cell above the face.
+            axis: of the face.
+            ways: shifts of the lines [cells], shape (n, 3).
+        """
         lower, upper = (self.center(c) + CELL * ways for c in (self.below(cell, axis), cell))
         return self.free(lower, upper)
 

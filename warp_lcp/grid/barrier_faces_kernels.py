@@ -196,7 +196,7 @@ def cross_kernel(
 
 
 @wp.struct
-class Crossings:
+class CrossedFaces:
     """Fields of the faces of each component, see `warp_lcp.grid.barriers`; z is null in 2-D."""
 
     number_x: I16
@@ -214,20 +214,20 @@ class Crossings:
 
 
 @wp.func
-def number_on(C: Crossings, axis: int, k: int, j: int, i: int):
+def number_on(C: CrossedFaces, axis: int, k: int, j: int, i: int):
     """Return the number of the solid that crosses a lower face, 0 without one."""
     return int(of_axis(axis, C.number_x, C.number_y, C.number_z, k, j, i))
 
 
 @wp.func
-def whole(C: Crossings, axis: int, k: int, j: int, i: int):
+def whole(C: CrossedFaces, axis: int, k: int, j: int, i: int):
     """Return whether no solid and no side of the domain closes a part of a lower face."""
     wall = of_axis(axis, C.wall_x, C.wall_y, C.wall_z, k, j, i)
     return wall == wp.int16(-1) and number_on(C, axis, k, j, i) == 0
 
 
 @wp.func
-def ends_within(C: Crossings, axis: int, d: int, side: int, k: int, j: int, i: int):
+def ends_within(C: CrossedFaces, axis: int, d: int, side: int, k: int, j: int, i: int):
     """Return whether a solid that crosses one of two neighboring faces ends between them.
 
     Of the four faces between the cells around their common edge it crosses only this one. The faces
@@ -240,11 +240,11 @@ def ends_within(C: Crossings, axis: int, d: int, side: int, k: int, j: int, i: i
 
 
 @wp.func
-def way_to_wall(C: Crossings, d: int, side: int, k: int, j: int, i: int):
+def way_to_wall(C: CrossedFaces, d: int, side: int, k: int, j: int, i: int):
     """Return the distance [cells] from a cell's center to a thin solid before the next one.
 
-    The next cell is that along axis d, on the upper `side` (1) or the lower one (0). The distance is
-    WIDEST without a solid.
+    The next cell is that along axis d, on the upper `side` (1) or the lower one (0). Without a
+    solid the distance is WIDEST.
     """
     c, b, a = next_to(d, side, k, j, i)
     result = WIDEST
@@ -267,7 +267,7 @@ def free_line(B: Barrier, axis: int, k: int, j: int, i: int, way: wp.vec3):
 
 
 @wp.func
-def open_width(B: Barrier, C: Crossings, axis: int, d: int, side: int, k: int, j: int, i: int):
+def open_width(B: Barrier, C: CrossedFaces, axis: int, d: int, side: int, k: int, j: int, i: int):
     """Return the width [cells] of an open lower face from its center on, along axis d.
 
     It is the distance by which the line between the cells' centers can be shifted to one side until
@@ -328,7 +328,7 @@ def edge_kernel(
     i,
     B: Barrier,
     axis: int,
-    C: Crossings,
+    C: CrossedFaces,
     fixed: wp.array(dtype=wp.uint8),
     samples: int,
     open: F32,

@@ -169,7 +169,7 @@ class Barriers:
 
     def _find_edges(self) -> None:
         """Find the open fractions of faces in which thin solids end."""
-        crossings = faces_kernels.Crossings()
+        crossings = faces_kernels.CrossedFaces()
         fields = {
             "number": self.number,
             "below": self.below,

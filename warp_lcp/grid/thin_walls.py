@@ -34,7 +34,7 @@ SKIN = 1e-4
 THIN_SHARE = 1e-3  # least share of a mesh's surface that is thin, for the mesh to be thin
 # Share of a mesh's surface above which the mesh is a shell: thin everywhere but at its rims.
 SHELL_SHARE = 0.8
-# Cells around a group's shapes that belong to their box: more than the distance that particles keep.
+# Cells around a group's shapes that belong to their box: more than particles keep off.
 BOX_ROOM = 0.05
 COST = 32  # work of a particle, in cells of a usual pass
 # Cells that material near moving thin solids may go in a step, in the frame of the solids.
