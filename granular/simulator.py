@@ -60,7 +60,7 @@ FRONT = 99.0  # percentile of the particles that defines runout and height
 FAR = 1.0
 # Share of the speed of moving solids, likewise: a solid that starts at 20 m/s drives sand much
 # faster than gravity does, and the residual of the solve is in proportion to that speed.
-DRIVEN = 0.01
+DRIVEN = 0.005
 JAMMED = (
     "solids or a source may enclose sand: move them less or slower; deep sand may need more "
     "solver.max_iterations"

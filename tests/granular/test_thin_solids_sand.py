@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from default_run import covering, slow
+from drawn_thin_walls import drawn, run
 from scene_tables import box
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
@@ -109,3 +110,16 @@ def test_a_hopper_with_thin_sides_discharges_as_one_with_thick_sides() -> None:
         return int(np.count_nonzero(simulation.particles.position.numpy()[:, 1] < foot))
 
     assert discharged(0.6) == pytest.approx(discharged(3.05), rel=0.03)
+
+
+def test_a_fast_piston_drives_sand() -> None:
+    """A plate that starts at 20 m/s in a pool of sand with room above it.
+
+    The residual of the first step is three times what gravity adds in it, and 0.2 % of the plate's
+    speed. No shorter step is better.
+    """
+    draw = drawn(771004, "piston", "granular", 2)
+    draw.until = 0.004
+    outcome = run(draw)
+    assert outcome.passed == 0
+    assert outcome.density < 1.2
