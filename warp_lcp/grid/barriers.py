@@ -34,8 +34,12 @@ from warp_lcp.operators.grid_poisson import FLUID
 # Cells. The level set and velocities are extrapolated two layers into thicker solids, which cut
 # cells; in thinner solids these layers would overlap those of the other side.
 BARRIER = 3.0
-# Rays per edge of the support of a cell's density kernel, for the share that its center sees.
-RAYS = {2: 16, 3: 6}
+# The share of a cell's density kernel that its center sees is found in 2-D from sample points, per
+# cell and axis (fewer if solids move, since they are tested in each step). They lie as particles on
+# the lattice do: so a pool on the lattice has density 1 beside a sheet. In 3-D so many points cost
+# too much; there it is found from rays, per edge of the kernel's support.
+PARTS, PARTS_MOVING = 6, 4
+RAYS = 6
 COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
@@ -117,8 +121,11 @@ class Barriers:
                 faces_kernels.apart_kernel,
                 [barrier, CENTERS if axis == grid.dimension else axis, apart],
             )
-        rays = RAYS[grid.dimension]
-        self._all.launch(faces_kernels.share_kernel, [barrier, rays, self._share])
+        if grid.dimension == 2:
+            parts = PARTS_MOVING if self.walls.moves else PARTS
+            self._all.launch(faces_kernels.share_kernel, [barrier, parts, self._share])
+        else:
+            self._all.launch(faces_kernels.ray_share_kernel, [barrier, RAYS, self._share])
 
     def _around(self) -> Window:
         """Return the cells near the solids, cells of the ring included."""
