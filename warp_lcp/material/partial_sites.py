@@ -30,7 +30,7 @@ STEPS = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47]).reshap
 # A site whose share is at least this counts as full, and one with at most the rest as empty, as long
 # as other sites make up for it: single gaps in a row of particles make waves in liquid at rest.
 NEARLY = 0.8
-FIRST, LAST = -1.0, 2.0  # values of t - f of such sites
+FIRST, LAST = -1.0, 1.0  # t - f of nearly full sites, and what is added to it in nearly empty ones
 Region = Callable[[np.ndarray], np.ndarray]
 
 
@@ -143,7 +143,7 @@ class PartialSites:
         samples = SAMPLES[grid.dimension] ** grid.dimension
         share = count / samples
         keys = np.where(share < NEARLY, draw - share, FIRST)
-        keys[share <= 1.0 - NEARLY] = LAST
+        keys[share <= 1.0 - NEARLY] += LAST
         everyone = grid.part.ranks.collect((keys, int(count.sum())))
         wanted = round(sum(filled for _, filled in everyone) / samples)
         order = np.sort(np.concatenate([other for other, _ in everyone]))
