@@ -36,8 +36,12 @@ from warp_lcp.operators.grid_poisson import FLUID
 # cells; in thinner solids these layers would overlap those of the other side.
 BARRIER = 3.0
 SAMPLES = {2: 96, 3: 12}  # lines per axis of a face, for the part that a solid's edge leaves open
-# Rays per edge of the support of a cell's density kernel, for the share that its center sees.
-RAYS = {2: 16, 3: 6}
+# The share of a cell's density kernel that its center sees is found in 2-D from sample points, per
+# cell and axis (fewer if solids move, since they are tested in each step). They lie as particles on
+# the lattice do: so a pool on the lattice has density 1 beside a sheet. In 3-D so many points cost
+# too much; there it is found from rays, per edge of the kernel's support.
+PARTS, PARTS_MOVING = 6, 4
+RAYS = 6
 COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]
 
@@ -122,8 +126,11 @@ class Barriers:
         if self.walls.has_meshes:
             self._all.launch(faces_kernels.inside_kernel, [barrier, self.near])
         self._all.launch(faces_kernels.apart_kernel, [barrier, CENTERS, self.apart[-1]])
-        rays = RAYS[grid.dimension]
-        self._all.launch(faces_kernels.share_kernel, [barrier, rays, self._share])
+        if grid.dimension == 2:
+            parts = PARTS_MOVING if self.walls.moves else PARTS
+            self._all.launch(faces_kernels.share_kernel, [barrier, parts, self._share])
+        else:
+            self._all.launch(faces_kernels.ray_share_kernel, [barrier, RAYS, self._share])
 
     def _around(self) -> Window:
         """Return the cells near the solids, cells of the ring included."""

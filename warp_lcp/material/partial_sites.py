@@ -27,6 +27,10 @@ SAMPLES = {2: 6, 3: 3}  # sample points per site and axis, for its filled share
 DRAWS = 5
 # Steps of these numbers along x, y and z: square roots of primes are independent over the rationals
 STEPS = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47]).reshape(DRAWS, 3) % 1.0
+# A site whose share is at least this counts as full, and one with at most the rest as empty, as long
+# as other sites make up for it: single gaps in a row of particles make waves in liquid at rest.
+NEARLY = 0.8
+FIRST, LAST = -1.0, 1.0  # t - f of nearly full sites, and what is added to it in nearly empty ones
 Region = Callable[[np.ndarray], np.ndarray]
 
 
@@ -137,8 +141,9 @@ class PartialSites:
             np.concatenate(column) for column in zip(*candidates, strict=True)
         )
         samples = SAMPLES[grid.dimension] ** grid.dimension
-        # Full sites are the first.
-        keys = np.where(count == samples, -1.0, draw - count / samples)
+        share = count / samples
+        keys = np.where(share < NEARLY, draw - share, FIRST)
+        keys[share <= 1.0 - NEARLY] += LAST
         everyone = grid.part.ranks.collect((keys, int(count.sum())))
         wanted = round(sum(filled for _, filled in everyone) / samples)
         order = np.sort(np.concatenate([other for other, _ in everyone]))
@@ -202,7 +207,7 @@ class PartialSites:
         order = np.minimum((draws[some, 3] * count[some]).astype(int), count[some] - 1)
         chosen = (np.cumsum(owners[some] >= 0, axis=1) > order[:, None]).argmax(axis=1)
         result = flat.reshape(len(sites), len(steps), 3)[some, chosen]
-        full = (count[some] == len(steps)) & self.boundary.admits(usual[some])
+        full = (count[some] >= NEARLY * len(steps)) & self.boundary.admits(usual[some])
         result[full] = usual[some[full]]
         return result, owners[some, chosen], count[some], draws[some, 4]
 
