@@ -1,8 +1,8 @@
 """Coupled solve of velocity and pressure: one unsteady Stokes problem a step.
 
 `fluids.viscosity` and `fluids.pressure` act one after the other. A steady liquid then slips along
-sticky walls by kick_dt |grad p| / rho, and thick liquid in narrow spaces flows too easily. Here both
-act at once [Larionov, Batty & Bridson 2017]: velocity u of the faces [m/s] and x = kick_dt p /
+sticky walls by kick_dt |grad p| / rho, and thick liquid in narrow spaces flows too easily. Here
+both act at once [Larionov, Batty & Bridson 2017]: velocity u of the faces [m/s] and x = kick_dt p /
 (rho dx) of the FLUID cells [m/s] satisfy
 
     M (u - u*) + tau K u - D'x = 0,        y = D u + C x + d,
@@ -30,11 +30,11 @@ in units of the mass of a cell, rho dx^d.
 Separating walls. At a wall with normal n along an axis the liquid has 0 <= -n.sigma.n
 complementary to the velocity at which it leaves. In the cell beside the wall e_nn is not known
 unless that velocity is. It is replaced by -(e_tt + e_ss), as for liquid that stays, and x of that
-cell then means -n.sigma.n: K does not depend on what separates, and the problem is a linear
+cell then means -n.sigma.n: K does not depend on what separates. The problem is a linear
 complementarity problem in x with the matrix D (M + tau K)^-1 D' + C, and one solution. In 2-D this
-drops e_nn and counts e_tt^2 twice. In corners e_nn is dropped for all walls. Links to walls that cut
-cells at a slant, and tangential links, are those of the contacts that the pressure of the split step
-finds.
+drops e_nn and counts e_tt^2 twice. In corners e_nn is dropped for all walls. Links to walls that
+cut cells at a slant, and tangential links, are those of the contacts that the pressure of the split
+step finds.
 
 Splitting error. With u1 = P(u*), (M + tau K) u2 = M u1 + walls, and u = P(u* + u2 - u1) the split
 step solves the coupled problem up to the force tau K (u - u2). K is monotone, so that
@@ -105,7 +105,10 @@ class StokesResult:
     given_by_walls: float = 0.0
 
     def row(self) -> dict[str, float]:
-        """Return log values: those of `STOKES_COLUMNS`, and energies of a solve that is used."""
+        """Return log values: those of `STOKES_COLUMNS`, and energies.
+
+        Energies only of a solve that is used.
+        """
         values = (self.splitting_error, self.iterations, self.error)
         energies = {"dissipated": self.dissipated, "wall_work": self.given_by_walls}
         return dict(zip(STOKES_COLUMNS, values, strict=True)) | (energies if self.used else {})
@@ -397,7 +400,7 @@ class StokesSolve:
         vector[self._size + self.grid.size :].assign(values.astype(np.float32))
 
     def _product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
-        """Write q = K p with the symmetric matrix K = [[A, -D'], [-D, -C]] and rows of bodies."""
+        """Write q = K p, K = [[A, -D'], [-D, -C]] with rows of bodies."""
         level, window = self._equations.level, self._equations.window
         self.viscosity.multigrid.product(p, q, launch=launch)
         u, force, x = self._components(p), self._components(q), self._pressure_of(p)
@@ -474,7 +477,7 @@ class StokesSolve:
         self.estimate()
 
     def estimate(self) -> float:
-        """Write z = P r; return the energy norm of z as P sees it, an estimate of the error."""
+        """Write z = P r; return an estimate of the error, the energy norm of z."""
         multigrid, system, window = (
             self.viscosity.multigrid,
             self._pressure,
@@ -539,7 +542,7 @@ class StokesSolve:
     def couple(
         self, velocity: Sequence[wp.array], share: float, moved: Callable[[], None]
     ) -> StokesResult:
-        """Solve for velocity and pressure, after `set_up`.
+        """Solve for velocity and pressure at once, after `set_up`.
 
         Args:
             velocity: u of the split step, each component [m/s] (updated).
@@ -771,7 +774,7 @@ class StokesSolve:
     # Forces on solids
 
     def impulses(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
-        """Return the viscous impulses on solids, with those of films at partly open faces.
+        """Return the viscous impulses on solids, with those of films.
 
         Shape (1 + solids, 6), [N s] and [N m s].
 
@@ -789,7 +792,9 @@ class StokesSolve:
         return impulses
 
     def _film_impulses(self, axis: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return solids and impulses of the films of a component's faces, shapes (n,), (n, 6).
+        """Return solids and impulses of the films of a component's faces.
+
+        Shapes (n,) and (n, 6).
 
         The film on a face takes drag (u - u_wall) = share (D'x + M (u* - u_wall)).
         """
