@@ -596,8 +596,8 @@ class PressureProjection:
     ) -> Projection:
         """Project a velocity on which the pressure x has acted already.
 
-        The pressure becomes x plus the correction. The correction x' is complementary to the outflow with the lower bound `lower - x`, so that
-        the sum keeps its own bound.
+        The pressure becomes x plus a correction x', complementary to the outflow with the lower
+        bound `lower - x`, so that the sum keeps its own bound.
 
         Args:
             velocity: the velocity [m/s] (updated).
