@@ -48,7 +48,7 @@ and walls is that of `fluids.viscosity`; the bound ignores the difference.)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +63,8 @@ from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.grid.window_reduction import WindowTally
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.fields import zeros
-from warp_lcp.kernels.launch_graph import Launch, copy, launch_now
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.vectors import Sums, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import NORM
@@ -193,6 +194,7 @@ class StokesSolve:
             self._bodies = StokesBodies(grid, boundary, bodies, viscosity.body_drag, density)
         self._rank = 0 if self._bodies is None else self._bodies.rank
         self._tallies: dict[tuple[str, int], WindowTally] = {}
+        self._estimation = LaunchGraph(grid.device, self._launch_estimation)
         self._krylov: GMRES | None = None  # built, with its vectors, at the first use
 
     def keep_start(self, velocity: Sequence[wp.array]) -> None:
@@ -220,10 +222,17 @@ class StokesSolve:
             kick_dt: time that forces have acted [s].
             moved: called when the velocities of bodies have changed.
         """
-        self.set_up(kick_dt)
-        error, size = self._splitting_error(velocity)
+        kind, contact = self.projection.kind, self.projection.contact
+        self._equations = self.viscosity.equations(kind, contact, kick_dt)
+        self._estimation.run(velocity, kind, contact)
+        (mass, power), (square, _), (start, _) = (
+            self._read(name, self.grid.dimension) for name in ("difference", "end", "start")
+        )
+        error, size = math.sqrt(max(power - mass, 0.0)), math.sqrt(square)
+        if error > self.splitting_tolerance * size:  # |u|_A is larger than |u|_M
+            size = math.hypot(size, math.sqrt(max(self._viscous_force(velocity), 0.0)))
         share = error / size if size > 0.0 else 0.0
-        small = error <= FLOOR * math.sqrt(self._energy(self.start, self.start)[0])
+        small = error <= FLOOR * math.sqrt(start)
         if self._refused or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
         return self.couple(velocity, share, moved)
@@ -232,10 +241,15 @@ class StokesSolve:
 
     def set_up(self, kick_dt: float) -> None:
         """Set up the equations of the step from those of the viscous solve."""
-        kernels, grid, b = self._kernels, self.grid, self.boundary
         kind, contact = self.projection.kind, self.projection.contact
+        self._equations = self.viscosity.equations(kind, contact, kick_dt)
+        self._launch_set_up(kind, contact)
+
+    def _launch_set_up(self, kind: wp.array, contact: wp.array) -> None:
+        """Launch the kernels that change the viscous equations to those of the coupled solve."""
+        kernels, grid, b = self._kernels, self.grid, self.boundary
         relative: list[wp.array | None] = [*self.viscosity.relative] or [None] * grid.dimension
-        equations = self._equations = self.viscosity.equations(kind, contact, kick_dt)
+        equations = self._equations
         level, window = equations.level, equations.window
         for axis in range(grid.dimension):
             window.run(
@@ -290,8 +304,11 @@ class StokesSolve:
             )
         self.viscosity.set_diagonals(kind, self._contact)
 
-    def _splitting_error(self, velocity: Sequence[wp.array]) -> tuple[float, float]:
-        """Return |u - u2|_V and, as far as it matters, |u|_A of the split step."""
+    def _launch_estimation(
+        self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array
+    ) -> None:
+        """Launch the set-up, and the sums of |u - u2|_V, |u|_M and |u*|_M."""
+        self._launch_set_up(kind, contact)
         level, window = self._equations.level, self._equations.window
         p, q = self.viscosity.multigrid.r, self.viscosity.change_field
         for axis, part in enumerate(self._components(p)):
@@ -302,14 +319,11 @@ class StokesSolve:
                 b=self._saved[axis],
                 volume=level.volume[axis],
             )
-        q.zero_()
-        self.viscosity.multigrid.product(p, q)
-        mass, power = self._energy(self._components(p), self._components(q))
-        error = math.sqrt(max(power - mass, 0.0))
-        size = math.sqrt(self._energy(velocity, velocity)[0])
-        if error > self.splitting_tolerance * size:  # |u|_A is larger than |u|_M
-            size = math.hypot(size, math.sqrt(max(self._viscous_force(velocity), 0.0)))
-        return error, size
+        clear(q)
+        self.viscosity.multigrid.product(p, q, launch=launch_recorded)
+        self._take_energy("difference", self._components(p), self._components(q))
+        self._take_energy("end", velocity, velocity)
+        self._take_energy("start", self.start, self.start)
 
     def _viscous_force(self, velocity: Sequence[wp.array]) -> float:
         """Write the force -M (u - u*) - tau K u; return the energy dissipated.
@@ -328,40 +342,33 @@ class StokesSolve:
         self._taken, self._driven = self.viscosity.force(fields)
         return self._taken
 
-    def _energy(self, u: Sequence[wp.array], force: Sequence[wp.array]) -> np.ndarray:
-        """Return u'M u and u'force."""
+    def _take_energy(self, name: str, u: Sequence[wp.array], force: Sequence[wp.array]) -> None:
+        """Launch the sums of u'M u and u'force, which `_read` returns."""
         level = self._equations.level
-        return self._sum_components(
-            "energy",
-            self._kernels.energy,
-            [
-                {
-                    "u": u[axis],
-                    "force": force[axis],
-                    "volume": level.volume[axis],
-                    "diagonal": level.diagonal[axis],
-                }
-                for axis in range(self.grid.dimension)
-            ],
-        )
+        for axis in range(self.grid.dimension):
+            self._take(
+                name,
+                self._kernels.energy,
+                axis,
+                u=u[axis],
+                force=force[axis],
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+            )
 
-    def _sum_components(
-        self, name: str, kernel: StencilKernel, arguments: Sequence[Mapping[str, object]]
-    ) -> np.ndarray:
-        """Launch a kernel that sums for each component; return the sums over all."""
-        totals = [self._sum(name, kernel, axis, **given) for axis, given in enumerate(arguments)]
-        return np.asarray(np.sum(totals, axis=0))
-
-    def _sum(
-        self, name: str, kernel: StencilKernel, part: int = 0, **arguments: object
-    ) -> np.ndarray:
-        """Launch a kernel that reduces; return its results."""
+    def _take(self, name: str, kernel: StencilKernel, part: int, **arguments: object) -> None:
+        """Launch a kernel that reduces; `_read` returns its results."""
         tally = self._tallies.get((name, part))
         if tally is None:
             tally = self._tallies[name, part] = WindowTally(kernel, self.grid)
         tally.take(self._equations.window, **arguments)
-        tally.changed()
-        return np.array(tally.read())
+
+    def _read(self, name: str, parts: int = 1) -> np.ndarray:
+        """Return the results of reductions, summed over parts."""
+        tallies = [self._tallies[name, part] for part in range(parts)]
+        for tally in tallies:
+            tally.changed()
+        return np.asarray(np.sum([tally.read() for tally in tallies], axis=0))
 
     # Vectors
 
@@ -487,23 +494,20 @@ class StokesSolve:
         wp.copy(multigrid.r, self.r, count=self._size)
         multigrid.apply()
         cycle, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
-        square = self._sum_components(
-            "velocity_correction",
-            self._kernels.velocity_correction,
-            [
-                {
-                    "z": z[axis],
-                    "cycle": cycle[axis],
-                    "r": r[axis],
-                    "volume": level.volume[axis],
-                    "diagonal": level.diagonal[axis],
-                    "cell": level.cell,
-                    "kind": self.projection.kind,
-                    "axis": axis,
-                }
-                for axis in range(self.grid.dimension)
-            ],
-        )[0]
+        for axis in range(self.grid.dimension):
+            self._take(
+                "velocity_correction",
+                self._kernels.velocity_correction,
+                axis,
+                z=z[axis],
+                cycle=cycle[axis],
+                r=r[axis],
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+                cell=level.cell,
+                kind=self.projection.kind,
+                axis=axis,
+            )
         x, work, right = (
             self._pressure_of(self.z),
             self._pressure_of(self._work),
@@ -519,6 +523,7 @@ class StokesSolve:
             free=self._free,
             sign=-1.0,
         )
+        square = 0.0
         if self._bodies is not None:
             r_bodies = self._body_part(self.r)
             z_bodies = self._bodies.corrected(r_bodies, self.z)
@@ -526,15 +531,18 @@ class StokesSolve:
             self._set_body_part(self.z, z_bodies)
             self._bodies.add_outflow(z_bodies, system.r, self._free_cells, sign=1.0)
         system.apply()
-        square += self._sum(
+        self._take(
             "correction",
             self._kernels.correction,
+            0,
             z=x,
             cycle=system.z.reshape(shape),
             r=right,
             coefficient=self._coefficient,
             free=self._free,
-        )[0]
+        )
+        square += self._read("velocity_correction", self.grid.dimension)[0]
+        square += self._read("correction")[0]
         return math.sqrt(max(float(square), 0.0))
 
     # Solve
@@ -557,7 +565,9 @@ class StokesSolve:
         settled, iterations, first = self.projection.lower is None, 0, None
         while True:
             error = self.estimate()
-            size = math.sqrt(self._energy(velocity, velocity)[0] + max(self._taken, 0.0))
+            self._take_energy("end", velocity, velocity)
+            mass = float(self._read("end", self.grid.dimension)[0])
+            size = math.sqrt(mass + max(self._taken, 0.0))
             relative = error / size if size > 0.0 else 0.0
             first = relative if first is None else first
             done = relative <= self.tolerance or iterations >= self.max_iterations
@@ -747,9 +757,10 @@ class StokesSolve:
         ux, uy, uz = three_components(velocity)
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
-        switched, worst, most = self._sum(
+        self._take(
             "divergence",
             self._kernels.divergence,
+            0,
             y=self._outflows,
             u=ux,
             v=uy,
@@ -769,6 +780,7 @@ class StokesSolve:
             least_x=least_x,
             least_y=least_y,
         )
+        switched, worst, most = self._read("divergence")
         return float(switched), float(worst), float(most)
 
     # Forces on solids
