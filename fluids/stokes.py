@@ -324,6 +324,7 @@ class StokesSolve:
         self._take_energy("difference", self._components(p), self._components(q))
         self._take_energy("end", velocity, velocity)
         self._take_energy("start", self.start, self.start)
+        clear(p)  # the viscous solve writes the rows of its own unknowns only
 
     def _viscous_force(self, velocity: Sequence[wp.array]) -> float:
         """Write the force -M (u - u*) - tau K u; return the energy dissipated.
@@ -597,6 +598,7 @@ class StokesSolve:
             if switched:
                 self._residual(velocity, KEEP)
                 self._pressure.restrict(self._free_cells)
+        self.viscosity.multigrid.r.zero_()  # see `_launch_estimation`
         converged = relative <= self.tolerance
         used = converged or relative <= USEFUL * first
         if not used:
