@@ -594,10 +594,10 @@ class PressureProjection:
         residual: float,
         moved: Callable[[], None],
     ) -> Projection:
-        """Project a velocity that the pressure x has acted on already; x becomes the sum of both.
+        """Project a velocity on which the pressure x has acted already.
 
-        The correction x' is complementary to the outflow with the lower bound `lower - x`, so that
-        the sum keeps its own bound.
+        The pressure becomes x plus a correction x', complementary to the outflow with the lower
+        bound `lower - x`, so that the sum keeps its own bound.
 
         Args:
             velocity: the velocity [m/s] (updated).

@@ -1,8 +1,8 @@
 """Coupled solve of velocity and pressure: one unsteady Stokes problem a step.
 
 `fluids.viscosity` and `fluids.pressure` act one after the other. A steady liquid then slips along
-sticky walls by kick_dt |grad p| / rho, and thick liquid in narrow spaces flows too easily. Here both
-act at once [Larionov, Batty & Bridson 2017]: velocity u of the faces [m/s] and x = kick_dt p /
+sticky walls by kick_dt |grad p| / rho, and thick liquid in narrow spaces flows too easily. Here
+both act at once [Larionov, Batty & Bridson 2017]: velocity u of the faces [m/s] and x = kick_dt p /
 (rho dx) of the FLUID cells [m/s] satisfy
 
     M (u - u*) + tau K u - D'x = 0,        y = D u + C x + d,
@@ -30,11 +30,11 @@ in units of the mass of a cell, rho dx^d.
 Separating walls. At a wall with normal n along an axis the liquid has 0 <= -n.sigma.n
 complementary to the velocity at which it leaves. In the cell beside the wall e_nn is not known
 unless that velocity is. It is replaced by -(e_tt + e_ss), as for liquid that stays, and x of that
-cell then means -n.sigma.n: K does not depend on what separates, and the problem is a linear
+cell then means -n.sigma.n: K does not depend on what separates. The problem is a linear
 complementarity problem in x with the matrix D (M + tau K)^-1 D' + C, and one solution. In 2-D this
-drops e_nn and counts e_tt^2 twice. In corners e_nn is dropped for all walls. Links to walls that cut
-cells at a slant, and tangential links, are those of the contacts that the pressure of the split step
-finds.
+drops e_nn and counts e_tt^2 twice. In corners e_nn is dropped for all walls. Links to walls that
+cut cells at a slant, and tangential links, are those of the contacts that the pressure of the split
+step finds.
 
 Splitting error. With u1 = P(u*), (M + tau K) u2 = M u1 + walls, and u = P(u* + u2 - u1) the split
 step solves the coupled problem up to the force tau K (u - u2). K is monotone, so that
@@ -48,7 +48,7 @@ and walls is that of `fluids.viscosity`; the bound ignores the difference.)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +63,8 @@ from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.fields import zeros
-from warp_lcp.kernels.launch_graph import Launch, copy, launch_now
+from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
+from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import NORM
@@ -105,7 +106,10 @@ class StokesResult:
     given_by_walls: float = 0.0
 
     def row(self) -> dict[str, float]:
-        """Return log values: those of `STOKES_COLUMNS`, and energies of a solve that is used."""
+        """Return log values: those of `STOKES_COLUMNS`, and energies.
+
+        Energies only of a solve that is used.
+        """
         values = (self.splitting_error, self.iterations, self.error)
         energies = {"dissipated": self.dissipated, "wall_work": self.given_by_walls}
         return dict(zip(STOKES_COLUMNS, values, strict=True)) | (energies if self.used else {})
@@ -190,6 +194,7 @@ class StokesSolve:
             self._bodies = StokesBodies(grid, boundary, bodies, viscosity.body_drag, density)
         self._rank = 0 if self._bodies is None else self._bodies.rank
         self._tallies: dict[tuple[str, int], WindowReduction] = {}
+        self._estimation = LaunchGraph(grid.device, self._launch_estimation)
         self._krylov: GMRES | None = None  # built, with its vectors, at the first use
 
     def keep_start(self, velocity: Sequence[wp.array]) -> None:
@@ -217,10 +222,17 @@ class StokesSolve:
             kick_dt: time that forces have acted [s].
             moved: called when the velocities of bodies have changed.
         """
-        self.set_up(kick_dt)
-        error, size = self._splitting_error(velocity)
+        kind, contact = self.projection.kind, self.projection.contact
+        self._equations = self.viscosity.equations(kind, contact, kick_dt)
+        self._estimation.run(velocity, kind, contact)
+        (mass, power), (square, _), (start, _) = (
+            self._read(name, self.grid.dimension) for name in ("difference", "end", "start")
+        )
+        error, size = math.sqrt(max(power - mass, 0.0)), math.sqrt(square)
+        if error > self.splitting_tolerance * size:  # |u|_A is larger than |u|_M
+            size = math.hypot(size, math.sqrt(max(self._viscous_force(velocity), 0.0)))
         share = error / size if size > 0.0 else 0.0
-        small = error <= FLOOR * math.sqrt(self._energy(self.start, self.start)[0])
+        small = error <= FLOOR * math.sqrt(start)
         if self._refused or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
         return self.couple(velocity, share, moved)
@@ -229,10 +241,15 @@ class StokesSolve:
 
     def set_up(self, kick_dt: float) -> None:
         """Set up the equations of the step from those of the viscous solve."""
-        kernels, grid, b = self._kernels, self.grid, self.boundary
         kind, contact = self.projection.kind, self.projection.contact
+        self._equations = self.viscosity.equations(kind, contact, kick_dt)
+        self._launch_set_up(kind, contact)
+
+    def _launch_set_up(self, kind: wp.array, contact: wp.array) -> None:
+        """Launch the kernels that change the viscous equations to those of the coupled solve."""
+        kernels, grid, b = self._kernels, self.grid, self.boundary
         relative: list[wp.array | None] = [*self.viscosity.relative] or [None] * grid.dimension
-        equations = self._equations = self.viscosity.equations(kind, contact, kick_dt)
+        equations = self._equations
         level, window = equations.level, equations.window
         for axis in range(grid.dimension):
             window.run(
@@ -287,8 +304,11 @@ class StokesSolve:
             )
         self.viscosity.set_diagonals(kind, self._contact)
 
-    def _splitting_error(self, velocity: Sequence[wp.array]) -> tuple[float, float]:
-        """Return |u - u2|_V and, as far as it matters, |u|_A of the split step."""
+    def _launch_estimation(
+        self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array
+    ) -> None:
+        """Launch the set-up, and the sums of |u - u2|_V, |u|_M and |u*|_M."""
+        self._launch_set_up(kind, contact)
         level, window = self._equations.level, self._equations.window
         p, q = self.viscosity.multigrid.r, self.viscosity.change_field
         for axis, part in enumerate(self._components(p)):
@@ -299,14 +319,12 @@ class StokesSolve:
                 b=self._saved[axis],
                 volume=level.volume[axis],
             )
-        q.zero_()
-        self.viscosity.multigrid.product(p, q)
-        mass, power = self._energy(self._components(p), self._components(q))
-        error = math.sqrt(max(power - mass, 0.0))
-        size = math.sqrt(self._energy(velocity, velocity)[0])
-        if error > self.splitting_tolerance * size:  # |u|_A is larger than |u|_M
-            size = math.hypot(size, math.sqrt(max(self._viscous_force(velocity), 0.0)))
-        return error, size
+        clear(q)
+        self.viscosity.multigrid.product(p, q, launch=launch_recorded)
+        self._take_energy("difference", self._components(p), self._components(q))
+        self._take_energy("end", velocity, velocity)
+        self._take_energy("start", self.start, self.start)
+        clear(p)  # the viscous solve writes the rows of its own unknowns only
 
     def _viscous_force(self, velocity: Sequence[wp.array]) -> float:
         """Write the force -M (u - u*) - tau K u; return the energy dissipated.
@@ -325,40 +343,33 @@ class StokesSolve:
         self._taken, self._driven = self.viscosity.force(fields)
         return self._taken
 
-    def _energy(self, u: Sequence[wp.array], force: Sequence[wp.array]) -> np.ndarray:
-        """Return u'M u and u'force."""
+    def _take_energy(self, name: str, u: Sequence[wp.array], force: Sequence[wp.array]) -> None:
+        """Launch the sums of u'M u and u'force, which `_read` returns."""
         level = self._equations.level
-        return self._sum_components(
-            "energy",
-            self._kernels.energy,
-            [
-                {
-                    "u": u[axis],
-                    "force": force[axis],
-                    "volume": level.volume[axis],
-                    "diagonal": level.diagonal[axis],
-                }
-                for axis in range(self.grid.dimension)
-            ],
-        )
+        for axis in range(self.grid.dimension):
+            self._take(
+                name,
+                self._kernels.energy,
+                axis,
+                u=u[axis],
+                force=force[axis],
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+            )
 
-    def _sum_components(
-        self, name: str, kernel: StencilKernel, arguments: Sequence[Mapping[str, object]]
-    ) -> np.ndarray:
-        """Launch a kernel that sums for each component; return the sums over all."""
-        totals = [self._sum(name, kernel, axis, **given) for axis, given in enumerate(arguments)]
-        return np.asarray(np.sum(totals, axis=0))
-
-    def _sum(
-        self, name: str, kernel: StencilKernel, part: int = 0, **arguments: object
-    ) -> np.ndarray:
-        """Launch a kernel that reduces; return its results."""
+    def _take(self, name: str, kernel: StencilKernel, part: int, **arguments: object) -> None:
+        """Launch a kernel that reduces; `_read` returns its results."""
         tally = self._tallies.get((name, part))
         if tally is None:
             tally = self._tallies[name, part] = WindowReduction(kernel, self.grid)
         tally.take(self._equations.window, **arguments)
-        tally.changed()
-        return np.array(tally.read())
+
+    def _read(self, name: str, parts: int = 1) -> np.ndarray:
+        """Return the results of reductions, summed over parts."""
+        tallies = [self._tallies[name, part] for part in range(parts)]
+        for tally in tallies:
+            tally.changed()
+        return np.asarray(np.sum([tally.read() for tally in tallies], axis=0))
 
     # Vectors
 
@@ -397,7 +408,7 @@ class StokesSolve:
         vector[self._size + self.grid.size :].assign(values.astype(np.float32))
 
     def _product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
-        """Write q = K p with the symmetric matrix K = [[A, -D'], [-D, -C]] and rows of bodies."""
+        """Write q = K p, K = [[A, -D'], [-D, -C]] with rows of bodies."""
         level, window = self._equations.level, self._equations.window
         self.viscosity.multigrid.product(p, q, launch=launch)
         u, force, x = self._components(p), self._components(q), self._pressure_of(p)
@@ -474,7 +485,7 @@ class StokesSolve:
         self.estimate()
 
     def estimate(self) -> float:
-        """Write z = P r; return the energy norm of z as P sees it, an estimate of the error."""
+        """Write z = P r; return an estimate of the error, the energy norm of z."""
         multigrid, system, window = (
             self.viscosity.multigrid,
             self._pressure,
@@ -484,23 +495,20 @@ class StokesSolve:
         wp.copy(multigrid.r, self.r, count=self._size)
         multigrid.apply()
         cycle, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
-        square = self._sum_components(
-            "velocity_correction",
-            self._kernels.velocity_correction,
-            [
-                {
-                    "z": z[axis],
-                    "cycle": cycle[axis],
-                    "r": r[axis],
-                    "volume": level.volume[axis],
-                    "diagonal": level.diagonal[axis],
-                    "cell": level.cell,
-                    "kind": self.projection.kind,
-                    "axis": axis,
-                }
-                for axis in range(self.grid.dimension)
-            ],
-        )[0]
+        for axis in range(self.grid.dimension):
+            self._take(
+                "velocity_correction",
+                self._kernels.velocity_correction,
+                axis,
+                z=z[axis],
+                cycle=cycle[axis],
+                r=r[axis],
+                volume=level.volume[axis],
+                diagonal=level.diagonal[axis],
+                cell=level.cell,
+                kind=self.projection.kind,
+                axis=axis,
+            )
         x, work, right = (
             self._pressure_of(self.z),
             self._pressure_of(self._work),
@@ -516,6 +524,7 @@ class StokesSolve:
             free=self._free,
             sign=-1.0,
         )
+        square = 0.0
         if self._bodies is not None:
             r_bodies = self._body_part(self.r)
             z_bodies = self._bodies.corrected(r_bodies, self.z)
@@ -523,15 +532,18 @@ class StokesSolve:
             self._set_body_part(self.z, z_bodies)
             self._bodies.add_outflow(z_bodies, system.r, self._free_cells, sign=1.0)
         system.apply()
-        square += self._sum(
+        self._take(
             "correction",
             self._kernels.correction,
+            0,
             z=x,
             cycle=system.z.reshape(shape),
             r=right,
             coefficient=self._coefficient,
             free=self._free,
-        )[0]
+        )
+        square += self._read("velocity_correction", self.grid.dimension)[0]
+        square += self._read("correction")[0]
         return math.sqrt(max(float(square), 0.0))
 
     # Solve
@@ -539,7 +551,7 @@ class StokesSolve:
     def couple(
         self, velocity: Sequence[wp.array], share: float, moved: Callable[[], None]
     ) -> StokesResult:
-        """Solve for velocity and pressure, after `set_up`.
+        """Solve for velocity and pressure at once, after `set_up`.
 
         Args:
             velocity: u of the split step, each component [m/s] (updated).
@@ -554,7 +566,9 @@ class StokesSolve:
         settled, iterations, first = self.projection.lower is None, 0, None
         while True:
             error = self.estimate()
-            size = math.sqrt(self._energy(velocity, velocity)[0] + max(self._taken, 0.0))
+            self._take_energy("end", velocity, velocity)
+            mass = float(self._read("end", self.grid.dimension)[0])
+            size = math.sqrt(mass + max(self._taken, 0.0))
             relative = error / size if size > 0.0 else 0.0
             first = relative if first is None else first
             done = relative <= self.tolerance or iterations >= self.max_iterations
@@ -584,6 +598,7 @@ class StokesSolve:
             if switched:
                 self._residual(velocity, KEEP)
                 self._pressure.restrict(self._free_cells)
+        self.viscosity.multigrid.r.zero_()  # see `_launch_estimation`
         converged = relative <= self.tolerance
         used = converged or relative <= USEFUL * first
         if not used:
@@ -744,9 +759,10 @@ class StokesSolve:
         ux, uy, uz = three_components(velocity)
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
-        switched, worst, most = self._sum(
+        self._take(
             "divergence",
             self._kernels.divergence,
+            0,
             y=self._outflows,
             u=ux,
             v=uy,
@@ -766,12 +782,13 @@ class StokesSolve:
             least_x=least_x,
             least_y=least_y,
         )
+        switched, worst, most = self._read("divergence")
         return float(switched), float(worst), float(most)
 
     # Forces on solids
 
     def impulses(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
-        """Return the viscous impulses on solids, with those of films at partly open faces.
+        """Return the viscous impulses on solids, with those of films.
 
         Shape (1 + solids, 6), [N s] and [N m s].
 
@@ -789,7 +806,9 @@ class StokesSolve:
         return impulses
 
     def _film_impulses(self, axis: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return solids and impulses of the films of a component's faces, shapes (n,), (n, 6).
+        """Return solids and impulses of the films of a component's faces.
+
+        Shapes (n,) and (n, 6).
 
         The film on a face takes drag (u - u_wall) = share (D'x + M (u* - u_wall)).
         """

@@ -1,4 +1,4 @@
-"""Rigid bodies in the coupled solve of velocity and pressure: their velocities are unknowns."""
+"""Rigid bodies as unknowns of the coupled solve of velocity and pressure."""
 
 from __future__ import annotations
 

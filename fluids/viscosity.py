@@ -94,14 +94,14 @@ class ViscousEquations:
         window: cells, and faces at the upper ends of the domain, whose equations are set up.
         distance: distance of each component's faces from walls [cells].
         slip: slip length of those walls [cells].
-        tau: nu dt / dx^2.
+        tau: nu dt / dx^2, which recorded launches read.
     """
 
     level: ViscosityLevel
     window: Window
     distance: Sequence[wp.array]
     slip: Sequence[wp.array]
-    tau: float
+    tau: Scalar
 
 
 @dataclass(frozen=True)
@@ -452,7 +452,7 @@ class Viscosity:
         if tau != self._tau.value:
             self._tau.value = tau
             self._graphs["_set_up"].run(kind, contact, variant=self._placed)
-        return ViscousEquations(self._fine, self._above, self._distance, self._slip, tau)
+        return ViscousEquations(self._fine, self._above, self._distance, self._slip, self._tau)
 
     def force(self, fields: ViscousFields) -> tuple[float, float]:
         """Write the residual for the current `change`, without the response of bodies.

@@ -17,6 +17,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.extras.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure import pressure_passes
+from warp_lcp.fluids.stokes_kernels import stokes_kernels
 from warp_lcp.fluids.surface_tension_kernels import push_pass
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
@@ -363,6 +364,8 @@ def modules_of_every_kernel(reals):
     for dimension, *walls in itertools.product((2, 3), *((False, True),) * 4):
         viscous_passes(dimension, *walls)
         viscous_passes(dimension, True, *walls[1:], thin=True)
+    for cut, moving, ghost, varies, bounded in itertools.product((False, True), repeat=5):
+        stokes_kernels(cut=cut, moving=moving, ghost=ghost, varies=varies, bounded=bounded)
     for axis in (0, 1, 2, CENTERS):
         carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):

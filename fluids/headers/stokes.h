@@ -300,8 +300,8 @@ for (int i = edge; i < last; ++i) {
 }
 
 // kernel fluids.stokes.divergence: Outflow y of FLUID cells [m/s]. Cells beside separating walls
-// are free unless x is at its bound and y > 0; `switching`: cells that changed; `worst`: largest |y|
-// of free cells; `most`: largest |x|
+// are free unless x is at its bound and y > 0; `switching`: cells that changed; `worst`: largest
+// |y| of free cells; `most`: largest |x|
 //   compute    float64
 //   box        float32 y, u, v, w?, ax?, ay?, az?, solid_x?, solid_y?, solid_z?; float64 x, lower?;
 //              int8 kind; uint8 free
