@@ -168,12 +168,15 @@ def inside(
 
 
 def signed_distance(geometry: Geometry, points: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Return the signed distance of points from a geometry [m], shape (m,); negative inside.
+    """Return the signed distance of points from a geometry [m], negative inside.
 
     Args:
         geometry: the region.
         points: [m], shape (m, 3); z = 0 in 2-D.
         device: device on which distances are evaluated.
+
+    Returns:
+        Distances, shape (m,).
     """
     result = np.empty(len(points), dtype=np.float32)
     for first in range(0, len(points), CHUNK):

@@ -25,12 +25,12 @@ from warp_lcp.material.boundary import Boundary
 SAMPLES = {2: 6, 3: 3}  # sample points per site and axis, for its filled share
 # Numbers per site: a shift of the sample points along each axis, the choice of one, and t.
 DRAWS = 5
-# Steps of these numbers along x, y and z: square roots of primes are independent over the rationals
+# Steps of these numbers along x, y and z: square roots of primes, which have no common period.
 STEPS = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47]).reshape(DRAWS, 3) % 1.0
-# A site whose share is at least this counts as full, and one with at most the rest as empty, as long
-# as other sites make up for it: single gaps in a row of particles make waves in liquid at rest.
+# A site with at least this share counts as full, and one with at most the rest as empty, as long as
+# other sites make up for it: single gaps in a row of particles make waves in liquid at rest.
 NEARLY = 0.8
-FIRST, LAST = -1.0, 1.0  # t - f of nearly full sites, and what is added to it in nearly empty ones
+FIRST, LAST = -1.0, 1.0  # t - f of nearly full sites; added to t - f in nearly empty ones
 Region = Callable[[np.ndarray], np.ndarray]
 
 
