@@ -99,7 +99,12 @@ def test_a_line_of_a_header_has_the_tests_of_the_module_that_names_its_kernel():
 
 def test_modules_of_a_simulator_have_the_tests_of_their_users():
     users = users_of(ROOT)["fluids/viscosity_level.py"]
-    assert users == {"fluids/viscosity_bodies.py", "fluids/viscosity_multigrid.py"}
+    assert users == {
+        "fluids/stokes_bodies.py",
+        "fluids/viscosity.py",
+        "fluids/viscosity_bodies.py",
+        "fluids/viscosity_multigrid.py",
+    }
 
 
 def test_a_mutant_of_a_simulator_is_in_the_package_that_tests_import(tmp_path, monkeypatch):

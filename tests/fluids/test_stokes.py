@@ -19,7 +19,7 @@ ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
 
 
 @dataclass
-class DenseProblem:
+class DenseStokesProblem:
     """Dense equations of a coupled solve, about a velocity and a pressure.
 
     A du - D'dx = r and y + D du + C dx >= 0, complementary to x + dx >= lower.
@@ -60,7 +60,7 @@ class DenseProblem:
         return float(np.sqrt(du @ self.A @ du))
 
 
-def dense(simulation: LiquidSimulation) -> DenseProblem:
+def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
     """Return the equations at the current velocity and pressure."""
     stokes, projection = simulation.stokes, simulation.projection
     kind = projection.kind.numpy()
@@ -86,7 +86,7 @@ def dense(simulation: LiquidSimulation) -> DenseProblem:
     x = projection.pressure.numpy().ravel()[cells]
     room = np.full(len(cells), -np.inf) if lower is None else lower.numpy().ravel()[cells] - x
     S = 0.5 * (K + K.T)
-    return DenseProblem(
+    return DenseStokesProblem(
         A=S[:n, :n],
         D=-S[n:, :n],
         C=-S[n:, n:],
@@ -97,7 +97,9 @@ def dense(simulation: LiquidSimulation) -> DenseProblem:
     )
 
 
-def coupled_step(simulation: LiquidSimulation, dt: float) -> tuple[DenseProblem, DenseProblem, Any]:
+def coupled_step(
+    simulation: LiquidSimulation, dt: float
+) -> tuple[DenseStokesProblem, DenseStokesProblem, Any]:
     """Take a step; return the equations before and after its coupled solve, and its result."""
     found: list[Any] = []
     solve = simulation.stokes.solve

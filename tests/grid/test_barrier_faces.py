@@ -99,7 +99,7 @@ def test_the_center_of_a_faces_open_part_is_that_of_its_polygon(dimension, seed)
     assert cut > 5
 
 
-class Plate:
+class PlateAcrossFaces:
     """A thin box: x = turn q + place, |q| <= half."""
 
     def __init__(self, half, turn, place):
@@ -240,7 +240,7 @@ def plate_in(dimension, rng, turned):
     place = rng.uniform(0.3, 0.7, 3)
     if dimension == 2:
         half[2], place[2] = 1.0, 0.0
-    return Plate(half, turn, place)
+    return PlateAcrossFaces(half, turn, place)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -284,7 +284,7 @@ def test_an_opening_has_its_exact_width(dimension, axis):
             low[axis], high[axis] = plane, plane + thick * CELL
             edge = middle + side * 0.5 * gap * CELL
             (high if side < 0 else low)[other] = edge
-            plates.append(Plate(0.5 * (high - low), np.eye(3), 0.5 * (low + high)))
+            plates.append(PlateAcrossFaces(0.5 * (high - low), np.eye(3), 0.5 * (low + high)))
         cut, _barriers = barriers_of(grid, plates)
         opened = grid.interior(cut.open[axis].numpy()).astype(np.float64)
         # Without the faces of the domain's lower side, which are closed.

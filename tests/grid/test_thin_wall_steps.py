@@ -17,7 +17,7 @@ MISS = kernels.MISS
 KEPT = MARGIN * CELL  # distance that particles keep from surfaces [m]
 
 
-class Plate:
+class PlateOnPath:
     """A box in any position: x = turn q + place, |q| <= half."""
 
     def __init__(self, half, turn, place):
@@ -146,7 +146,7 @@ def leaning_plate(rng):
     half = np.array([*rng.uniform(0.1, 0.4, 2), rng.uniform(0.02, 0.6) * CELL])
     place = rng.uniform(0.2, 0.8, 3)
     place[axis] = abs(side - rng.uniform(0.0, 1.0) * CELL)
-    return Plate(half, turn, place)
+    return PlateOnPath(half, turn, place)
 
 
 @pytest.mark.parametrize("seed", range(6))
