@@ -146,6 +146,7 @@ class StokesSolve:
 
     Attributes:
         start: u* of each component [m/s].
+        unsupported: whether bodies thinner than a cell leave the split step alone.
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class StokesSolve:
         self._bodies: StokesBodies | None = None
         coupling = projection.coupling
         # Liquid that thin bodies carry along has no rows here.
-        self._refused = coupling is not None and coupling.carried is not None
+        self.unsupported = coupling is not None and coupling.carried is not None
         if bodies is not None and viscosity.body_drag is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = StokesBodies(grid, boundary, bodies, viscosity.body_drag, density)
@@ -233,7 +234,7 @@ class StokesSolve:
             size = math.hypot(size, math.sqrt(max(self._viscous_force(velocity), 0.0)))
         share = error / size if size > 0.0 else 0.0
         small = error <= FLOOR * math.sqrt(start)
-        if self._refused or small or not share > self.splitting_tolerance:
+        if self.unsupported or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
         return self.couple(velocity, share, moved)
 
