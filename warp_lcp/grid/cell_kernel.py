@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.particle_loops import list_of
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.staggered import ORDERED_KERNELS, CellRange
 from warp_lcp.kernels.compiler import forward_kernel, project_module
 from warp_lcp.kernels.launch_graph import Launch, call, is_recording, launch, launch_ranges
 
@@ -136,7 +136,8 @@ def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], w
 
     def made(function: Callable) -> wp.Kernel:
         kernel = _kernel(function, module)
-        kernel.ordered = ordered
+        if ordered:
+            ORDERED_KERNELS.add(kernel)
         return kernel
 
     return made

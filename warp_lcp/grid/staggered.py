@@ -94,9 +94,8 @@ def cell_index(coordinate: float, count: int):
     return wp.min(int(inside(coordinate, count)), count)
 
 
-def is_ordered(kernel: wp.Kernel) -> bool:
-    """Return whether one CPU thread visits the cells in order, see `cell_kernel`."""
-    return bool(getattr(kernel, "ordered", False))
+ORDERED_KERNELS: set[wp.Kernel] = set()
+"""Kernels for which one CPU thread visits the cells in order, see `cell_kernel`."""
 
 
 def _corners(
@@ -295,7 +294,7 @@ class Window(KeyedArgument):
             [cells, *inputs],
             device=self.device,
             launch=launch,
-            ordered=is_ordered(kernel),
+            ordered=kernel in ORDERED_KERNELS,
         )
 
     @property
@@ -485,7 +484,7 @@ class ActiveWindow(Window):
             [cells, *inputs],
             device=self.device,
             launch=launch,
-            ordered=is_ordered(kernel),
+            ordered=kernel in ORDERED_KERNELS,
             first=memory.first,
             sized=memory.sized,
             extent=memory,

@@ -423,11 +423,7 @@ class DensityCorrection:
 
     def _begins_on_gpu(self) -> bool:
         """Return whether a GPU starts the solve before the host knows of overfull cells."""
-        return (
-            self._problem is not None
-            and not self.grid.part.shared
-            and bool(getattr(self._work, "begins_on_gpu", False))
-        )
+        return self._problem is not None and not self.grid.part.shared and self._work.begins_on_gpu
 
     def _solve_counting(self) -> wl.SolveResult:
         """Solve while the cells are counted, with one readback for both.

@@ -194,11 +194,16 @@ class WorkspaceDefaults:
     Attributes:
         scratch: stored fields, of 4-byte elements and of bytes, that the search of floating
             components may overwrite before `start`; None: there are none.
-        device_begins: whether `begin_on_device` may begin a solve.
+        begins_on_device: whether `begin_on_device` may begin a solve.
     """
 
     scratch: Scratch | None = None
     begins_on_device = False
+
+    @property
+    def begins_on_gpu(self) -> bool:
+        """Whether a GPU begins a solve before the host knows its problem."""
+        return False
 
     @property
     def has_device_steps(self) -> bool:
