@@ -8,7 +8,7 @@ from the fields included.
 
 import ctypes
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -210,7 +210,7 @@ def launch(
     """
     rows, listed = chunks(count, grid.device), None
     if is_recording():
-        members = [value for s in structs for value in vars(s).values()]
+        members = [getattr(s, f.name) for s in structs for f in fields(s)]
         found = (list_of(a) for a in (*kernel_args.values(), *members))
         listed = next((one for one in found if one is not None), None)
     if listed is not None:
