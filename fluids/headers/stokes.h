@@ -39,17 +39,17 @@ for (int i = first; i < edge; ++i) volume[i] = leak[i] = share[i] = 0.0f;
 for (int i = edge; i < last; ++i) {
     const int here = kind[i], below = kind[i - step];
     const float part = moved(i) ? fraction(i) : 0.0f;
-    const float inverse = here == AIR ? (below == FLUID ? inverse_theta(i - step, i) : 1.0f)
-                                      : (below == AIR && here == FLUID ? inverse_theta(i, i - step)
-                                                                       : 1.0f);
+    const float inverse = here == AIR
+                              ? (below == FLUID ? inverse_theta(i - step, i) : 1.0f)
+                              : (below == AIR && here == FLUID ? inverse_theta(i, i - step) : 1.0f);
     const float mass = part / inverse;
     const bool wall = d[i] <= (float)CLOSE;
     const bool held = ((here == FLUID) & (contact[i] != RELEASED)) |
                       ((below == FLUID) & (contact[i - step] != RELEASED));
     float drag = 0.0f;
     if (wall && part > 0.0f && held && h[i] < INFINITY) {
-        const float thick = VARIES && relative[VARIES ? i : 0] > 0.0f ? relative[VARIES ? i : 0]
-                                                                      : 1.0f;
+        const float thick =
+            VARIES && relative[VARIES ? i : 0] > 0.0f ? relative[VARIES ? i : 0] : 1.0f;
         drag = tau * thick / (0.5f * part + h[i]);
     }
     volume[i] = wall ? 0.0f : mass;
@@ -201,8 +201,7 @@ const long long steps[3] = {1, s2, s1}, step = steps[axis];
 for (int i = first; i < last; ++i) {
     float size = 1.0f;
     if (i >= edge && volume[i] > 0.0f)
-        size = diagonal[i] > 0.0f ? diagonal[i]
-                                  : volume[i] + cell[kind[i] == FLUID ? i : i - step];
+        size = diagonal[i] > 0.0f ? diagonal[i] : volume[i] + cell[kind[i] == FLUID ? i : i - step];
     weight[i] = i >= edge && volume[i] > 0.0f ? 1.0f / size : 0.0f;
 }
 
@@ -329,8 +328,7 @@ for (int i = first; i < last; ++i) {
     bool is_free = fluid && (free[i] != 0 || look == 2);
     if (BOUNDED && fluid && look && lower[BOUNDED ? i : 0] > -INFINITY) {
         const double above = x[i] - lower[BOUNDED ? i : 0];
-        const bool next = look == 2 ? above > 0.0
-                                    : (is_free ? above >= -least_x : sum < -least_y);
+        const bool next = look == 2 ? above > 0.0 : (is_free ? above >= -least_x : sum < -least_y);
         changes += look == 1 && next != is_free;
         is_free = next;
     }
