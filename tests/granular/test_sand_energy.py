@@ -6,7 +6,7 @@ They are compared with the forces on the faces.
 import numpy as np
 import pytest
 import warp as wp
-from test_sand_stress import Case, make, velocity
+from test_sand_stress import RandomSand, make, velocity
 
 from small_sands import advance, box, create, scene
 from warp_lcp.granular.packing import Packing
@@ -18,7 +18,7 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
 
-def without_trace(case: Case) -> np.ndarray:
+def without_trace(case: RandomSand) -> np.ndarray:
     """Return the stresses with a traceless deviator.
 
     In 2-D it is always traceless.

@@ -17,7 +17,7 @@ import warp as wp
 
 from benchmarks.machine_code import assemble, tools_missing
 from benchmarks.machine_counts import issued
-from benchmarks.machine_memory import Memory, constants_of
+from benchmarks.machine_memory import EmulatedMemory, constants_of
 from warp_lcp.kernels import Rows, StencilKernel
 from warp_lcp.kernels.layout import copy_of, native_of, put, threads
 
@@ -127,7 +127,7 @@ def test_machine_code_writes_to_the_cells_of_a_box(
     count = math.prod(dims)
     bounds = struct.pack("<3I4xQQ", *dims, count, 1)
     parameters = bounds + bytes(native_of(planes)) + bound.arguments
-    memory = Memory((int(a.ptr), a.numpy().copy()) for a in (x, y, out, visited))
+    memory = EmulatedMemory((int(a.ptr), a.numpy().copy()) for a in (x, y, out, visited))
     constants = constants_of(parameters, BLOCK, 1)
     cells = set()
     for begin in range(0, count, WARP):

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from warp_lcp.grid.particles import ParticleTotals
-from warp_lcp.material.particle_log import Moved, totals_row
+from warp_lcp.material.particle_log import CompletedStep, totals_row
 
 
 def test_entries_are_those_of_the_definitions():
     totals = ParticleTotals(
         count=10, mean_square_speed=4.0, center=np.array([0.5, 0.25, 0.0]), max_speed=3.0
     )
-    moved = Moved(2.0, np.array([0.0, -10.0, 0.0]), np.zeros(3), dt=0.01, kick_dt=0.01)
+    moved = CompletedStep(2.0, np.array([0.0, -10.0, 0.0]), np.zeros(3), dt=0.01, kick_dt=0.01)
     row = totals_row(totals, moved, particles=10, spacing=0.05)
     assert row == pytest.approx(
         {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bodies_at_hand import GRAVITY, SIDES, bodies_of, run
 
-from warp_lcp.grid.grid_part import OneProcess
+from warp_lcp.grid.grid_part import SerialCommunicator
 from warp_lcp.grid.motion import Pose, Rotation, Translation
 from warp_lcp.grid.signed_distance import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
@@ -499,7 +499,7 @@ def test_a_side_of_an_axis_without_an_end_stops_the_run():
     assert "not finite" in bodies.trouble([1.0, 1.0], ())
 
 
-class SecondRank(OneProcess):
+class SecondRank(SerialCommunicator):
     """Second of two ranks; it receives what the first one has shared."""
 
     size, rank, is_root = 2, 1, False
@@ -511,7 +511,7 @@ class SecondRank(OneProcess):
         return self.messages.pop(0)
 
 
-class FirstRank(OneProcess):
+class FirstRank(SerialCommunicator):
     """First of two ranks; it stores what it shares."""
 
     size = 2

@@ -192,11 +192,11 @@ def test_ranks_wait_for_each_other():
 
 
 def test_callers_of_the_library_need_not_name_a_signal(scene_file, tmp_path):
-    from test_run import Watcher, load_scene
+    from test_run import RemarkObserver, load_scene
 
     assert (
         run_into(
-            load_scene(scene_file), tmp_path / "out", observer=Watcher(), stop=lambda: True
+            load_scene(scene_file), tmp_path / "out", observer=RemarkObserver(), stop=lambda: True
         ).reason
         == "interrupted"
     )

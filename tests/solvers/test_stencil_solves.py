@@ -206,7 +206,7 @@ def test_coarse_matrices_are_products_of_the_transfers():
         coarse.x.assign(rng.standard_normal(coarse.x.size) * (coarse.d.numpy() != 0))
         fine.b.zero_()
         fine.correct_kernel(coarse, add=False).launch()
-        for stage in fine.restrict_kernel(coarse):
+        for stage in fine.restrict_kernels(coarse):
             stage.launch()
         product = wp.zeros_like(coarse.x)
         coarse.stencil.product(coarse.x, product)
