@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from dots_on_ranks import COUNT, SCENE, DotsSimulator
+from dots_on_ranks import COUNT, SCENE, DotsOnRanksSimulator
 from typer.testing import CliRunner
 
 from small_runs import read_record
@@ -34,7 +34,9 @@ def run(mpi, tmp_path, monkeypatch):
     scene.write_text(SCENE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        simulator, "entry_points", lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)]
+        simulator,
+        "entry_points",
+        lambda group: [SimpleNamespace(name="dots", load=DotsOnRanksSimulator)],
     )
 
     def go(ranks, *commands, exit_code=0):
