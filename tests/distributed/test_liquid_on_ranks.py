@@ -75,6 +75,7 @@ CLOSE = {
     "bodies in sand": 1e-5,
     "endless sand": 2e-5,
     "endless sand, stirred": 2e-5,
+    "endless shelf": 2e-5,
     # Liquid nearly at rest: its kinetic energy is the square of such differences.
     "cup": 1e-5,
     "bottle": 1e-5,

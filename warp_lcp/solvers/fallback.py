@@ -349,6 +349,11 @@ class FallbackWorkspace(WorkspaceDefaults):
         """Whether the first method's device has already taken the next step."""
         return self._optional.has_device_steps
 
+    @property
+    def begins_on_gpu(self) -> bool:
+        """Whether a GPU begins the first method's solve before the host knows its problem."""
+        return self._optional.begins_on_gpu
+
     def solution(self) -> DeviceArray | None:
         """Return x as the first method's workspace does."""
         return self._optional.solution()
