@@ -59,6 +59,8 @@ NOISE = {
         lambda row: 1.0,
     ),
     "max_divergence": lambda row: 32.0 * max(row["max_speed"], 0.1),
+    # A difference of positions in float32, in a domain of about 1 m.
+    "runout": lambda row: 1.0,
 }
 
 
