@@ -34,7 +34,8 @@ def test_ranks_of_one_machine_count_through_its_devices(mpi):
     from warp_lcp.distributed import ranks as devices
     from warp_lcp.distributed.ranks import Ranks
     wp.config.log_level = wp.LOG_ERROR
-    devices.device_by_number = lambda name, number, found: f"{name} {number}"  # without a GPU at hand
+    # Without a GPU at hand.
+    devices.device_by_number = lambda name, number, found: f"{name} {number}"
     ranks = Ranks.world()
     print(f"{ranks.rank}: {devices.device_of_rank(ranks, 'cuda')}\\n", end="")
     """
