@@ -64,7 +64,7 @@ def sight_code(axis: int, way: wp.vec3):
 
 @wp.func
 def sight_of(B: Barrier, axis: int, k: int, j: int, i: int):
-    """Return the point [m] of a lower face that stands for it in lines of sight.
+    """Return the point [m] of a lower face at which lines of sight end.
 
     It is the face's center, or that of the face's open part where a thin solid ends within it.
     """
