@@ -11,14 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from unicodedata import normalize
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    ModelWrapValidatorHandler,
-    PrivateAttr,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, model_validator
+from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.frames.meshio_format import FrameFormat
