@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from parsed_sources import parsed
+
 ROOT = Path(__file__).parents[1]
 PRODUCT = ("warp_lcp", "fluids", "granular")
 WIDTH = 100
@@ -57,7 +59,7 @@ def test_a_class_name_is_defined_once():
     defined = Counter(
         node.name
         for path in sources("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.ClassDef)
     )
     assert [name for name, count in defined.items() if count > 1] == []

@@ -5,8 +5,10 @@ They do nothing, or return an argument or a constant.
 
 import ast
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+from parsed_sources import parsed
 
 ROOT = Path(__file__).parent.parent
 # Class, or class and method: why a subclass may replace an empty method.
@@ -53,7 +55,7 @@ def is_empty(method: ast.FunctionDef) -> bool:
     return all(map(nothing, method.body))
 
 
-def overridden(sources: list[str]) -> Iterator[str]:
+def overridden(trees: Iterable[ast.Module]) -> Iterator[str]:
     """Yield Class.method of overridden empty methods.
 
     They are not abstract, of no protocol, and overridden by a class below.
@@ -61,8 +63,8 @@ def overridden(sources: list[str]) -> Iterator[str]:
     methods: dict[str, dict[str, ast.FunctionDef]] = defaultdict(dict)
     below: dict[str, set[str]] = defaultdict(set)
     protocols = set()
-    for source in sources:
-        for node in ast.walk(ast.parse(source)):
+    for tree in trees:
+        for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 bases = [ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases]
                 methods[node.name] |= {
@@ -94,7 +96,7 @@ def test_no_method_waits_for_a_subclass_without_a_reason():
         for folder in ("warp_lcp", "fluids", "granular")
         for path in sorted((ROOT / folder).rglob("*.py"))
     ]
-    found = set(overridden([path.read_text() for path in files if "benchmarks" not in path.parts]))
+    found = set(overridden(parsed(path) for path in files if "benchmarks" not in path.parts))
     assert "GridPart.fill" in found
     assert set(ALLOWED) <= found | {method.split(".")[0] for method in found}
     assert not {
@@ -124,4 +126,4 @@ class Last(Middle):
 class Mine(Other):
     def a(self): return 3 + 4
 """
-    assert set(overridden([source])) == {"Base.a", "Base.b", "Base.c"}
+    assert set(overridden([ast.parse(source)])) == {"Base.a", "Base.b", "Base.c"}

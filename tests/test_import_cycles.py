@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from parsed_sources import parsed
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = {
     "warp_lcp": "warp_lcp",
@@ -74,9 +76,7 @@ def edges_of_all() -> dict[str, set[str]]:
     names, found = modules(), {}
     for name, path in names.items():
         direct = {
-            other
-            for other in imported(ast.parse(path.read_text()), names)
-            if other in names and other != name
+            other for other in imported(parsed(path), names) if other in names and other != name
         }
         around = {
             other.rsplit(".", depth)[0]

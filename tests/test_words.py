@@ -4,13 +4,13 @@ import ast
 import inspect
 import re
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
 import typer
 
 import warp_lcp as wl
+from parsed_sources import parsed
 from warp_lcp import gallery
 from warp_lcp.cli.commands import app
 
@@ -257,11 +257,6 @@ NOT_IN_MESSAGES = {
 # A module of kernels; names with a deprecation.
 for old_name in (r"\bcrowding\b", r"\bangle_of\b", r"\bConvexSetProblem\b"):
     del NOT_IN_MESSAGES[old_name]
-
-
-@cache
-def parsed(file: Path) -> ast.Module:
-    return ast.parse(file.read_text())
 
 
 def documented() -> dict[str, str]:
