@@ -245,9 +245,9 @@ def least_eigenvalue(level, steps: int = 60) -> float:
 @pytest.mark.parametrize(
     ("seed", "steps"),
     [
-        (4, 24),
-        (28, 3),  # a step takes a second
-        *(slow((seed, 24)) for seed in (6, 28, 37, *range(100, 160))),
+        (4, 12),
+        (28, 1),  # a step takes a second
+        *(slow((seed, 24)) for seed in (4, 6, 28, 37, *range(100, 160))),
     ],
 )
 def test_any_liquid_among_any_solids_is_solved(seed: int, steps: int) -> None:

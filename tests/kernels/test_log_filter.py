@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from default_run import slow
 from warp_lcp.kernels.log_filter import KernelMessages, install_log_filter
 
 SCRIPT = """
@@ -62,7 +63,7 @@ def test_a_script_has_one_message_of_its_kernels_and_no_compiler_warning(tmp_pat
 @pytest.mark.parametrize(
     ("made", "stream"),
     [
-        ("wl.DenseOperator(np.eye(2), device='cpu')", "open"),
+        slow(("wl.DenseOperator(np.eye(2), device='cpu')", "open")),
         ("wl.DenseOperator(np.eye(2), device='cpu')", "closed"),
         (
             "wl.DirectEnumeration; from warp_lcp.grid.staggered import StaggeredGrid; "

@@ -72,10 +72,26 @@ def dense(A):
     )
 
 
-@pytest.mark.parametrize(
-    "capability", [None, *CAPABILITIES], ids=lambda c: "none" if c is None else c.__name__
-)
-@pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if families(cls)])
+def capability_cases():
+    """Yield each method with no capability and with each of them.
+
+    By default a method that asks for no capability runs with none and with one, in turn: it does
+    the same with all that it does not ask for.
+    """
+    capabilities = list(CAPABILITIES)
+    for number, (name, method) in enumerate(wl.METHODS.items()):
+        in_turn = capabilities[number % len(capabilities)]
+        for capability in (None, *capabilities) if families(method) else ():
+            by_default = getattr(method, "supports", ()) or capability in (None, in_turn)
+            yield pytest.param(
+                name,
+                capability,
+                marks=() if by_default else pytest.mark.slow,
+                id=f"{name}-{'none' if capability is None else capability.__name__}",
+            )
+
+
+@pytest.mark.parametrize(("name", "capability"), list(capability_cases()))
 def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
     cls = wl.METHODS[name]
     if name == "quadratic-program":
