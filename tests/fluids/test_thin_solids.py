@@ -271,8 +271,7 @@ def test_a_mesh_that_is_thin_in_parts_cuts_cells_elsewhere(tmp_path: Path) -> No
     assert all(partly)
 
 
-@pytest.mark.parametrize("angle", [0.0, 27.0])
-@pytest.mark.parametrize("thickness", [0.05, 0.3, 0.9])
+@pytest.mark.parametrize(("thickness", "angle"), covering([0.05, 0.3, 0.9], [0.0, 27.0]))
 def test_a_surface_mesh_ends_at_both_sides_of_a_sheet(thickness: float, angle: float) -> None:
     low, high = 0.52, 0.52 + thickness * CELL
     place = {"rotate": [0.0, 0.0, angle], "translate": [0.5, 0.3, 0.0]}

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation as Rotation3
 
-from default_run import few
+from default_run import covering, few
 from warp_lcp.grid import barrier_faces_kernels as kernels
 from warp_lcp.grid.barrier_geometry import Barrier
 from warp_lcp.grid.barriers import SAMPLES, Barriers
@@ -269,8 +269,7 @@ def test_open_fractions_beside_plates_are_those_of_a_loop(seed, dimension, turne
     assert partial > 5
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("dimension", "axis"), covering([2, 3], [0, 1]))
 def test_an_opening_has_its_exact_width(dimension, axis):
     """Two plates with a gap between them: the open faces in their plane add up to the gap."""
     rng = np.random.default_rng([7741, dimension, axis])

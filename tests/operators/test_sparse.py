@@ -12,6 +12,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from default_run import covering
 from matrices import poisson
 from oracle import boxed, lemke
 
@@ -181,10 +182,16 @@ def test_arguments_that_are_no_matrix_are_named():
 
 
 @pytest.mark.parametrize(
-    "solver",
-    [wl.MinimumMapNewton(), wl.MinimumMapNewton(precision="double"), wl.ProjectedSOR(omega=1.0)],
+    ("solver", "symmetric"),
+    covering(
+        [
+            wl.MinimumMapNewton(),
+            wl.MinimumMapNewton(precision="double"),
+            wl.ProjectedSOR(omega=1.0),
+        ],
+        [True, False],
+    ),
 )
-@pytest.mark.parametrize("symmetric", [True, False])
 def test_boxed_problems_against_enumeration(solver, symmetric, device):
     for seed in range(20):
         rng = np.random.default_rng(41 + seed)

@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
+from default_run import covering
 from method_steps import begun
 from oracle import assemble
 from warp_lcp.solvers.interior_point import InteriorPoint, InteriorPointWorkspace
@@ -182,10 +183,18 @@ def compare(method, work, problem, plain, place, steps, tolerance):
                 )
 
 
-@pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize(
-    "settings",
-    [{}, {"start": 0.02}, {"backoff": 0.8}, {"mehrotra": False}, {"mehrotra": False, "horizon": 3}],
+    ("settings", "kind"),
+    covering(
+        [
+            {},
+            {"start": 0.02},
+            {"backoff": 0.8},
+            {"mehrotra": False},
+            {"mehrotra": False, "horizon": 3},
+        ],
+        ["dense", "sparse"],
+    ),
     ids=repr,
 )
 def test_steps_are_those_of_the_algorithm(kind, settings, device):
