@@ -3,6 +3,7 @@
 Walls are no-slip, separating or slip.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -211,6 +212,26 @@ def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> Non
         assert result.converged and result.relative_residual <= max(1e-4, rounding)
         counts.append(result.iterations)
     assert counts[1] <= (counts[0] + 3 if shape == "tank" else 16) and min(counts) <= 13
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_interpolation_is_normalized_in_its_window_only(dimension: int) -> None:
+    """Values beside the window stay as they are."""
+    simulation = blob(dimension)
+    levels = simulation.viscosity.multigrid.levels
+    assert len(levels) > 1
+    for fine, coarse in itertools.pairwise(levels):
+        for field in fine.norm:
+            field.fill_(7.0)
+        window = fine.grid.domain
+        fine.normalize(coarse, window)
+        outside = np.ones(fine.grid.shape, dtype=bool)
+        outside[tuple(map(slice, window.low, window.high))] = False
+        assert outside.any()
+        for field in fine.norm:
+            values = field.numpy()
+            assert (values[outside] == 7.0).all()
+            assert (values[~outside] != 7.0).all()
 
 
 def least_eigenvalue(level, steps: int = 60) -> float:

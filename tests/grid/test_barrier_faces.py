@@ -7,13 +7,16 @@ from scipy.spatial.transform import Rotation as Rotation3
 
 from default_run import covering, few
 from warp_lcp.grid import barrier_faces_kernels as kernels
+from warp_lcp.grid.barrier_fields import binomial_kernel
 from warp_lcp.grid.barrier_geometry import Barrier
+from warp_lcp.grid.barrier_velocity_kernels import FaceComponents, FaceMarks, constrain_kernel
 from warp_lcp.grid.barriers import SAMPLES, Barriers
 from warp_lcp.grid.cell_kernel import F32, POINTS
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.signed_distance import Box, Placement
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.thin_walls import SKIN, ThinWalls
+from warp_lcp.grid.thin_walls_kernels import ThinGroup, ThinShape
 from warp_lcp.grid.voxelize import PlacedSolid
 
 COUNT = 16
@@ -292,3 +295,60 @@ def test_an_opening_has_its_exact_width(dimension, axis):
         np.testing.assert_allclose(
             inner.sum(axis=1).min(axis=0), gap, rtol=0.0, atol=1.0 / SAMPLES[dimension] + 2e-3
         )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_binomial_pass_is_a_convolution_up_to_a_wall(dimension):
+    """Without walls all neighbors count; beyond a wall the cell's own column stands in."""
+    rng, grid = np.random.default_rng(80412), grid_of(dimension)
+    near = wp.array(np.ones(grid.shape, dtype=np.uint8), device="cpu")
+    source = rng.random(grid.shape).astype(np.float32)
+    wall = 7
+    for walled in (False, True):
+        apart = np.zeros(grid.shape, dtype=np.uint8)
+        apart[:, :, wall] = walled  # between columns wall - 1 and wall
+        out = wp.zeros(grid.shape, dtype=wp.float32, device="cpu")
+        given = [near, wp.array(apart, device="cpu"), grid.planes]
+        grid.everywhere.launch(binomial_kernel, [*given, wp.array(source, device="cpu"), out])
+        expected = np.zeros(grid.shape)
+        middle = slice(4, 10)
+        planes = range(4, 10) if dimension == 3 else (1,)
+        for k in planes:
+            for j in range(4, 10):
+                for i in range(4, 10):
+                    for dk in (-1, 0, 1) if dimension == 3 else (0,):
+                        for dj in (-1, 0, 1):
+                            for di in (-1, 0, 1):
+                                beyond = walled and (i < wall) != (i + di < wall)
+                                weight = np.prod([0.25 if d else 0.5 for d in (di, dj)])
+                                weight *= (0.25 if dk else 0.5) if dimension == 3 else 1.0
+                                value = source[k + dk, j + dj, i if beyond else i + di]
+                                expected[k, j, i] += weight * value
+        inner = (middle if dimension == 3 else 1, middle, middle)
+        np.testing.assert_allclose(out.numpy()[inner], expected[inner], rtol=1e-6)
+
+
+def test_a_crossed_face_without_a_wall_in_reach_keeps_its_velocity():
+    """No solid is nearest then, and the first body's motion is not that of a wall."""
+    grid = grid_of(2)
+
+    def field(value, dtype):
+        return wp.full(grid.shape, value, dtype=dtype, device="cpu")
+
+    barrier, velocity, marks = Barrier(), FaceComponents(), FaceMarks()
+    barrier.groups = wp.empty(0, dtype=ThinGroup, device="cpu")
+    barrier.shapes = wp.empty(0, dtype=ThinShape, device="cpu")
+    barrier.planes, barrier.dx = 1, CELL
+    velocity.u = velocity.v = field(3.0, wp.float32)
+    marks.u = marks.v = field(0, wp.int8)
+    turn = wp.zeros(1, dtype=wp.mat33, device="cpu")
+    shift = wp.full(1, wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3, device="cpu")
+    kinds, contact = field(0, wp.int8), field(0, wp.uint8)
+    for axis in range(2):
+        result = field(0.0, wp.float32)
+        crossed = [field(1, wp.int16), field(0.0, wp.float32)]  # number of the wall, open part
+        given = [barrier, axis, *crossed, velocity, marks, turn, shift, kinds, contact, 1, 1]
+        grid.everywhere.launch(constrain_kernel, [*given, result])
+        written = result.numpy()[result.numpy() != 0.0]
+        assert written.size >= COUNT**2
+        assert (written == 3.0).all()

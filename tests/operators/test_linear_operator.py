@@ -267,3 +267,11 @@ def test_a_buffer_that_is_handed_out_twice():
     result = wl.solve(wl.LCP(A, -np.ones(20)))
     x = result.x.numpy()
     assert result and np.linalg.norm(np.minimum(x, M @ x - 1)) < 1e-4
+
+
+def test_a_symmetric_operator_is_its_own_transpose():
+    A, x = matrix(True), np.arange(1.0, N + 1.0)
+    linear = Linear((N, N), matvec=lambda v: A @ v, dtype=np.float64)
+    operator = wl.LinearOperator(linear, symmetric=True)
+    field = wp.array(x, dtype=wp.float64, device="cpu")
+    np.testing.assert_allclose(operator.apply_transpose(field).numpy(), A @ x, rtol=1e-12)

@@ -223,3 +223,14 @@ def test_entries_that_change_change_the_scale():
     result = wl.solve(problem, chain, workspace=work)
     np.testing.assert_array_equal(work.residual.diagonal.numpy(), 1.0)
     np.testing.assert_allclose(result.x.numpy(), lemke(M, b), atol=1e-6)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_the_start_is_projected_and_nothing_beside_it_is_written(keep):
+    problem = wl.LCP(wl.DenseOperator(np.eye(5), device="cpu"), np.ones(5), -1.0, 0.5)
+    stored = problem.layout.zeros(wp.float64).size
+    memory = wp.full(stored + 1, 7.0, dtype=wp.float64, device="cpu")
+    x = memory[:stored]
+    wl.ProjectedSOR().init(problem).residual.start(x, keep=keep)
+    assert (x.numpy()[problem.layout.places()] == (0.5 if keep else 0.0)).all()
+    assert memory.numpy()[stored] == 7.0

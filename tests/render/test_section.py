@@ -194,3 +194,28 @@ def test_without_matplotlib_the_command_says_what_to_install(dots, tmp_path, mon
     result = invoke("render", write_run(tmp_path / "run", [material(2)]), "--slice")
     assert result.exit_code == 2
     assert INSTALL_MATPLOTLIB in result.stderr
+
+
+@pytest.mark.parametrize("color", [Color.PRESSURE, Color.SPEED])
+def test_solids_are_drawn_above_particles(dots, tmp_path, monkeypatch, color):
+    """Matplotlib draws larger numbers of the order later."""
+    from matplotlib.axes import Axes
+
+    orders = {"scatter": [], "contourf": []}
+
+    def note(name):
+        draws = getattr(Axes, name)
+
+        def noted(*arguments, zorder, **looks):
+            orders[name].append(zorder)
+            return draws(*arguments, zorder=zorder, **looks)
+
+        monkeypatch.setattr(Axes, name, noted)
+
+    for name in orders:
+        note(name)
+    solid = SOLID.format("0.25, 0.5, 0.55")
+    folder = write_run(tmp_path / "run", [material(3)], solid, (1.0, 1.0, 1.0))
+    draw(folder, at=0.55, color=color)
+    assert orders["scatter"]
+    assert max(orders["scatter"]) < min(orders["contourf"])

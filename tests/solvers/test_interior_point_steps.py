@@ -225,14 +225,17 @@ def test_steps_are_those_of_the_algorithm(kind, settings, device):
 
 @pytest.mark.parametrize("mehrotra", [True, False])
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25)])
-def test_steps_on_a_grid_are_those_of_the_algorithm(bounds, mehrotra):
+@pytest.mark.parametrize(
+    "shape, solid", [((4, 5, 4), 0.1), ((2, 150), 0.01)]
+)  # long: rows of several pieces
+def test_steps_on_a_grid_are_those_of_the_algorithm(shape, solid, bounds, mehrotra):
     """Steps on a grid against the algorithm.
 
     The passes over rows condense the next system where a step ends.
     """
     rng = np.random.default_rng(4511)
-    cells = rng.choice(3, (4, 5, 4), p=[0.1, 0.8, 0.1])
-    cells[0, 0, 0] = wl.AIR
+    cells = rng.choice(3, shape, p=[0.1, 0.9 - solid, solid])
+    cells.flat[0] = wl.AIR
     fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
     A, n = dense[np.ix_(fluid, fluid)], int(fluid.sum())
     b, field = 2 * rng.standard_normal(n), np.zeros(cells.size)

@@ -14,7 +14,7 @@ from oracle import assemble
 from warp_lcp.subproblems.diagonal_system import DiagonalSystem
 from warp_lcp.subproblems.low_rank_system import CoupledGridSystem
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.sparse_system import IncompleteFactors, suits_multigrid
+from warp_lcp.subproblems.sparse_system import FactoredSystem, IncompleteFactors, suits_multigrid
 
 
 def grid(cells, dtype=wp.float64, device="cpu", **faces):
@@ -180,6 +180,20 @@ def test_incomplete_factors_leave_little_to_iterate():
     system.r.assign(r)
     assert system.solve(1e-6 * system.norm(), 50)[0] <= 4
     assert np.linalg.norm(matrix @ system.e.numpy() - r) <= 2e-6 * np.linalg.norm(r)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_factored_systems_measure_residuals_in_units_of_the_shifted_diagonal(weighted):
+    """||r||, or with weights the root of r' (D + shift)^-1 r."""
+    matrix = scipy.sparse.csr_array(np.array([[4.0, 1.0, 0.0], [2.0, 9.0, 1.0], [0.0, 1.0, 15.0]]))
+    shift, r = np.array([5.0, 7.0, 10.0]), np.array([3.0, -8.0, 10.0])
+    operator = wl.SparseOperator(matrix, device="cpu")
+    system = FactoredSystem.of(operator, weighted=weighted, complete=3)
+    free = wp.array(np.ones(3, dtype=np.uint8), device="cpu")
+    system.restrict(free, wp.array(shift, device="cpu"))
+    system.r.assign(r)
+    unit = np.array([9.0, 16.0, 25.0]) if weighted else np.ones(3)
+    assert system.norm() == pytest.approx(np.sqrt((r**2 / unit).sum()), rel=1e-12)
 
 
 def test_singular_blocks_still_get_factors():
