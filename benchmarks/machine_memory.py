@@ -14,6 +14,9 @@ import numpy as np
 
 PARAMETERS = 0x210  # offset of a kernel's parameters in constant memory
 NEAR = 65536  # bytes beside memory that are read as 0
+# Generic addresses of local and of shared memory, above those of the host; each window has 4 GiB.
+LOCAL_WINDOW, SHARED_WINDOW = 1 << 48, 1 << 49
+STACK = 1 << 20  # address in local memory where a thread's stack begins; it grows downward
 
 
 class EmulatedMemory:
@@ -98,9 +101,11 @@ class ProcessMemory(EmulatedMemory):
 def constants_of(parameters: bytes, block: int, blocks: int) -> bytes:
     """Return a kernel's constant memory.
 
-    It holds the size of a block, the number of blocks, and the parameters.
+    It holds the size of a block, the number of blocks, the window of local memory, the begin of the
+    stack, and the parameters.
     """
-    return struct.pack("<6I", block, 1, 1, blocks, 1, 1).ljust(PARAMETERS, b"\0") + parameters
+    sizes = struct.pack("<6I8xQI", block, 1, 1, blocks, 1, 1, LOCAL_WINDOW, STACK)
+    return sizes.ljust(PARAMETERS, b"\0") + parameters
 
 
 def packed(params: Sequence[ctypes.Structure | ctypes._SimpleCData[Any]]) -> bytes:

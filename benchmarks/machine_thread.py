@@ -1,7 +1,7 @@
 """Emulator of a GPU thread's machine code (SASS of sm_90) on the host.
 
 It works on copies of the device's memory. Atomics take effect in the order in which threads are
-executed. Shuffles and votes, which need other threads, do nothing.
+executed. Shuffles and votes, which need other threads, see the thread alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.machine_code import Instruction
-from benchmarks.machine_memory import EmulatedMemory
+from benchmarks.machine_memory import LOCAL_WINDOW, SHARED_WINDOW, EmulatedMemory
 
 LOW, ALL = 0xFFFFFFFF, (1 << 64) - 1
 MOST = 200_000  # most instructions of a lane
@@ -366,7 +366,12 @@ class Lane:
     # Moves.
 
     def _do_s2r(self, m: set[str], o: list[str], i: Instruction) -> None:
-        which = {"SR_TID.X": self.thread, "SR_CTAID.X": self.block, "SR_LANEID": self.thread % 32}
+        which = {
+            "SR_TID.X": self.thread,
+            "SR_CTAID.X": self.block,
+            "SR_LANEID": self.thread % 32,
+            "SR_SWINHI": SHARED_WINDOW >> 32,
+        }
         self._put(o[0], which.get(o[1], 0))
 
     def _do_cs2r(self, m: set[str], o: list[str], i: Instruction) -> None:
@@ -409,15 +414,16 @@ class Lane:
         self._put(o[0], value)
 
     def _do_p2r(self, m: set[str], o: list[str], i: Instruction) -> None:
-        mask = self._int(o[3])
-        value = sum(self.predicates[f"P{n}"] << n for n in range(7))
+        mask, kind = self._int(o[3]), o[1].removesuffix("R")
+        value = sum(self.predicates[f"{kind}{n}"] << n for n in range(7))
         self._put(o[0], self._int(o[2]) & ~mask | value & mask)
 
     def _do_r2p(self, m: set[str], o: list[str], i: Instruction) -> None:
         value, mask = self._int(o[1]) >> (8 * int(o[1][-1]) if ".B" in o[1] else 0), self._int(o[2])
+        kind = o[0].removesuffix("R")
         for n in range(7):
             if mask >> n & 1:
-                self.predicates[f"P{n}"] = bool(value >> n & 1)
+                self.predicates[f"{kind}{n}"] = bool(value >> n & 1)
 
     def _do_shfl(self, m: set[str], o: list[str], i: Instruction) -> None:
         self._set(o[0], True)
@@ -427,9 +433,11 @@ class Lane:
         self._put(o[0], self._int(o[1]))
 
     def _do_vote(self, m: set[str], o: list[str], i: Instruction) -> None:
-        for operand in o:
+        for operand in o[:-1]:
             if re.match(r"U?R\d", operand):
                 self._put(operand, 1)
+            elif PREDICATE.match(operand):
+                self._set(operand, "EQ" in m or self._predicate(o[-1]))
 
     # Integers.
 
@@ -716,18 +724,31 @@ class Lane:
             else 4
         )
 
+    def _own(self, name: str, address: int) -> dict[int, int] | None:
+        """Return the local or shared memory that an access reaches; None if it is global.
+
+        Generic accesses reach local and shared memory by addresses in their windows.
+        """
+        window = address >> 32 << 32
+        if name in ("LDL", "STL") or window == LOCAL_WINDOW:
+            return self.local
+        if name in ("LDS", "STS", "ATOMS") or window == SHARED_WINDOW:
+            return self.memory.shared
+        return None
+
     def _do_qspc(self, m: set[str], o: list[str], i: Instruction) -> None:
-        """Set a predicate where a generic address is one of shared memory: none is."""
-        self._set(o[0], False)
+        """Set a predicate where a generic address is one of shared (S) or local (L) memory."""
+        window = self._address(o[-1]) >> 32 << 32
+        self._set(o[0], window == (SHARED_WINDOW if "S" in m else LOCAL_WINDOW))
 
     def _do_load(self, m: set[str], o: list[str], i: Instruction) -> None:
         address, size = (
             self._address(next(operand for operand in o[1:] if "[" in operand)),
             self._size(m),
         )
-        if i.name in ("LDS", "LDL"):
-            own = self.memory.shared if i.name == "LDS" else self.local
-            data = bytes(own.get(address + k, 0) for k in range(size))
+        own = self._own(i.name, address)
+        if own is not None:
+            data = bytes(own.get((address + k) & LOW, 0) for k in range(size))
         else:
             data = self.memory.read(address, size)
             self.accesses.append((self.at, self.count[self.at], address, size, True))
@@ -748,19 +769,20 @@ class Lane:
 
     def _do_atomic(self, m: set[str], o: list[str], i: Instruction) -> None:
         """Change memory; the value before goes to a register, but for reductions."""
-        shared, wide = i.name == "ATOMS", "64" in m or "F64" in m
+        wide = "64" in m or "F64" in m
         place = next(n for n, operand in enumerate(o) if "[" in operand)
         address, size, values = self._address(o[place]), 8 if wide else 4, o[place + 1 :]
-        take = self._long if wide else self._int
-        if shared:
-            data = bytes(self.memory.shared.get(address + k, 0) for k in range(size))
+        take, own = self._long if wide else self._int, self._own(i.name, address)
+        if own is not None:
+            data = bytes(own.get((address + k) & LOW, 0) for k in range(size))
         else:
             data = self.memory.read(address, size)
             self.accesses.append((self.at, self.count[self.at], address, size, False))
         old = int.from_bytes(data, "little")
         if i.name.startswith("ATOM") and place:
             (self._put_long if wide else self._put)(o[place - 1], old)
-            self._await(o[place - 1], address, size // 4)
+            if own is None:
+                self._await(o[place - 1], address, size // 4)
         if m & {"CAS", "CAST"}:
             new = take(values[1]) if old == take(values[0]) else old
         elif m >= {"POPC", "INC"}:  # counts the threads that execute it
@@ -768,8 +790,8 @@ class Lane:
         else:
             new = _changed(old, take(values[0]), m, i)
         stored = (new & (ALL if wide else LOW)).to_bytes(size, "little")
-        if shared:
-            self.memory.shared.update((address + k, byte) for k, byte in enumerate(stored))
+        if own is not None:
+            own.update(((address + k) & LOW, byte) for k, byte in enumerate(stored))
         else:
             self.memory.write(address, stored)
 
@@ -784,10 +806,9 @@ class Lane:
             for k in range(max(size // 4, 1))
         ]
         data = b"".join(word.to_bytes(4, "little") for word in words)[:size]
-        if i.name in ("STS", "STL"):
-            (self.memory.shared if i.name == "STS" else self.local).update(
-                (address + k, byte) for k, byte in enumerate(data)
-            )
+        own = self._own(i.name, address)
+        if own is not None:
+            own.update(((address + k) & LOW, byte) for k, byte in enumerate(data))
         else:
             self.memory.write(address, data)
             self.accesses.append((self.at, self.count[self.at], address, size, False))
@@ -800,6 +821,9 @@ ALIASES = {
     "ATOMG": "atomic",
     "ATOMS": "atomic",
     "S2UR": "S2R",
+    "P2UR": "P2R",
+    "R2UP": "R2P",
+    "VOTEU": "VOTE",
     "LDG": "load",
     "LD": "load",
     "LDS": "load",

@@ -1,12 +1,14 @@
 """Registers, stacks and spills of all kernels, by ptxas (extra `ptxas`).
 
-TABLE=path keeps the table, PTX=folder what was compiled.
+TABLE=path keeps the table, PTX=folder what was compiled. A later run with the same folder compiles
+and assembles only what has changed.
 """
 
 import fnmatch
 import itertools
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections import defaultdict
@@ -18,7 +20,7 @@ import pytest
 import warp as wp
 
 from benchmarks.machine_code import tool, tools_missing
-from test_cuda_compiles import compile_for_cuda, modules_of_every_kernel
+from test_cuda_compiles import compile_for_cuda, modules_of_every_kernel, source_hash
 
 ARCHS = ("sm_80", "sm_90", "sm_100")
 REGISTERS = 65536  # registers of all threads of a multiprocessor
@@ -96,21 +98,40 @@ class KernelResources(NamedTuple):
     block: int
 
 
+def compiled(name: str, folder: Path) -> Path:
+    """Return the PTX of a module; compile it if its source has changed since it was compiled."""
+    mark, source = folder / name / "source.txt", source_hash(name)
+    if not mark.exists() or mark.read_text() != source:
+        shutil.rmtree(folder / name, ignore_errors=True)
+        compile_for_cuda(name, [80], folder / name)
+        mark.write_text(source)
+    (ptx,) = (folder / name).glob("*.ptx")
+    return ptx
+
+
+def report(ptx: Path, arch: str, text: str) -> str:
+    """Assemble PTX; return the report of `ptxas`, which is kept in a file beside the PTX."""
+    kept = ptx.with_suffix(f".{arch}.txt")
+    if not kept.exists():
+        ptxas = tool("ptxas")
+        assert ptxas
+        done = subprocess.run(
+            [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", "/dev/null"],
+            input=text,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        kept.write_text(done.stderr)
+    return kept.read_text()
+
+
 def costs(ptx: Path, arch: str) -> list[KernelResources]:
     """Assemble a module; return the resources of its kernels."""
-    ptxas = tool("ptxas")
-    assert ptxas
     text = ptx.read_text().rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
     blocks = dict(re.findall(r"\.entry (\w+)\([^{]*?\)\s*(?:\.maxntid (\d+))?", text))
-    done = subprocess.run(
-        [ptxas, "-v", f"-arch={arch}", "/dev/stdin", "-o", "/dev/null"],
-        input=text,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
     found = []
-    for part in re.split(r"Compiling entry function '", done.stderr)[1:]:
+    for part in re.split(r"Compiling entry function '", report(ptx, arch, text))[1:]:
         entry = part.partition("'")[0]
         frame = re.search(
             r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", part
@@ -152,10 +173,8 @@ def table(rows: list[KernelResources]) -> str:
 )
 def test_kernels_stay_within_their_budgets(tmp_path: Path) -> None:
     folder = Path(os.environ.get("PTX", tmp_path))
-    for name in modules_of_every_kernel((wp.float32, wp.float64)):
-        if not (folder / name).exists():
-            compile_for_cuda(name, [80], folder / name)
-    modules = sorted(folder.glob("*/*.ptx"))
+    names = modules_of_every_kernel((wp.float32, wp.float64))
+    modules = [compiled(name, folder) for name in names]
     with ThreadPoolExecutor() as pool:
         rows = [
             row

@@ -10,7 +10,15 @@ import pytest
 
 from benchmarks.machine_code import Instruction, parsed
 from benchmarks.machine_counts import issued
-from benchmarks.machine_memory import EmulatedMemory, ProcessMemory, constants_of, packed
+from benchmarks.machine_memory import (
+    LOCAL_WINDOW,
+    SHARED_WINDOW,
+    STACK,
+    EmulatedMemory,
+    ProcessMemory,
+    constants_of,
+    packed,
+)
 from benchmarks.machine_thread import Lane
 
 AT = 0x7000_0000_0000  # address of the memory
@@ -172,6 +180,81 @@ def test_larger_and_smaller_of_two(kind: str, of: np.ufunc, a: float, b: float) 
     lane = lane_of(memory_of(np.zeros(COUNT, np.int32)), *lines)
     found = struct.unpack("<d", struct.pack("<II", lane.registers["R8"], lane.registers["R9"]))[0]
     assert found == of(a, b) or (np.isnan(found) and np.isnan(of(a, b)))
+
+
+@pytest.mark.parametrize(
+    ("mask", "value"), [(0x1, 0x0), (0x2, 0x2), (0x40, 0x40), (0x7F, 0b1000010)]
+)
+def test_uniform_predicates_to_a_register(mask: int, value: int) -> None:
+    lane = lane_of(
+        memory_of(np.zeros(COUNT, np.int32)),
+        "UISETP.EQ.AND UP1, UP2, URZ, 0x0, UPT",  # UP1 is true, UP2 false
+        "UISETP.NE.AND UP3, UP6, URZ, 0x0, UPT",  # UP3 is false, UP6 true
+        "ISETP.EQ.AND P0, P1, RZ, 0x0, PT",  # not of the uniform ones
+        f"UP2UR UR44, UPR, URZ, {mask:#x}",
+        f"P2R R5, PR, RZ, {mask:#x}",
+    )
+    assert lane.registers["UR44"] == value
+    assert lane.registers["R5"] == mask & 0x1
+
+
+def test_uniform_predicates_from_a_register() -> None:
+    lane = lane_of(memory_of(np.zeros(COUNT, np.int32)), "UMOV UR4, 0x5", "UR2UP UPR, UR4, 0x7")
+    assert [lane.predicates[f"UP{n}"] for n in range(3)] == [True, False, True]
+    assert not any(lane.predicates[f"P{n}"] for n in range(3))
+
+
+@pytest.mark.parametrize("kind", ["EQ", "NE"])
+def test_vote_to_a_predicate(kind: str) -> None:
+    lane = lane_of(
+        memory_of(np.zeros(COUNT, np.int32)),
+        f"ISETP.{kind}.AND P2, PT, RZ, 0x0, PT",
+        "VOTEU.ANY UP6, P2",
+        "VOTEU.ANY UP5, !P2",
+        "VOTEU.ANY UR5, UPT, PT",
+    )
+    assert (lane.predicates["UP6"], lane.predicates["UP5"]) == (kind == "EQ", kind == "NE")
+    assert lane.registers["UR5"] == 1
+
+
+def test_generic_addresses_of_the_stack() -> None:
+    lines = [
+        "LDC R1, c[0x0][0x28]",
+        "VIADD R1, R1, 0xfffffff0",  # a frame of 16 bytes
+        "ULDC.64 UR6, c[0x0][0x20]",
+        "IADD3 R6, P0, R1, UR6, RZ",
+        "IADD3.X R7, RZ, UR7, RZ, P0, !PT",
+        "MOV R4, 0x2a",
+        "STL [R1+0x8], R4",
+        "LD.E R5, desc[UR4][R6.64+0x8]",
+        "ST.E desc[UR4][R6.64+0xc], R5",
+        "LDL R8, [R1+0xc]",
+    ]
+    first, second = (lane_of(memory_of(np.zeros(COUNT)), *lines) for _ in range(2))
+    assert first.registers["R6"] | first.registers["R7"] << 32 == LOCAL_WINDOW + STACK - 16
+    assert (first.registers["R5"], first.registers["R8"]) == (42, 42)
+    assert (first.accesses, first.waits) == ([], 0)
+    assert second.local[STACK - 8] == 42
+
+
+def test_generic_addresses_of_shared_memory() -> None:
+    memory = memory_of(np.zeros(COUNT, np.int32))
+    lane = lane_of(
+        memory,
+        "S2R R7, SR_SWINHI",
+        "MOV R6, 0x410",
+        "MOV R4, 0x7",
+        "ST.E desc[UR4][R6.64], R4",
+        "ATOM.E.ADD.STRONG.GPU PT, R8, desc[UR4][R6.64], R4",
+        "LDS R5, [0x410]",
+        "QSPC.E.S P0, RZ, [R6.64]",
+        "QSPC.E.L P1, RZ, [R6.64]",
+        "QSPC.E.S P2, RZ, [R2.64]",
+    )
+    assert lane.registers["R7"] == SHARED_WINDOW >> 32
+    assert (lane.registers["R8"], lane.registers["R5"]) == (7, 14)
+    assert [lane.predicates[f"P{n}"] for n in range(3)] == [True, False, False]
+    assert (lane.accesses, memory.written) == ([], {})
 
 
 def test_waits_are_those_for_new_lines() -> None:
