@@ -8,6 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation as Rotation3
 
 from default_run import few
+from warp_lcp.grid import thin_walls_kernels as kernels
 from warp_lcp.grid.motion import Rotation, Sinusoid
 from warp_lcp.grid.signed_distance import (
     Box,
@@ -104,6 +105,62 @@ def test_nothing_leaves_a_closed_box(dimension, thickness, kind):
     assert free.sum() > 100 and np.allclose(
         ends[free], (points + ways)[free, :dimension], atol=1e-6
     )
+
+
+@wp.kernel(enable_backward=False)
+def first_hits(
+    shapes: kernels.SHAPES,
+    start: wp.array(dtype=wp.vec3d),
+    end: wp.array(dtype=wp.vec3d),
+    place: wp.array(dtype=wp.float64),
+):
+    """Find the first place on each path where it meets the first shape, from 0 to 1."""
+    i = wp.tid()
+    at, _n, _which = kernels.first_hit(shapes, 0, 1, start[i], end[i], -1)
+    place[i] = at
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_path_slips_through_the_edges_and_corners_of_a_mesh(seed: int) -> None:
+    rng, count = np.random.default_rng(seed), 20000
+    low = rng.uniform(0.1, 0.3, 3)
+    high = low + rng.uniform(0.3, 0.6, 3)
+    walls = thin_walls(grid(3), [sheet(low, high)])
+    # Points on edges and corners: two or three coordinates are those of sides.
+    upper, free = rng.random((count, 3)) < 0.5, np.zeros((count, 3), dtype=bool)
+    edges = rng.random(count) < 0.7
+    free[edges, rng.integers(0, 3, count)[edges]] = True
+    on_edge = np.where(free, rng.uniform(low, high, (count, 3)), np.where(upper, high, low))
+    start = rng.uniform(low + 0.02 * (high - low), high - 0.02 * (high - low), (count, 3))
+    end = 2.0 * on_edge - start
+    place = wp.zeros(count, dtype=wp.float64, device="cpu")
+    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
+    wp.launch(first_hits, count, [walls.shapes, *ends, place], device="cpu")
+    # All paths leave the box halfway. Vertices are rounded to float32, which shifts the place by
+    # about 1e-7 / 0.02.
+    np.testing.assert_allclose(place.numpy(), 0.5, rtol=0.0, atol=2e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_paths_meet_a_mesh_where_they_meet_its_box(seed: int) -> None:
+    rng, count = np.random.default_rng(seed), 5000
+    low = rng.uniform(0.1, 0.3, 3)
+    high = low + rng.uniform(0.3, 0.6, 3)
+    walls = thin_walls(grid(3), [sheet(low, high)])
+    start, end = rng.uniform(0.0, 1.0, (2, count, 3))
+    place = wp.zeros(count, dtype=wp.float64, device="cpu")
+    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
+    wp.launch(first_hits, count, [walls.shapes, *ends, place], device="cpu")
+    # Exact slabs: the path is in the box between the last entry and the first exit.
+    sides = np.stack([low, high])[:, None] - start
+    crossed = np.sort(sides / (end - start), axis=0)
+    enter, leave = crossed[0].max(axis=1), crossed[1].min(axis=1)
+    first = np.where(enter >= 0.0, enter, leave)
+    hits = (enter <= leave) & (first >= 0.0) & (first <= 1.0)
+    clear = (np.abs(leave - enter) > 1e-4) & (np.abs(first) > 1e-4) & (np.abs(first - 1.0) > 1e-4)
+    assert hits.sum() > count / 4 and clear.sum() > 0.95 * count
+    np.testing.assert_array_equal((place.numpy() <= 1.0)[clear], hits[clear])
+    np.testing.assert_allclose(place.numpy()[clear & hits], first[clear & hits], atol=1e-4)
 
 
 def leaning_shape(kind, rng):

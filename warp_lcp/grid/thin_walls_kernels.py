@@ -141,22 +141,71 @@ def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
 
 
 @wp.func
+def across_path(p: wp.vec3d, d: wp.vec3d, axis: int):
+    """Project a point along a path d from the origin, onto the plane across a coordinate axis.
+
+    Returns the place in the plane, rounded to float32, and the parameter t of the point along the
+    path. Products of such places are exact in float64.
+    """
+    t = p[axis] / d[axis]
+    k = (axis + 1) % 3
+    m = (axis + 2) % 3
+    x = wp.float64(wp.float32(p[k] - t * d[k]))
+    y = wp.float64(wp.float32(p[m] - t * d[m]))
+    return wp.vec3d(x, y, t)
+
+
+@wp.func
 def hit_mesh(a: wp.vec3d, d: wp.vec3d, unit: wp.float64, mesh: wp.uint64):
     """Intersect a path with a mesh, from either side.
 
     Returns the place on the path, and the normal there, against the path.
+
+    No path slips through between triangles. The vertices are projected along the path, each to the
+    same place for all its triangles. There, the path is the origin, and lies in a triangle if no
+    two of the areas
+
+        U = x_c y_b - y_c x_b, V = x_a y_c - y_a x_c, W = x_b y_a - y_b x_a
+
+    have opposite signs. Places have 24 bits, so the signs are exact, and two triangles never both
+    miss a path through their common edge. On the path, t = (U t_a + V t_b + W t_c) / (U + V + W) is
+    continuous across edges. Thus the result is that of a closed surface whose vertices differ from
+    the true ones by rounding (Woop, Benthin and Wald 2013, "Watertight ray/triangle intersection").
     """
     t = _MISS
     n = wp.vec3d()
-    length = wp.length(d)
-    if length > _ZERO:
-        way = wp.vec3(d / length)
-        query = wp.mesh_query_ray(mesh, wp.vec3(a / unit), way, float(length / unit))
-        if query.result:
-            t = wp.float64(query.t) * unit / length
-            n = wp.normalize(wp.vec3d(query.normal))
-            if wp.dot(n, d) > _ZERO:
-                n = -n
+    if wp.dot(d, d) > _TINY:
+        p = a / unit
+        way = d / unit
+        q = p + way
+        axis = int(0)
+        for k in range(1, 3):
+            if wp.abs(way[k]) > wp.abs(way[axis]):
+                axis = k
+        # Rounding to float32 is monotone and the vertices are float32: no triangle whose bounding
+        # box meets that of the path is left out.
+        query = wp.mesh_query_aabb(mesh, wp.vec3(wp.min(p, q)), wp.vec3(wp.max(p, q)))
+        face = int(0)
+        while wp.mesh_query_aabb_next(query, face):
+            first = wp.vec3d(wp.mesh_get_point(mesh, 3 * face)) - p
+            second = wp.vec3d(wp.mesh_get_point(mesh, 3 * face + 1)) - p
+            third = wp.vec3d(wp.mesh_get_point(mesh, 3 * face + 2)) - p
+            one = across_path(first, way, axis)
+            two = across_path(second, way, axis)
+            three = across_path(third, way, axis)
+            u = three[0] * two[1] - three[1] * two[0]
+            v = one[0] * three[1] - one[1] * three[0]
+            w = two[0] * one[1] - two[1] * one[0]
+            total = u + v + w
+            least = wp.min(u, wp.min(v, w))
+            most = wp.max(u, wp.max(v, w))
+            if (least >= _ZERO or most <= _ZERO) and total != _ZERO:
+                at = (u * one[2] + v * two[2] + w * three[2]) / total
+                if at >= _ZERO and at <= _ONE and at < t:
+                    t = at
+                    n = wp.normalize(wp.cross(second - first, third - first))
+                    if wp.dot(n, d) > _ZERO:
+                        n = -n
     return t, n
 
 
