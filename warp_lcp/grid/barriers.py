@@ -23,6 +23,7 @@ from warp_lcp.grid import barrier_transfer_kernels as transfer_kernels
 from warp_lcp.grid import barrier_velocity_kernels as velocity_kernels
 from warp_lcp.grid.barrier_fields import binomial_kernel, shift_kernel
 from warp_lcp.grid.barrier_geometry import CENTERS, REACH, Barrier
+from warp_lcp.grid.barrier_volume import filled_kernel
 from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.motion import RigidMotion
@@ -346,6 +347,27 @@ class Barriers:
         """
         given = [self.near, self.apart[-1], self.grid.planes, variance, limit]
         window.launch(shift_kernel, [*given, capacity, phi, known, out])
+
+    def fill(
+        self,
+        window: Window,
+        phi: wp.array,
+        known: wp.array,
+        distance: wp.array | None,
+        filled: wp.array | None,
+    ) -> None:
+        """Find the share of each cell near the solids that liquid fills.
+
+        Args:
+            window: cells of the pass.
+            phi: distance to the surface at the cells' centers [cells], float32, < 0 in the liquid.
+            known: int8, 1 where phi is that of an open cell.
+            distance: distance to thick solids at the cells' low corners [cells], float32, if any.
+            filled: share, float32; -1 where solids are too far away to matter (updated).
+        """
+        nodes = phi if distance is None else distance
+        given = [self._barrier, self.apart[-1], phi, known, nodes, distance is not None, filled]
+        window.launch(filled_kernel, given)
 
     def carry(self, velocity: Faces, dt: float, start: wp.array) -> None:
         """Advect particles near the solids by the velocity that they see.

@@ -73,6 +73,7 @@ class LevelSet:
             ActiveWindow(grid.domain),
             LaunchGraph(grid.device, self._launch_leaving),
         )
+        self._beside: wp.array | None = None  # filled shares of cells beside thin solids
         self._measured = False
         self._filled: Window | None = None
 
@@ -161,7 +162,7 @@ class LevelSet:
     def volume(self, distance: wp.array | None, window: Window) -> float:
         """Return the volume of phi < 0 outside the solids [m^3; m^2 in 2-D].
 
-        phi is multilinear between the cells' centers.
+        phi is multilinear between the cells' centers, and linear about them beside thin solids.
 
         Args:
             distance: signed distance to the solids at the cells' low corners [cells], > 0 in the
@@ -182,6 +183,7 @@ class LevelSet:
             return
         if self._volume is None:
             self._volume = WindowReduction(kernels.VOLUME, self.grid)
+            self._beside = self.grid.field() if self.grid.barriers is not None else None
         self._box.move_to(box)
         self._measuring.run(distance, variant=box.near is None)
         self._volume.changed()
@@ -189,11 +191,14 @@ class LevelSet:
     def _launch_volume(self, distance: wp.array | None) -> None:
         grid = self.grid
         assert self._volume is not None
+        if grid.barriers is not None:
+            grid.barriers.fill(self._box, self.phi, self._known, distance, self._beside)
         self._volume.take(
             self._box,
             phi=self.phi,
             known=self._known,
             distance=distance,
+            beside=self._beside,
             planes=grid.planes,
             parts=PARTS[grid.dimension],
         )

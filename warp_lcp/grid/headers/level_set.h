@@ -203,10 +203,10 @@ for (int start = first; start < last; start += M) {
 // kernel warp_lcp.grid.volume.volume: Volume of the liquid [cells]. Cells that neither surface can
 // cross are counted whole. In the other cells phi is multilinear between cell centers, and the
 // distance to walls between nodes. Each of `parts` points per axis stands for its part of the cell,
-// which is filled as far as a plane at that distance fills it. In a module of its own, since few
-// runs need it.
+// which is filled as far as a plane at that distance fills it. Where `beside` is not negative, it is
+// the filled share of a cell beside thin solids. In a module of its own, since few runs need it.
 //   compute    float32
-//   box        float32 phi, distance?; int8 known
+//   box        float32 phi, distance?, beside?; int8 known
 //   numbers    int planes, parts
 //   sums       volume
 const T* node = distance ? distance : phi;
@@ -242,6 +242,10 @@ for (int start = first; start < last; start += M) {
         }
     for (int m = 0; m < n; ++m) {
         const int i = start + m;
+        if (beside && beside[i] >= 0) {
+            volume += beside[i];
+            continue;
+        }
         const T least = smaller(low[m], smaller(low[m + 1], low[m + 2])),
                 most = larger(high[m], larger(high[m + 1], high[m + 2]));
         const bool shut = walls ? larger(far[m], far[m + 1]) <= 0 : known[i] != 1;
