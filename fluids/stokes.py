@@ -63,8 +63,16 @@ from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.fields import zeros
-from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, launch_now
+from warp_lcp.kernels.launch_graph import (
+    CommandBuffer,
+    Launch,
+    LaunchGraph,
+    clear,
+    copy,
+    launch_now,
+)
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import NORM
@@ -196,6 +204,26 @@ class StokesSolve:
         self._rank = 0 if self._bodies is None else self._bodies.rank
         self._tallies: dict[tuple[str, int], WindowReduction] = {}
         self._estimation = LaunchGraph(grid.device, self._launch_estimation)
+        # Launches between two decisions of the host. On CUDA they contain cycles, which are programs
+        # of their own there.
+        launches = (
+            self._launch_product,
+            self._launch_velocities,
+            self._launch_right_side,
+            self._launch_pressures,
+            self._launch_preconditioner_set_up,
+            self._launch_divergence,
+            self._launch_held,
+            self._launch_residual,
+            self._launch_differences,
+            self._launch_end_energy,
+            self._launch_corrections,
+        )
+        self._graphs = {
+            function.__name__: LaunchGraph(grid.device, function, at_once=grid.device.is_cuda)
+            for function in launches
+        }
+        self._least_x, self._least_y = Scalar(0.0), Scalar(0.0)
         self._krylov: GMRES | None = None  # built, with its vectors, at the first use
 
     def keep_start(self, velocity: Sequence[wp.array]) -> None:
@@ -332,6 +360,13 @@ class StokesSolve:
 
         In units of the mass of a cell; the force is in the viscous multigrid's `r`.
         """
+        self._graphs["_launch_differences"].run(velocity)
+        fields = ViscousFields(velocity, self.projection.kind, self._contact)
+        self._taken, self._driven = self.viscosity.force(fields)
+        return self._taken
+
+    def _launch_differences(self, velocity: Sequence[wp.array]) -> None:
+        """Write u - u* to the viscous solve's change."""
         for axis, change in enumerate(self.viscosity.change):
             self._equations.window.run(
                 self._kernels.difference,
@@ -340,9 +375,10 @@ class StokesSolve:
                 b=self.start[axis],
                 volume=self._equations.level.volume[axis],
             )
-        fields = ViscousFields(velocity, self.projection.kind, self._contact)
-        self._taken, self._driven = self.viscosity.force(fields)
-        return self._taken
+
+    def _launch_end_energy(self, velocity: Sequence[wp.array]) -> None:
+        """Launch the sum of |u|_M."""
+        self._take_energy("end", velocity, velocity)
 
     def _take_energy(self, name: str, u: Sequence[wp.array], force: Sequence[wp.array]) -> None:
         """Launch the sums of u'M u and u'force, which `_read` returns."""
@@ -382,6 +418,7 @@ class StokesSolve:
                 zeros(size, wp.float32, device) for _ in range(4)
             )
             self._krylov = GMRES(self._product, self, restart=VECTORS, weight=self._weight)
+            self._velocity_residual = self.r[: self._size]
             self._norm = RowReduction(rows_of(self.r))
             self._pressure = GridSystem(self.projection.operator, wp.float32, bounded=False)
             self._free_cells = self._free.flatten()
@@ -410,8 +447,17 @@ class StokesSolve:
 
     def _product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
         """Write q = K p, K = [[A, -D'], [-D, -C]] with rows of bodies."""
+        self._graphs["_launch_product"].run(p, q)
+        if self._bodies is not None:
+            V = self._body_part(p)
+            self._bodies.add_forces(V, q)
+            self._bodies.add_outflow(V, self._flat_pressure(q), self._free_cells, sign=-1.0)
+            self._set_body_part(q, self._bodies.rows(V, p, self._flat_pressure(p)))
+
+    def _launch_product(self, p: wp.array, q: wp.array) -> None:
+        """Write q = K p without bodies."""
         level, window = self._equations.level, self._equations.window
-        self.viscosity.multigrid.product(p, q, launch=launch)
+        self.viscosity.multigrid.product(p, q, launch=launch_recorded)
         u, force, x = self._components(p), self._components(q), self._pressure_of(p)
         for axis in range(self.grid.dimension):
             window.run(
@@ -430,11 +476,6 @@ class StokesSolve:
             )
         self._add_products(u, force, 1.0)
         self._minus_outflow(u, x, self._pressure_of(q))
-        if self._bodies is not None:
-            V = self._body_part(p)
-            self._bodies.add_forces(V, q)
-            self._bodies.add_outflow(V, self._flat_pressure(q), self._free_cells, sign=-1.0)
-            self._set_body_part(q, self._bodies.rows(V, p, self._flat_pressure(p)))
 
     def _add_products(self, u: Sequence[wp.array], force: Sequence[wp.array], sign: float) -> None:
         """Add the products of strain rates along separating walls to the rows, in 3-D."""
@@ -483,26 +524,37 @@ class StokesSolve:
 
     def apply(self) -> None:
         """Write z = P r, see the class; GMRES calls it."""
-        self.estimate()
+        self._graphs["_launch_velocities"].run(self.viscosity.multigrid.program)
+        if self._bodies is not None:
+            r_bodies = self._body_part(self.r)
+            z_bodies = self._bodies.corrected(r_bodies, self.z)
+            self._square_of_bodies = self._bodies.square(z_bodies, r_bodies)
+            self._set_body_part(self.z, z_bodies)
+            self._graphs["_launch_right_side"].run()
+            self._bodies.add_outflow(z_bodies, self._pressure.r, self._free_cells, sign=1.0)
+        self._graphs["_launch_pressures"].run(self._pressure.program)
 
     def estimate(self) -> float:
         """Write z = P r; return an estimate of the error, the energy norm of z."""
-        multigrid, system, window = (
-            self.viscosity.multigrid,
-            self._pressure,
-            self._equations.window,
-        )
-        level, shape = self._equations.level, self.grid.shape
-        wp.copy(multigrid.r, self.r, count=self._size)
-        multigrid.apply()
-        cycle, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
+        self.apply()
+        square = 0.0 if self._bodies is None else self._square_of_bodies
+        square += self._read("velocity_correction", self.grid.dimension)[0]
+        square += self._read("correction")[0]
+        return math.sqrt(max(float(square), 0.0))
+
+    def _launch_velocities(self, cycle: CommandBuffer) -> None:
+        """Write the velocities of z: a viscous cycle."""
+        multigrid, level = self.viscosity.multigrid, self._equations.level
+        copy(multigrid.r, self._velocity_residual)
+        cycle.run()
+        found, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
         for axis in range(self.grid.dimension):
             self._take(
                 "velocity_correction",
                 self._kernels.velocity_correction,
                 axis,
                 z=z[axis],
-                cycle=cycle[axis],
+                cycle=found[axis],
                 r=r[axis],
                 volume=level.volume[axis],
                 diagonal=level.diagonal[axis],
@@ -510,42 +562,37 @@ class StokesSolve:
                 kind=self.projection.kind,
                 axis=axis,
             )
-        x, work, right = (
-            self._pressure_of(self.z),
-            self._pressure_of(self._work),
-            system.r.reshape(shape),
-        )
-        x.zero_()
-        self._minus_outflow(z, x, work)
-        window.run(
+
+    def _launch_right_side(self) -> None:
+        """Write the right-hand side of the pressure's cycle, r_x + D z_u without bodies."""
+        x, work = self._flat_pressure(self.z), self._pressure_of(self._work)
+        clear(x)
+        self._minus_outflow(self._components(self.z), x.reshape(self.grid.shape), work)
+        self._equations.window.run(
             self._kernels.right_side,
-            out=right,
+            out=self._pressure.r.reshape(self.grid.shape),
             r=self._pressure_of(self.r),
             q=work,
             free=self._free,
             sign=-1.0,
         )
-        square = 0.0
-        if self._bodies is not None:
-            r_bodies = self._body_part(self.r)
-            z_bodies = self._bodies.corrected(r_bodies, self.z)
-            square += self._bodies.square(z_bodies, r_bodies)
-            self._set_body_part(self.z, z_bodies)
-            self._bodies.add_outflow(z_bodies, system.r, self._free_cells, sign=1.0)
-        system.apply()
+
+    def _launch_pressures(self, cycle: CommandBuffer) -> None:
+        """Write the pressures of z: a cycle plus c; without bodies the right-hand side, too."""
+        if self._bodies is None:
+            self._launch_right_side()
+        cycle.run()
+        system, shape = self._pressure, self.grid.shape
         self._take(
             "correction",
             self._kernels.correction,
             0,
-            z=x,
+            z=self._pressure_of(self.z),
             cycle=system.z.reshape(shape),
-            r=right,
+            r=system.r.reshape(shape),
             coefficient=self._coefficient,
             free=self._free,
         )
-        square += self._read("velocity_correction", self.grid.dimension)[0]
-        square += self._read("correction")[0]
-        return math.sqrt(max(float(square), 0.0))
 
     # Solve
 
@@ -559,7 +606,7 @@ class StokesSolve:
             share: its splitting error.
             moved: called when the velocities of bodies have changed.
         """
-        krylov, window, x = self._allocate(), self._equations.window, self.projection.pressure
+        krylov = self._allocate()
         self._save(velocity)
         self._set_up_preconditioner(velocity)
         self._residual(velocity, FIRST)
@@ -567,7 +614,7 @@ class StokesSolve:
         settled, iterations, first = self.projection.lower is None, 0, None
         while True:
             error = self.estimate()
-            self._take_energy("end", velocity, velocity)
+            self._graphs["_launch_end_energy"].run(velocity)
             mass = float(self._read("end", self.grid.dimension)[0])
             size = math.sqrt(mass + max(self._taken, 0.0))
             relative = error / size if size > 0.0 else 0.0
@@ -580,17 +627,7 @@ class StokesSolve:
                 share_of_norm = max(share_of_norm, TENTH)
             norm = float(np.sqrt(self._norm.of(NORM, r=self.r, w=self._weight)[0]))
             iterations += krylov.solve(share_of_norm * norm, VECTORS)[0]
-            more = self._components(krylov.x)
-            for axis, u in enumerate(velocity):
-                window.run(
-                    self._kernels.add_velocity,
-                    u=u,
-                    more=more[axis],
-                    volume=self._equations.level.volume[axis],
-                )
-            window.run(
-                self._kernels.add_pressure, x=x, more=self._pressure_of(krylov.x), free=self._free
-            )
+            self._graphs["_launch_corrections"].run(velocity, krylov.x)
             if self._bodies is not None:
                 self._bodies.move(self._body_part(krylov.x))
                 moved()
@@ -615,6 +652,20 @@ class StokesSolve:
             energy * self._driven,
         )
 
+    def _launch_corrections(self, velocity: Sequence[wp.array], more: wp.array) -> None:
+        """Add a correction to velocity and pressure."""
+        equations, window = self._equations, self._equations.window
+        for axis, (u, part) in enumerate(zip(velocity, self._components(more), strict=True)):
+            window.run(
+                self._kernels.add_velocity, u=u, more=part, volume=equations.level.volume[axis]
+            )
+        window.run(
+            self._kernels.add_pressure,
+            x=self.projection.pressure,
+            more=self._pressure_of(more),
+            free=self._free,
+        )
+
     def _save(self, velocity: Sequence[wp.array]) -> None:
         """Store the split step's result."""
         self.keep_viscous(velocity)
@@ -634,14 +685,19 @@ class StokesSolve:
     def _set_up_preconditioner(self, velocity: Sequence[wp.array]) -> None:
         """Set up the cycles, the correction c and the weights of the rows."""
         equations, projection = self._equations, self.projection
-        level, window = equations.level, equations.window
-        self.viscosity.multigrid.set_up()
         self._pressure.refresh()
-        self._weight.zero_()
+        clear(self._weight, self._free)
         if self._bodies is not None:
             walls = ViscousWalls(equations.distance, equations.slip, projection.kind, self._contact)
-            self._bodies.take(level, walls, velocity)
+            self._bodies.take(equations.level, walls, velocity)
             self._set_body_part(self._weight, self._bodies.weights)
+        self._graphs["_launch_preconditioner_set_up"].run()
+
+    def _launch_preconditioner_set_up(self) -> None:
+        """Launch the set-up of the viscous cycle, of c and of the weights."""
+        equations, projection = self._equations, self.projection
+        level, window = equations.level, equations.window
+        self.viscosity.multigrid.set_up()
         for axis, weight in enumerate(self._components(self._weight)):
             window.run(
                 self._kernels.weights,
@@ -680,7 +736,6 @@ class StokesSolve:
             kind=projection.kind,
             planes=self.grid.planes,
         )
-        self._free.zero_()
 
     def _residual(self, velocity: Sequence[wp.array], look: int) -> int:
         """Write the residual of velocity and pressure to `r`, evaluated in float64.
@@ -692,35 +747,52 @@ class StokesSolve:
         Returns:
             The number of cells that have become free or fixed.
         """
-        equations, kernels, projection = self._equations, self._kernels, self.projection
-        level, window, x, kind = (
-            equations.level,
-            equations.window,
-            projection.pressure,
-            projection.kind,
-        )
-        for axis in range(self.grid.dimension):
-            window.run(
-                kernels.held,
-                u=velocity[axis],
-                before=self.start[axis],
-                leak=self._leak[axis],
-                share=self._share[axis],
-                open=self._open[axis],
-                solid=self._solids[axis],
-                x=x,
-                kind=kind,
-                axis=axis,
-            )
+        projection = self.projection
+        self._graphs["_launch_held"].run(velocity)
         _, worst, most = self._divergence(velocity, look if look == FIRST else KEEP)
         switched = 0.0
         if look == LOOK and projection.lower is not None:
             # Signs of outflows below the residual mean nothing.
             switched = self._divergence(velocity, LOOK, NOISE * most, worst)[0]
         if look != KEEP and projection.lower is not None:
-            window.run(kernels.bound, x=x, lower=projection.lower, kind=kind, free=self._free)
+            self._equations.window.run(
+                self._kernels.bound,
+                x=projection.pressure,
+                lower=projection.lower,
+                kind=projection.kind,
+                free=self._free,
+            )
         self._viscous_force(velocity)
-        wp.copy(self.r, self.viscosity.multigrid.r, count=self._size)
+        self._graphs["_launch_residual"].run(velocity)
+        if self._bodies is not None:
+            for part, u in zip(self._components(self._work), velocity, strict=True):
+                copy(part, u)
+            x = projection.pressure.flatten()
+            rows = self._bodies.rows(self._bodies.velocities, self._work, x)
+            self._set_body_part(self.r, self._bodies.start - rows)
+        return int(switched)
+
+    def _launch_held(self, velocity: Sequence[wp.array]) -> None:
+        """Update the velocity of faces in walls that are partly open."""
+        for axis in range(self.grid.dimension):
+            self._equations.window.run(
+                self._kernels.held,
+                u=velocity[axis],
+                before=self.start[axis],
+                leak=self._leak[axis],
+                share=self._share[axis],
+                open=self._open[axis],
+                solid=self._solids[axis],
+                x=self.projection.pressure,
+                kind=self.projection.kind,
+                axis=axis,
+            )
+
+    def _launch_residual(self, velocity: Sequence[wp.array]) -> None:
+        """Write the residual from the viscous force and the outflow, without bodies."""
+        equations, kernels = self._equations, self._kernels
+        level, window = equations.level, equations.window
+        copy(self._velocity_residual, self.viscosity.multigrid.r)
         r = self._components(self.r)
         for axis in range(self.grid.dimension):
             window.run(
@@ -732,8 +804,8 @@ class StokesSolve:
                 u=velocity[axis],
                 rate=self.viscosity.change[axis],
                 open=self._open[axis],
-                x=x,
-                kind=kind,
+                x=self.projection.pressure,
+                kind=self.projection.kind,
                 axis=axis,
                 sign=1.0,
             )
@@ -746,17 +818,18 @@ class StokesSolve:
             free=self._free,
             sign=0.0,
         )
-        if self._bodies is not None:
-            for part, u in zip(self._components(self._work), velocity, strict=True):
-                copy(part, u)
-            rows = self._bodies.rows(self._bodies.velocities, self._work, x.flatten())
-            self._set_body_part(self.r, self._bodies.start - rows)
-        return int(switched)
 
     def _divergence(
         self, velocity: Sequence[wp.array], look: int, least_x: float = 0.0, least_y: float = 0.0
     ) -> tuple[float, float, float]:
         """Write y, the outflow; return switched cells, and the largest |y| and |x|."""
+        self._least_x.value, self._least_y.value = least_x, least_y
+        self._graphs["_launch_divergence"].run(velocity, look)
+        switched, worst, most = self._read("divergence")
+        return float(switched), float(worst), float(most)
+
+    def _launch_divergence(self, velocity: Sequence[wp.array], look: int) -> None:
+        """Launch the outflow, see `_residual`."""
         ux, uy, uz = three_components(velocity)
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
@@ -780,11 +853,9 @@ class StokesSolve:
             free=self._free,
             planes=self.grid.planes,
             look=look,
-            least_x=least_x,
-            least_y=least_y,
+            least_x=self._least_x,
+            least_y=self._least_y,
         )
-        switched, worst, most = self._read("divergence")
-        return float(switched), float(worst), float(most)
 
     # Forces on solids
 

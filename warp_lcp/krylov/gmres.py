@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.fields import zeros, zeros_like
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, RowReduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
@@ -51,19 +53,31 @@ class GMRES:
         restart: int = 30,
         weight: DeviceArray | None = None,
     ) -> None:
-        r = preconditioner.r
+        r, size = preconditioner.r, preconditioner.r.size
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
         self.device, self.x = r.device, zeros_like(r)
         self._b, self._q = zeros_like(r), zeros_like(r)
         self._weight = weight
-        self._basis = zeros((restart + 1) * r.size, r.dtype, r.device)  # fields, one after another
+        self._basis = zeros((restart + 1) * size, r.dtype, r.device)  # fields, one after another
         # The first ones, preconditioned.
-        self._images = zeros(min(KEPT, restart) * r.size, r.dtype, r.device)
+        self._images = zeros(min(KEPT, restart) * size, r.dtype, r.device)
         # Products with them, and a square in the last slot.
         self._sums = RowReduction(rows_of(r), restart + 1, slots=restart + 2)
+        self._products = zeros(restart + 2, wp.float64, r.device)  # of the first orthogonalization
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
         self._increase = ADD.bind(rows_of(r), z=preconditioner.z, x=self.x)
+        # Launches between two calls of the preconditioner or of A, recorded once on the CPU.
+        at_once = r.device.is_cuda
+        self._first = LaunchGraph(r.device, self._launch_first, at_once=at_once)
+        self._again = LaunchGraph(r.device, self._launch_start, at_once=at_once)
+        self._before, self._after, self._ends = (
+            [
+                LaunchGraph(r.device, partial(function, k), at_once=at_once)
+                for k in range(restart + 1)
+            ]
+            for function in (self._launch_before, self._launch_after, self._launch_end)
+        )
         self._H, self._rotations, self._g = (
             np.zeros((restart + 1, restart)),
             np.zeros((restart, 2)),
@@ -79,28 +93,78 @@ class GMRES:
             The iterations done, products with A that restarts cost not counted, and the norm of the
             residual.
         """
-        wp.copy(self._b, self._preconditioner.r)
-        self.x.zero_()
-        self._q.zero_()
-        norm, done = self._start(), 0
+        self._first.run()
+        norm, done = self._norm(), 0
         while norm > tolerance and done < max_iterations and math.isfinite(norm):
             columns = self._expand(norm, tolerance, min(self._restart, max_iterations - done))
             done += columns
             self._correct(columns)
             self._product(self.x, self._q)
-            before, norm = norm, self._start()
+            self._again.run()
+            before, norm = norm, self._norm()
             if norm > STALLED * before:
                 break
         return done, norm
 
-    def _start(self) -> float:
-        """Store the normalized residual as the first vector; return its norm.
+    def _norm(self) -> float:
+        """Return the norm of the residual that a start has stored."""
+        return float(np.sqrt(self._sums.scalars.numpy()[-1]))
 
-        `_q` is A x.
-        """
+    def _launch_first(self) -> None:
+        """Take the right-hand side, and start at x = 0."""
+        copy(self._b, self._preconditioner.r)
+        clear(self.x, self._q)
+        self._launch_start()
+
+    def _launch_start(self) -> None:
+        """Store the normalized residual as the first vector; `_q` is A x."""
         self._residual.launch()
         self._combine(self._factors, self._q, 0)
-        return float(np.sqrt(self._stored(0)[-1]))
+        self._store(0)
+
+    def _launch_before(self, k: int) -> None:
+        """Write W^(-1/2) v_k to the preconditioner: the basis has weighted residuals."""
+        copy(self._preconditioner.r, self._vector(self._basis, k))
+        self._weigh(self._preconditioner.r, inverse=True)
+
+    def _launch_after(self, k: int) -> None:
+        """Orthogonalize w = W^(1/2) A z against the first k + 1 vectors, twice, and store it.
+
+        It is stored as the next vector, normalized. `_products` and `_sums` have its products.
+        """
+        self._weigh(self._q)
+        for first in True, False:
+            DOTS.bind(
+                rows_of(self._q),
+                basis=self._basis,
+                size=self._q.size,
+                count=k + 1,
+                x=self._q,
+                out=self._sums.partials,
+            ).launch()
+            self._sums.add_up(0, columns=k + 1)
+            self._combine(self._sums.scalars, self._q, k + 1, sign=-1.0)
+            if first:
+                copy(self._products, self._sums.scalars)
+        self._store(k + 1)
+
+    def _launch_end(self, columns: int) -> None:
+        """Add the sum of factors_j M v_j to x, or write that of factors_j v_j to `r`.
+
+        For few columns the stored images M v_j are used.
+        """
+        if columns <= KEPT:
+            self._combine(self._factors, self.x, columns, other_basis=self._images)
+            return
+        r = self._preconditioner.r
+        clear(r)
+        self._combine(self._factors, r, columns)
+        self._weigh(r, inverse=True)
+
+    def _vector(self, basis: DeviceArray, place: int) -> DeviceArray:
+        """Return a vector of a basis."""
+        size = self._q.size
+        return basis[place * size : (place + 1) * size]
 
     def _expand(self, norm: float, tolerance: float, most: int) -> int:
         """Add vectors until the residual's estimate is small enough; return their number.
@@ -113,11 +177,7 @@ class GMRES:
         g[0] = norm
         for k in range(most):
             check_time()
-            # z = M W^(-1/2) v_k: the basis has weighted residuals.
-            wp.copy(
-                self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size
-            )
-            self._weigh(self._preconditioner.r, inverse=True)
+            self._before[k].run()
             self._preconditioner.apply()
             if k < KEPT:
                 wp.copy(
@@ -127,9 +187,11 @@ class GMRES:
                     count=self._q.size,
                 )
             self._product(self._preconditioner.z, self._q)
-            self._weigh(self._q)
             # Arnoldi: w = W^(1/2) A z, orthogonalized, is column k of H.
-            H[: k + 2, k] = self._orthogonalize(k + 1)
+            self._after[k].run()
+            found, products = self._sums.scalars.numpy(), self._products.numpy()
+            H[: k + 1, k] = products[: k + 1] + found[: k + 1]
+            H[k + 1, k] = np.sqrt(found[-1])
             self._rotate(k)
             if not abs(g[k + 1]) > tolerance:  # also if it is NaN
                 return k + 1
@@ -142,26 +204,6 @@ class GMRES:
         """
         if self._weight is not None:
             WEIGH.bind(rows_of(q), w=self._weight, q=q, inverse=inverse).launch()
-
-    def _orthogonalize(self, count: int) -> np.ndarray:
-        """Orthogonalize `_q` against the first vectors, twice, and store it.
-
-        It is stored as the next vector, normalized. Returns the column of H.
-        """
-        column = np.zeros(count)
-        for _ in range(2):
-            DOTS.bind(
-                rows_of(self._q),
-                basis=self._basis,
-                size=self._q.size,
-                count=count,
-                x=self._q,
-                out=self._sums.partials,
-            ).launch()
-            self._sums.add_up(0, columns=count)
-            self._combine(self._sums.scalars, self._q, count, sign=-1.0)
-            column += self._sums.scalars.numpy()[:count]
-        return np.asarray(np.r_[column, np.sqrt(self._stored(count)[-1])])
 
     def _combine(
         self,
@@ -188,8 +230,8 @@ class GMRES:
             sign=sign,
         )
 
-    def _stored(self, place: int) -> np.ndarray:
-        """Store `_q`, normalized, as a vector; return the sums."""
+    def _store(self, place: int) -> None:
+        """Store `_q`, normalized, as a vector."""
         STORE.bind(
             rows_of(self._q),
             basis=self._basis,
@@ -199,7 +241,6 @@ class GMRES:
             x=self._q,
             last=self._restart + 1,
         ).launch()
-        return np.asarray(self._sums.scalars.numpy())
 
     def _rotate(self, k: int) -> None:
         """Make column k of H upper triangular by the old rotations and a new one."""
@@ -227,13 +268,7 @@ class GMRES:
             if abs(H[k, k]) > 1e-14 * largest:
                 y[k] = (g[k] - H[k, k + 1 :] @ y[k + 1 : columns]) / H[k, k]
         self._factors.assign(y)
-        if columns <= KEPT:
-            self._combine(self._factors, self.x, columns, other_basis=self._images)
-            return
-        # x += M (V y), with one more application of M.
-        r = self._preconditioner.r
-        r.zero_()
-        self._combine(self._factors, r, columns)
-        self._weigh(r, inverse=True)
-        self._preconditioner.apply()
-        self._increase.launch()
+        self._ends[columns].run()
+        if columns > KEPT:  # x += M (V y), with one more application of M
+            self._preconditioner.apply()
+            self._increase.launch()

@@ -59,6 +59,7 @@ ORDINARY = 1e-100
 # vanish.
 RATIOS = 1e-6, 1e6
 ROWS = 32  # largest number of rows
+KEPT_BEGINNINGS = 2  # recorded starts of solves
 
 
 # A row is stored for each evaluation: NORM ... ENERGY, then these.
@@ -289,7 +290,7 @@ class DeviceIteration:
         # By the step's program, and whether the device rebuilds.
         self._loops: dict[tuple[int, bool], CommandBuffer] = {}
         self._resuming = LaunchGraph(device, self._launch_resumption)
-        self._beginning: SolveStart | None = None
+        self._beginnings: list[SolveStart] = []  # of the latest guesses and counts
 
     @staticmethod
     def suits(work: MultigridWorkspace) -> bool:
@@ -375,14 +376,13 @@ class DeviceIteration:
             criteria.atol,
             work.energy_monitor.noise,
         )
-        if self._beginning is None or not self._beginning.fits(guess, counted):
-            self._beginning = SolveStart(work, guess, counted, self._results, self._judge_first)
+        beginning = self._beginning_of(guess, counted)
         for number, value in zip(self._numbers, numbers, strict=True):
             number.value = value
         if work.A.device.is_cuda:
-            self._beginning.run_with(loop, self._going, renewed=renewed)
+            beginning.run_with(loop, self._going, renewed=renewed)
         else:
-            self._beginning.run()
+            beginning.run()
             if loop is not None:
                 loop.run_while(self._going)
         self._take_rows()
@@ -394,9 +394,7 @@ class DeviceIteration:
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = (
-            self._beginning.is_plain()
-            and math.isfinite(size)
-            and 4 * EPS * size < reference < math.inf
+            beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
         )
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
@@ -408,8 +406,20 @@ class DeviceIteration:
 
     def forget_guess(self) -> None:
         """Release the guess: the launches that begin from one are created again."""
-        self._beginning = None
+        self._beginnings.clear()
         self.rows.clear()
+
+    def _beginning_of(self, guess: DeviceArray, counted: DeviceArray | None) -> SolveStart:
+        """Return the launches of a guess and a count.
+
+        Those of the last two are kept: a step of thick liquid solves with two criteria.
+        """
+        for start in self._beginnings:
+            if start.fits(guess, counted):
+                return start
+        start = SolveStart(self._work, guess, counted, self._results, self._judge_first)
+        self._beginnings = [start, *self._beginnings[: KEPT_BEGINNINGS - 1]]
+        return start
 
     def _judge_first(self, counted: DeviceArray | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
