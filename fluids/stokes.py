@@ -348,7 +348,7 @@ class StokesSolve:
         """Launch the sums of u'M u and u'force, which `_read` returns."""
         level = self._equations.level
         for axis in range(self.grid.dimension):
-            self._take(
+            self._launch_reduction(
                 name,
                 self._kernels.energy,
                 axis,
@@ -358,7 +358,9 @@ class StokesSolve:
                 diagonal=level.diagonal[axis],
             )
 
-    def _take(self, name: str, kernel: StencilKernel, part: int, **arguments: object) -> None:
+    def _launch_reduction(
+        self, name: str, kernel: StencilKernel, part: int, **arguments: object
+    ) -> None:
         """Launch a kernel that reduces; `_read` returns its results."""
         tally = self._tallies.get((name, part))
         if tally is None:
@@ -497,7 +499,7 @@ class StokesSolve:
         multigrid.apply()
         cycle, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
         for axis in range(self.grid.dimension):
-            self._take(
+            self._launch_reduction(
                 "velocity_correction",
                 self._kernels.velocity_correction,
                 axis,
@@ -533,7 +535,7 @@ class StokesSolve:
             self._set_body_part(self.z, z_bodies)
             self._bodies.add_outflow(z_bodies, system.r, self._free_cells, sign=1.0)
         system.apply()
-        self._take(
+        self._launch_reduction(
             "correction",
             self._kernels.correction,
             0,
@@ -640,7 +642,7 @@ class StokesSolve:
         self._weight.zero_()
         if self._bodies is not None:
             walls = ViscousWalls(equations.distance, equations.slip, projection.kind, self._contact)
-            self._bodies.take(level, walls, velocity)
+            self._bodies.update(level, walls, velocity)
             self._set_body_part(self._weight, self._bodies.weights)
         for axis, weight in enumerate(self._components(self._weight)):
             window.run(
@@ -760,7 +762,7 @@ class StokesSolve:
         ux, uy, uz = three_components(velocity)
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
-        self._take(
+        self._launch_reduction(
             "divergence",
             self._kernels.divergence,
             0,
