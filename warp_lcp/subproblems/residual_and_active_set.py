@@ -207,7 +207,7 @@ class ResidualAndActiveSet(NaturalResidual):
     def store_evaluation(
         self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool
     ) -> float:
-        """Store the results of an evaluation, see `multigrid_ahead.keep_row`.
+        """Store the results of an evaluation, see `device_iteration.keep_row`.
 
         Returns the norm.
         """
