@@ -205,7 +205,8 @@ class Frames(Protocol):
 class FrameWriter:
     """Write frames on a thread of its own while the simulation continues.
 
-    At most WAITING frames are in memory. Errors are raised by every later call of `put`, `queue_files`,
+    At most WAITING frames are in memory.
+    Errors are raised by every later call of `put`, `queue_files`,
     `check` or `flush`, and nothing is written after an error. The end of the `with` block waits for
     queued frames, whatever ended the block, and raises only if nothing else did.
     """
