@@ -441,7 +441,7 @@ def replayed():
                 meter.update(counts)
 
     host_kernel.LaunchGraph = HostGraph
-    device_graph.noted = lambda device, event: None
+    device_graph.record_event = lambda device, event: None
     wp.is_conditional_graph_supported = lambda: True
     CommandBuffer._captured = lambda self, commands: list(commands)
     CommandBuffer._captured_loop = lambda self, condition: (

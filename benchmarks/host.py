@@ -111,7 +111,7 @@ class StageTimer:
         """Measure a stage."""
         return self.stage(name)
 
-    def wrote(self, name: str, *files: Path) -> None:
+    def add_file_sizes(self, name: str, *files: Path) -> None:
         """Do nothing: steps write no files."""
 
     def _switch(self) -> None:

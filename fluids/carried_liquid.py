@@ -48,7 +48,7 @@ class CarriedLiquid:
         self._body = np.full(1 + max(bodies.numbers), -1)
         self._body[bodies.numbers] = np.arange(count)
 
-    def take(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
+    def update(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
         """Compute G and g, and share the liquid's momentum with the bodies; collective.
 
         Args:

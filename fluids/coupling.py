@@ -109,7 +109,7 @@ class BodyCoupling:
         self._gathering.at_once = self.columns.comm is not None
         return wl.SumOperator(A, self._low)
 
-    def take(self, kind: wp.array) -> None:
+    def update(self, kind: wp.array) -> None:
         """Update U for the placed solids, and M^-1.
 
         Args:
@@ -234,7 +234,7 @@ class BodyCoupling:
             kind: int8 of AIR, FLUID, SOLID.
         """
         if self.carried is not None:
-            self.carried.take(velocity, kind)
+            self.carried.update(velocity, kind)
 
     def _block(self) -> tuple[list[int], list[int]] | None:
         """Return the first and last cell (x, y, z) beside moving solids; None without any."""

@@ -53,21 +53,21 @@ class Probe(Table):
         return tuple(f"{self.name}_{part}" for part in parts)
 
 
-def probe_complaints(
+def probe_errors(
     probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]
 ) -> list[CrossKeyError]:
     """Return errors of the probes in a domain of given sides [m] and gravity [m/s^2]."""
-    complaints = []
+    errors = []
     for index, probe in enumerate(probes):
         place = ("probe", index, "position")
         if len(probe.position) != len(size):
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     place, probe.position, f"must have {len(size)} entries, as domain.size has"
                 )
             )
         elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     place,
                     probe.position,
@@ -81,13 +81,13 @@ def probe_complaints(
                 f"is also the name of another probe of the {probe.quantity}: log columns "
                 "must differ"
             )
-            complaints.append(CrossKeyError(("probe", index, "name"), probe.name, message))
+            errors.append(CrossKeyError(("probe", index, "name"), probe.name, message))
         if probe.quantity == "level" and not any(gravity):
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("probe", index, "quantity"),
                     "level",
                     "needs gravity, along which it is measured",
                 )
             )
-    return complaints
+    return errors

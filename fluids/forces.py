@@ -78,7 +78,7 @@ class WallSums:
         )
         self._reserve(0)
 
-    def take(
+    def launch_sums(
         self,
         kernel: wp.Kernel,
         window: Window,
@@ -239,13 +239,13 @@ class SolidForces:
         for number, change in zip(self._kick, simulation.gravity * simulation.kick_dt, strict=True):
             number.value = float(change)
         self.add(
-            sums.take(
+            sums.launch_sums(
                 kernels.pressure_kernel, window, self.references, [*kernel_args, *self._kick, scale]
             )
         )
         if sums.grid.barriers is not None:
             thin = [simulation.boundary.touch, projection.pressure, *self._kick, scale]
-            self.add(sums.take(thin_pressure_kernel, window, self.references, thin))
+            self.add(sums.launch_sums(thin_pressure_kernel, window, self.references, thin))
 
     @staticmethod
     def push(bodies: RigidBodies, impulses: np.ndarray) -> None:

@@ -125,13 +125,13 @@ class Projection:
     found: Callable[[], tuple[float, float]]
 
     @functools.cached_property
-    def _found(self) -> tuple[float, float]:
+    def _release_counts(self) -> tuple[float, float]:
         return self.found()
 
     @property
     def released(self) -> int:
         """Number of wall cells where the liquid separates."""
-        return int(self._found[0])
+        return int(self._release_counts[0])
 
     @property
     def max_outflow(self) -> float:
@@ -139,7 +139,7 @@ class Projection:
 
         Recomputed from the projected velocities.
         """
-        return self._found[1]
+        return self._release_counts[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +325,7 @@ class PressureProjection:
             kick_dt: time that forces have acted on u* [s].
             window: cells that hold all FLUID cells; None for all cells.
         """
-        self._look(window)
+        self._restrict_to_window(window)
         self._everyone = None
         self._counting.run(variant=self._cells.near is None)
         self._count.changed()
@@ -356,7 +356,7 @@ class PressureProjection:
             jump=self.jump,
         )
 
-    def _look(self, window: Window | None) -> None:
+    def _restrict_to_window(self, window: Window | None) -> None:
         """Restrict the problem to the cells of a window, and clear those of the last one.
 
         On ranks the problem has all cells.
@@ -421,7 +421,7 @@ class PressureProjection:
             self._copying_faces.run()
         self._operator.update(self._kinds)
         if self.coupling is not None:
-            self.coupling.take(self._unknown)
+            self.coupling.update(self._unknown)
 
     @property
     def _faces(self) -> LiquidBoundary:
@@ -547,7 +547,7 @@ class PressureProjection:
         variant = window.near is None, self._cells.near is None, self.jump is None
         self._projection.run(velocity, window, result.x, variant=variant)
         self._contacts.changed()
-        return Projection(result, unknowns, self._found)
+        return Projection(result, unknowns, self._release_counts)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
         """Launch the projection: gradient, support of spray, contact of wall cells."""
@@ -714,14 +714,14 @@ class PressureProjection:
 
     def _accept(self, x: wp.array) -> None:
         """Store the solution of the problem, and show its cells in frames."""
-        self._take(x)
+        self._store_pressure(x)
         copy(self.cells, self.kind)
 
-    def _take(self, x: wp.array) -> None:
+    def _store_pressure(self, x: wp.array) -> None:
         """Store the solution of the problem as the pressure."""
         self.grid.part.store(x, self.pressure, self._guess)
 
-    def _found(self) -> tuple[float, float]:
+    def _release_counts(self) -> tuple[float, float]:
         """Return the number of released cells and the largest outflow of the others.
 
         They belong to the last projection; collective.
@@ -730,6 +730,6 @@ class PressureProjection:
         return float(every[:, 0].sum()), float(every[:, 1].max())
 
     def _found_here(self) -> tuple[float, float]:
-        """Return the result of `_found` for the cells of this process."""
+        """Return the result of `_release_counts` for the cells of this process."""
         released, worst = self._contacts.read()
         return released, worst

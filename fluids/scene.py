@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.fluids.drag_and_probe_tables import Probe, WallDragSettings, probe_complaints
+from warp_lcp.fluids.drag_and_probe_tables import Probe, WallDragSettings, probe_errors
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import SceneModel
 from warp_lcp.scene.scene import CrossKeyError, Liquid, Table
@@ -123,17 +123,17 @@ class LiquidScene(ParticleScene):
         """Return the key `liquid` and its shapes."""
         return "liquid", self.liquid
 
-    def complaints(self) -> list[CrossKeyError]:
+    def find_errors(self) -> list[CrossKeyError]:
         """Return errors that involve several keys."""
-        complaints = super().complaints()
+        errors = super().find_errors()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
             message = (
                 "cannot be combined with rigid bodies (their part of the matrix has only "
                 f"products); use {', '.join(COUPLED_METHODS)}"
             )
-            complaints.append(CrossKeyError(("solver", "method"), self.solver.method, message))
+            errors.append(CrossKeyError(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("pressure", "surface"),
                     "voxel",
@@ -146,23 +146,23 @@ class LiquidScene(ParticleScene):
                 'cannot be combined with pressure.model = "unilateral", whose liquid may '
                 "separate anywhere inside"
             )
-            complaints.append(CrossKeyError(("particles", "narrow_band"), None, message))
+            errors.append(CrossKeyError(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which computes how full cells are'
-            complaints.append(CrossKeyError(("particles", "narrow_band"), None, message))
+            errors.append(CrossKeyError(("particles", "narrow_band"), None, message))
         if self.surface_tension is not None and self.pressure.surface == "voxel":
             message = 'needs pressure.surface = "ghost-fluid", whose surface has a curvature'
-            complaints.append(CrossKeyError(("surface_tension",), None, message))
+            errors.append(CrossKeyError(("surface_tension",), None, message))
         if self.surface_tension is not None and self.pressure.model == "unilateral":
             message = (
                 'needs pressure.model = "incompressible": surface tension needs a pressure '
                 "that may be negative"
             )
-            complaints.append(CrossKeyError(("surface_tension",), None, message))
+            errors.append(CrossKeyError(("surface_tension",), None, message))
         return [
-            *complaints,
-            *self._viscosity_complaints(),
-            *probe_complaints(self.probe, self.domain.size, self.physics.gravity),
+            *errors,
+            *self._viscosity_errors(),
+            *probe_errors(self.probe, self.domain.size, self.physics.gravity),
         ]
 
     def notes(self) -> list[str]:
@@ -199,7 +199,7 @@ class LiquidScene(ParticleScene):
             notes += DRAG.notes(place, value)
         return notes
 
-    def _viscosity_complaints(self) -> list[CrossKeyError]:
+    def _viscosity_errors(self) -> list[CrossKeyError]:
         """Return errors of settings that need viscosity or exclude it."""
         if self.viscosity is not None and self.endless:
             return [CrossKeyError(("viscosity",), None, "cannot be combined with periodic axes")]
@@ -225,19 +225,17 @@ class LiquidScene(ParticleScene):
             (("domain", "wall"), self.domain.wall),
             *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid)),
         ]
-        complaints = [
-            CrossKeyError(place, wall, message) for place, wall in walls if wall == "sticky"
-        ]
+        errors = [CrossKeyError(place, wall, message) for place, wall in walls if wall == "sticky"]
         slips = [
             (n, solid.slip_length)
             for n, solid in enumerate(self.solid)
             if solid.slip_length is not None
         ]
-        complaints += [
+        errors += [
             CrossKeyError((key, n, "viscosity"), value, "needs the table [viscosity]")
             for key, n, value in own_settings
         ]
-        return complaints + [
+        return errors + [
             CrossKeyError(("solid", n, "slip_length"), slip, "needs the table [viscosity]")
             for n, slip in slips
         ]

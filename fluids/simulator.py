@@ -257,7 +257,7 @@ class LiquidSimulation(ParticleSimulation):
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.grid_to_particles(window, self.projection.kind, dt)
         if self.tension is not None:
-            self.tension.calm(self.particles, dt)
+            self.tension.damp_velocity_gradients(self.particles, dt)
         row = (
             self.move(dt, window, self.surface.density, self.projection.contact)
             | self.solve_row(projected.result)
@@ -447,7 +447,7 @@ class LiquidSimulation(ParticleSimulation):
         to the sum of both.
         """
         projection = self.projection
-        viscosity.keep(self.velocity)
+        viscosity.store_velocity(self.velocity)
         if self.stokes is not None:
             self.stokes.keep_start(self.velocity)
             if self.forces is not None:

@@ -384,7 +384,7 @@ class StokesSolve:
         """Launch the sums of u'M u and u'force, which `_read` returns."""
         level = self._equations.level
         for axis in range(self.grid.dimension):
-            self._take(
+            self._launch_reduction(
                 name,
                 self._kernels.energy,
                 axis,
@@ -394,7 +394,7 @@ class StokesSolve:
                 diagonal=level.diagonal[axis],
             )
 
-    def _take(self, name: str, kernel: StencilKernel, part: int, **arguments: object) -> None:
+    def _launch_reduction(self, name: str, kernel: StencilKernel, part: int, **arguments: object) -> None:
         """Launch a kernel that reduces; `_read` returns its results."""
         tally = self._tallies.get((name, part))
         if tally is None:
@@ -549,7 +549,7 @@ class StokesSolve:
         cycle.run()
         found, r, z = (self._components(v) for v in (multigrid.z, self.r, self.z))
         for axis in range(self.grid.dimension):
-            self._take(
+            self._launch_reduction(
                 "velocity_correction",
                 self._kernels.velocity_correction,
                 axis,
@@ -583,7 +583,7 @@ class StokesSolve:
             self._launch_right_side()
         cycle.run()
         system, shape = self._pressure, self.grid.shape
-        self._take(
+        self._launch_reduction(
             "correction",
             self._kernels.correction,
             0,
@@ -689,7 +689,7 @@ class StokesSolve:
         clear(self._weight, self._free)
         if self._bodies is not None:
             walls = ViscousWalls(equations.distance, equations.slip, projection.kind, self._contact)
-            self._bodies.take(equations.level, walls, velocity)
+            self._bodies.update(equations.level, walls, velocity)
             self._set_body_part(self._weight, self._bodies.weights)
         self._graphs["_launch_preconditioner_set_up"].run()
 
@@ -833,7 +833,7 @@ class StokesSolve:
         ux, uy, uz = three_components(velocity)
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
-        self._take(
+        self._launch_reduction(
             "divergence",
             self._kernels.divergence,
             0,

@@ -66,12 +66,12 @@ class StokesBodies:
         """Store V*."""
         self.start = self.velocities
 
-    def take(
+    def update(
         self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
     ) -> None:
         """Compute the coupling of a step."""
-        self._drag.take(level, walls, velocity)
-        self._flow.take(walls.kind)
+        self._drag.update(level, walls, velocity)
+        self._flow.update(walls.kind)
         self._flow.grow_entries()
         self._m, self._D = self._drag.factors()
         inverses = [body.inverse_mass(self._dimension) for body in self.bodies.bodies]

@@ -130,7 +130,7 @@ class SurfaceTension:
         shared = grid.part.shared  # then ranks exchange halos, and their particles change
         # Moving solids change the lists of wall cells.
         self._pushing = LaunchGraph(grid.device, self._push, at_once=shared or boundary.moves)
-        self._calming = LaunchGraph(grid.device, self._calm, at_once=shared)
+        self._calming = LaunchGraph(grid.device, self._launch_velocity_damping, at_once=shared)
         self._measuring = LaunchGraph(
             grid.device,
             lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares),
@@ -250,7 +250,7 @@ class SurfaceTension:
         self.grid.part.fill(self._bend)
         self._continue(self._bend, 0, 0.0)
 
-    def calm(self, particles: Particles, dt: float) -> None:
+    def damp_velocity_gradients(self, particles: Particles, dt: float) -> None:
         """Damp velocity gradients shorter than the filter on particles near the surface.
 
         Ripples shorter than the filter have no restoring force. Without damping they grow from the
@@ -266,8 +266,8 @@ class SurfaceTension:
         )
         self._calming.run(particles)
 
-    def _calm(self, particles: Particles) -> None:
-        """Launch the kernels of `calm`."""
+    def _launch_velocity_damping(self, particles: Particles) -> None:
+        """Launch the kernels of `damp_velocity_gradients`."""
         particles.number()
         for gradient in particles.affine:
             listed = [

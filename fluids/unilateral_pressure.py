@@ -167,7 +167,7 @@ class UnilateralPressure(PressureProjection):
         )
         if self._totals is not None:
             self._totals.changed()
-        return Projection(result, self.counted(), self._found)
+        return Projection(result, self.counted(), self._release_counts)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
         """Launch the projection and the contact of wall cells."""

@@ -168,7 +168,7 @@ class Viscosity:
 
     Attributes:
         change: change of each component in the last step [m/s].
-        before: saved velocity, see `keep` and `undo`.
+        before: saved velocity, see `store_velocity` and `undo`.
         relative: viscosity on the faces of each component, in units of `viscosity`, 0 without
             liquid; empty if all viscosities are equal.
     """
@@ -235,7 +235,7 @@ class Viscosity:
         self._box, self._above = ActiveWindow(grid.everywhere), ActiveWindow(grid.everywhere)
         self._unknowns, self._tau = ActiveWindow(self._inner), Scalar()
         launches = (
-            self._keep,
+            self._copy_velocity,
             self._set_up,
             self._residual,
             self._take_solution,
@@ -286,7 +286,7 @@ class Viscosity:
         self._placed = True
         fields = ViscousFields(velocity, kind, contact)
         if self._bodies is not None:
-            self._bodies.take(
+            self._bodies.update(
                 self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity
             )
             if self._bodies.moved:  # the recorded iteration has the old column addresses
@@ -387,7 +387,7 @@ class Viscosity:
             self._pull = ViscousWallCoupling(
                 self.grid, self.boundary, range(len(points)), len(points), self._passes
             )
-        self._pull.take(
+        self._pull.update(
             self._inner, self._fine, ViscousWalls(self._distance, self._slip, kind, contact), points
         )
         pulled, drags = self._pull.pulled(velocity, points)
@@ -484,9 +484,9 @@ class Viscosity:
         if self._bodies is not None:
             self._bodies.subtract(p, q, launch)
 
-    def keep(self, velocity: Sequence[wp.array]) -> None:
+    def store_velocity(self, velocity: Sequence[wp.array]) -> None:
         """Copy a velocity to `before`."""
-        self._graphs["_keep"].run(velocity)
+        self._graphs["_copy_velocity"].run(velocity)
 
     def keep_change(self) -> None:
         """Add the last solve's change to `before`.
@@ -499,7 +499,7 @@ class Viscosity:
         """Restore a velocity from `before`, plus the last step's change."""
         self._graphs["_undo"].run(velocity)
 
-    def _keep(self, velocity: Sequence[wp.array]) -> None:
+    def _copy_velocity(self, velocity: Sequence[wp.array]) -> None:
         for kept, u in zip(self.before, velocity, strict=True):
             copy(kept, u)
 
@@ -573,7 +573,7 @@ class Viscosity:
             scale=self._tau,
         )
         if self.grid.barriers is not None:
-            self._hold_apart(kind, contact)
+            self._cut_links_at_thin_solids(kind, contact)
         self.set_diagonals(kind, contact)
         self.multigrid.set_up()
 
@@ -592,7 +592,7 @@ class Viscosity:
                 thin=self._thin[axis],
             )
 
-    def _hold_apart(self, kind: wp.array, contact: wp.array) -> None:
+    def _cut_links_at_thin_solids(self, kind: wp.array, contact: wp.array) -> None:
         """Launch the kernels that cut links at thin solids, and link faces to the solids."""
         grid, fine, barriers = self.grid, self._fine, self.grid.barriers
         assert isinstance(self.boundary, CutBoundary), "thin solids are among cut cells"

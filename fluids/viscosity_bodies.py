@@ -79,7 +79,7 @@ class ViscousWallCoupling:
         self._owners = wp.array(owners, dtype=wp.int32, device=grid.device)
         self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
-    def take(
+    def update(
         self, window: Window | None, level: ViscosityLevel, walls: ViscousWalls, points: np.ndarray
     ) -> None:
         """Compute `rows`, `blocks` and `values`.
@@ -239,7 +239,7 @@ class BodyDrag:
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 
-    def take(
+    def update(
         self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
     ) -> None:
         """Compute the coefficients of a step, and the bodies' response to the liquid.
@@ -256,7 +256,7 @@ class BodyDrag:
         )
         window = None if block is None else self.grid.window(*block, grow=1).common(self._solved)
         points = np.array([body.position for body in bodies])
-        self._pull.take(window, level, walls, points)
+        self._pull.update(window, level, walls, points)
         pulled, drags = self._pull.pulled(velocity, points)
         if self.columns.comm is not None:
             found = self.columns.comm.sum(np.concatenate((pulled[:, None], drags), axis=1))

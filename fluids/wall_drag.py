@@ -66,7 +66,7 @@ class WallDrag:
         self._drag, self._dt = D, Scalar()
         self._slowing, self._keeping = (
             LaunchGraph(grid.device, self._slow_down),
-            LaunchGraph(grid.device, self._keep),
+            LaunchGraph(grid.device, self._launch_velocity_copy),
         )
 
     def act(
@@ -102,7 +102,7 @@ class WallDrag:
         impulses = np.zeros((sums.solids, 6))
         self._keeping.run(velocity)
         for given in self._given(sums, velocity, projection, phi, apply=False):
-            impulses += sums.take(drag_kernel, window, references, given)
+            impulses += sums.launch_sums(drag_kernel, window, references, given)
         return float(self._losses.numpy().sum()), impulses
 
     def _slow_down(
@@ -114,11 +114,11 @@ class WallDrag:
         phi: wp.array | None,
     ) -> None:
         """Launch the drag without the output of impulses."""
-        self._keep(velocity)
+        self._launch_velocity_copy(velocity)
         for given in self._given(sums, velocity, projection, phi, apply=True):
             sums.launch(drag_kernel, window, given)
 
-    def _keep(self, velocity: Sequence[wp.array]) -> None:
+    def _launch_velocity_copy(self, velocity: Sequence[wp.array]) -> None:
         """Launch copies of the velocity, and reset the losses."""
         for before, field in zip(self._before, velocity, strict=True):
             copy(before, field)

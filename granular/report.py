@@ -47,7 +47,7 @@ class SandReport:
         # With solids that cut cells, no face inside a solid is left unknown.
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)
 
-    def take(self, velocity: Sequence[wp.array]) -> None:
+    def write_outcome(self, velocity: Sequence[wp.array]) -> None:
         """Write the velocity after the stresses [m/s], `known` and `contact`; collective."""
         self._taking.run(velocity, variant=tuple(field.ptr for field in velocity))
         packing = self.stress.packing
@@ -86,7 +86,7 @@ class SandReport:
         Args:
             mass: mass of a full cell [kg; kg/m in 2-D].
         """
-        cells, yielded, taken, most = self._found()
+        cells, yielded, taken, most = self._read_sums()
         return {
             "yielded": yielded / max(cells, 1.0),
             "dissipation": taken * mass,
@@ -105,7 +105,7 @@ class SandReport:
             ratio=self.ratio,
         )
 
-    def _found(self) -> list[float]:
+    def _read_sums(self) -> list[float]:
         """Return the cells with shear, those yielding, the dissipation, the excess.
 
         The first two are counts; the excess is the largest one.

@@ -192,8 +192,8 @@ Sand = ShapeUnion[SandProperties]
 Solid = ShapeUnion[RoughProperties]
 
 
-def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[CrossKeyError]:
-    """Return the complaints whose condition is true.
+def _true_errors(rules: Iterable[tuple[object, str, object, str]]) -> list[CrossKeyError]:
+    """Return the errors whose condition is true.
 
     Each rule has a condition, the key, its value and the message.
     """
@@ -325,9 +325,9 @@ class SandScene(ParticleScene):
         """Return the friction coefficient of each solid's surface."""
         return self.wall_frictions()[1:]
 
-    def complaints(self) -> list[CrossKeyError]:
+    def find_errors(self) -> list[CrossKeyError]:
         """Return errors that involve several keys."""
-        complaints = super().complaints()
+        errors = super().find_errors()
         angles = [sand.friction_angle for sand in self.sand]
         cohesions = [sand.cohesion for sand in self.sand]
         for key, first, values in (
@@ -339,13 +339,8 @@ class SandScene(ParticleScene):
                     message = (
                         f"must be {first:g} as in the other [[sand]]: a scene has one material"
                     )
-                    complaints.append(CrossKeyError(("sand", number, key), value, message))
-        return (
-            complaints
-            + self._strength_complaints()
-            + self._rate_complaints()
-            + self._domain_complaints()
-        )
+                    errors.append(CrossKeyError(("sand", number, key), value, message))
+        return errors + self._strength_errors() + self._rate_errors() + self._domain_errors()
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""
@@ -380,7 +375,7 @@ class SandScene(ParticleScene):
             )
         return notes
 
-    def _strength_complaints(self) -> list[CrossKeyError]:
+    def _strength_errors(self) -> list[CrossKeyError]:
         material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))
         if material.tensile_strength > most:
             message = (
@@ -397,7 +392,7 @@ class SandScene(ParticleScene):
         return []
 
     def _too_steep(self) -> CrossKeyError:
-        """Return the complaint about a friction angle, at the key that sets it."""
+        """Return the error of a friction angle, at the key that sets it."""
         angle, message = self.friction_angle, self._at_most()
         number = next(
             (number for number, sand in enumerate(self.sand) if sand.friction_angle is not None),
@@ -428,13 +423,13 @@ class SandScene(ParticleScene):
             "cone would bear tension"
         )
 
-    def _rate_complaints(self) -> list[CrossKeyError]:
+    def _rate_errors(self) -> list[CrossKeyError]:
         """Return errors of friction that grows with the shear rate."""
         table, dynamic = self.friction, self.friction.dynamic_angle
         if dynamic is None:
             given = {"grain_size": table.grain_size, "inertial_number": table.inertial_number}
             message = "needs friction.dynamic_angle, which is missing"
-            return _found(
+            return _true_errors(
                 (value is not None, f"friction.{key}", value, message)
                 for key, value in given.items()
             )
@@ -447,7 +442,7 @@ class SandScene(ParticleScene):
             self._slope_of(dynamic) > STEEPEST[self.dimension],
         )
         missing = "must be given with friction.dynamic_angle: a length > 0 [m]"
-        return _found(
+        return _true_errors(
             [
                 (small, "friction.dynamic_angle", dynamic, above),
                 (
@@ -466,7 +461,7 @@ class SandScene(ParticleScene):
             ]
         )
 
-    def _domain_complaints(self) -> list[CrossKeyError]:
+    def _domain_errors(self) -> list[CrossKeyError]:
         """Return errors of periodic axes, rigid bodies and keys that sand lacks."""
         domain, method, closed, periodic = (
             self.domain,
@@ -491,7 +486,7 @@ class SandScene(ParticleScene):
             "friction = 0"
         )
         height, top = None if self.gauge is None else self.gauge.height, domain.size[1]
-        return _found(
+        return _true_errors(
             [
                 (
                     1 in closed,

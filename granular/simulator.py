@@ -229,7 +229,7 @@ class SandSimulation(ParticleSimulation):
         if self.sources is not None:
             self.sources.hold(self.velocity, [], self.packing.kind)
         self.grid_to_particles(window, self.packing.kind, dt)
-        below, most = self._mass_below(), self._most()
+        below, most = self._mass_below(), self._largest_fraction()
         row = self.move(dt, window, self.density) | self._measured()
         self._place_solids()
         runout, height = self._front()
@@ -485,7 +485,7 @@ class SandSimulation(ParticleSimulation):
             )
             raise missed_by_far("stress", solved.status, solved.iterations, left, JAMMED)
         with self.watch.stage("projection", *self.velocity):
-            self.outcome.take(self.velocity)
+            self.outcome.write_outcome(self.velocity)
             self._push_bodies(dt)
         try:
             self.solve_contacts()
@@ -602,7 +602,7 @@ class SandSimulation(ParticleSimulation):
         left = sum(int(row.get(name) or 0) for name in ("drained", "departed")) * self.particle_mass
         return (self._mass_below() - below + left) / dt
 
-    def _most(self) -> float:
+    def _largest_fraction(self) -> float:
         """Return the largest fraction of a cell, relative to the densest packing."""
         return self._largest([self.packing.densest])[0]
 

@@ -207,11 +207,11 @@ class MomentumWorkspace(StressWorkspace):
             return None
         self._device_iteration.begin(criteria.atol, steps)
         self._steps_counted = 0
-        reference = self._take(kernels.FIRST)
+        reference = self._read_residual(kernels.FIRST)
         self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None
         return reference
 
-    def _take(self, place: int) -> float:
+    def _read_residual(self, place: int) -> float:
         """Read a residual that the device has computed; return its norm."""
         assert self._device_iteration is not None
         sums = self._device_iteration.decisions()[place : place + 2]
@@ -220,7 +220,7 @@ class MomentumWorkspace(StressWorkspace):
 
     def evaluate(self, x: wp.array) -> float:
         """Return the norm of the natural residual; see the base class."""
-        return super().evaluate(x) if self._news is None else self._take(self._news)
+        return super().evaluate(x) if self._news is None else self._read_residual(self._news)
 
     def take_steps(self) -> tuple[int, bool, bool]:
         """Run steps; return their number, and two decisions.

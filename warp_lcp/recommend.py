@@ -201,7 +201,7 @@ def _within(advice: Recommendation, budget: Budget, problem: LCP) -> Recommendat
             None,
         )
         if lean is None:
-            advice = _said(
+            advice = _with_reason(
                 advice, f"No method fits into {budget.bytes} bytes; this one takes about {needs}."
             )
         else:
@@ -230,7 +230,7 @@ def _within(advice: Recommendation, budget: Budget, problem: LCP) -> Recommendat
                     f"{advice.name} would take {t.sweeps:.0f} of the {budget.iterations} steps "
                     f"allowed, {fewer.method} some {fewer.steps}."
                 )
-                advice = _said(_from_rule(fewer, t, advice.stopping.rtol), why)
+                advice = _with_reason(_from_rule(fewer, t, advice.stopping.rtol), why)
         advice = replace(
             advice, stopping=replace(advice.stopping, max_iterations=budget.iterations)
         )
@@ -246,12 +246,12 @@ def _in_time(advice: Recommendation, seconds: float, problem: LCP) -> Recommenda
     taken = _takes(advice.name, problem, steps=1)
     took = time.perf_counter() - start_time
     if taken and took <= seconds:
-        return _said(
+        return _with_reason(
             advice, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed."
         )
     start_time = time.perf_counter()
     if not advice.traits.takes("psor") or not _takes("psor", problem, steps=TRIAL):
-        return _said(
+        return _with_reason(
             advice,
             f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no "
             "sweep is possible here.",
@@ -279,7 +279,7 @@ def _takes(name: str, problem: LCP, *, steps: int = 0) -> bool:
     return True
 
 
-def _said(found: Recommendation, reason: str) -> Recommendation:
+def _with_reason(found: Recommendation, reason: str) -> Recommendation:
     return replace(found, reasons=(*found.reasons, reason))
 
 
@@ -298,4 +298,4 @@ def _instead(advice: Recommendation, name: str, reason: str) -> Recommendation:
         expected=None,
         attempts=attempts,
     )
-    return _said(changed, reason)
+    return _with_reason(changed, reason)

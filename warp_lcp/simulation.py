@@ -30,7 +30,7 @@ class Stopwatch(Protocol):
     def beside(self, name: str) -> AbstractContextManager[None]:
         """Return the context of work that another thread does at the same time."""
 
-    def wrote(self, name: str, *files: Path) -> None:
+    def add_file_sizes(self, name: str, *files: Path) -> None:
         """Add the sizes of files to a stage."""
 
 
@@ -48,7 +48,7 @@ class NoStopwatch:
         """Return a context that does nothing."""
         return NOTHING
 
-    def wrote(self, name: str, *files: Path) -> None:
+    def add_file_sizes(self, name: str, *files: Path) -> None:
         """Do nothing."""
 
 

@@ -210,7 +210,7 @@ def search_panel(axes: Any) -> None:
 
     slope = (merit(1e-7) - merit(0.0)) / 1e-7
     search = NonmonotoneSearch(memory=1)
-    search.remember(merit(0.0))
+    search.store_merit(merit(0.0))
     tried = list[float]()
 
     def trial(length: float) -> float:

@@ -805,7 +805,7 @@ def test_without_the_table_there_is_no_viscosity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("tables", "complaint"),
+    ("tables", "error"),
     [
         ({"wall": "sticky"}, "needs the table"),
         ({"solid": [box([0.1, 0.1], [0.2, 0.2], slip_length=0.1)]}, "needs the table"),
@@ -825,6 +825,6 @@ def test_without_the_table_there_is_no_viscosity() -> None:
         ),
     ],
 )
-def test_invalid_settings_are_refused(tables, complaint: str) -> None:
-    with pytest.raises(ValidationError, match=complaint):
+def test_invalid_settings_are_refused(tables, error: str) -> None:
+    with pytest.raises(ValidationError, match=error):
         scene(size=[1.0, 1.0], resolution=8, **{"liquid": [box([0.0, 0.0], [0.5, 0.5])], **tables})

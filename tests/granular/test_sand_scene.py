@@ -28,7 +28,7 @@ max = [1.0, 0.25]
 """
 
 
-def complaint(tmp_path: Any, *overrides: str) -> str:
+def error(tmp_path: Any, *overrides: str) -> str:
     """Return the message about a scene with these keys."""
     file = tmp_path / "pile.toml"
     file.write_text(FILE)
@@ -93,7 +93,7 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
     ],
 )
 def test_invalid_settings_are_refused(tmp_path: Any, overrides: str, expected: str) -> None:
-    assert expected in complaint(tmp_path, overrides)
+    assert expected in error(tmp_path, overrides)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_invalid_settings_are_refused(tmp_path: Any, overrides: str, expected: s
 def test_keys_that_contradict_each_other(
     tmp_path: Any, overrides: list[str], expected: str
 ) -> None:
-    assert expected in complaint(tmp_path, *overrides)
+    assert expected in error(tmp_path, *overrides)
 
 
 def test_sand_of_two_kinds_is_refused() -> None:

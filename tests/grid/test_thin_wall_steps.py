@@ -166,7 +166,7 @@ def test_paths_in_wedges_are_those_of_a_loop(seed):
     aims = points + rng.normal(0.0, 0.7 * CELL, points.shape)
     aims = np.clip(aims, KEPT, 1.0 - KEPT).astype(np.float32)
     position = wp.array(points, dtype=wp.vec3, device="cpu")
-    walls.remember(position)
+    walls.store_positions(position)
     position.assign(aims)
     walls.stop(position, still=True)
     ends, taken_back = [], []

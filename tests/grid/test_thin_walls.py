@@ -67,7 +67,7 @@ def thin_walls(g, shapes, motion=None):
 def flung(walls, points, ways, *, still=True, between=lambda: None):
     """Return the ends of particles that move by some ways, float64, shape (n, 3)."""
     position = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
-    walls.remember(position)
+    walls.store_positions(position)
     position.assign((points + ways).astype(np.float32))
     between()
     walls.stop(position, still=still)

@@ -81,7 +81,7 @@ def build(**tables: Any) -> GrainScene:
     return validate(GrainScene, data | {"domain": domain} | tables, "grains.toml")
 
 
-complaint = partial(scene_error, build)
+error = partial(scene_error, build)
 
 
 def test_own_tables_replace_the_general_ones() -> None:
@@ -123,8 +123,8 @@ def test_own_tables_replace_the_general_ones() -> None:
         ),
     ],
 )
-def test_complaints_name_its_keys(tables: dict[str, Any], expected: str) -> None:
-    assert complaint(**tables).startswith(f"grains.toml: {expected}")
+def test_errors_name_its_keys(tables: dict[str, Any], expected: str) -> None:
+    assert error(**tables).startswith(f"grains.toml: {expected}")
 
 
 def test_its_plan_counts_its_own_memory() -> None:

@@ -491,12 +491,12 @@ def test_a_side_of_an_axis_without_an_end_stops_the_run():
         open_sides=SIDES,
         velocity=np.array([1.0, 0.0, 0.0]),
     )
-    assert bodies.trouble([1.0, 1.0], (0,)) is None
+    assert bodies.stop_reason([1.0, 1.0], (0,)) is None
     run(bodies, 0.06)
-    assert bodies.trouble([1.0, 1.0], ()) is None
-    assert "periodic x axis" in bodies.trouble([1.0, 1.0], (0,))
+    assert bodies.stop_reason([1.0, 1.0], ()) is None
+    assert "periodic x axis" in bodies.stop_reason([1.0, 1.0], (0,))
     bodies.bodies.momentum[0, 0] = np.inf
-    assert "not finite" in bodies.trouble([1.0, 1.0], ())
+    assert "not finite" in bodies.stop_reason([1.0, 1.0], ())
 
 
 class SecondRank(SerialCommunicator):

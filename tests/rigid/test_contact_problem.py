@@ -159,7 +159,7 @@ def test_a_warm_start_uses_the_impulses_of_the_last_step():
     bodies = bodies_of(stack(2), 2)
     run(bodies, 0.2)
     touching = bodies._solve.find(bodies.time, 0.01, GRAVITY)
-    start = bodies._solve.memory.recall(touching, bodies.bodies)
+    start = bodies._solve.memory.initial_impulses(touching, bodies.bodies)
     weights = sum(body.properties.mass for body in bodies.bodies) * 9.81 * 0.01
     on_floor = touching.second == 3
     assert start[on_floor, 0].sum() == pytest.approx(weights, rel=1e-4)

@@ -106,7 +106,7 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
         memory.values = np.column_stack(
             [*ends, rng.standard_normal((m, 3)).round(1), rng.standard_normal((m, 3))]
         )
-        start, old = memory.recall(contacts, bodies), memory.values
+        start, old = memory.initial_impulses(contacts, bodies), memory.values
         places = [
             (p - bodies[i].position) @ bodies[i].rotation
             for p, i in zip(contacts.point, contacts.first, strict=True)

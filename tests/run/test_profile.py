@@ -43,7 +43,7 @@ def test_files_and_other_threads(tmp_path):
     (tmp_path / "x").write_bytes(bytes(100))
     with profile.beside("written"):
         pass
-    profile.wrote("written", tmp_path / "x", tmp_path / "x")
+    profile.add_file_sizes("written", tmp_path / "x", tmp_path / "x")
     assert profile.stages["written"].bytes == 200
     assert profile.stages["written"].beside
 
@@ -134,7 +134,7 @@ def test_without_a_profile_nothing_is_measured(monkeypatch, tmp_path):
     monkeypatch.setattr(time, "perf_counter", no_clock)
     watch = NoStopwatch()
     with watch.stage("a", None), watch.beside("b"):
-        watch.wrote("b", tmp_path / "not there")
+        watch.add_file_sizes("b", tmp_path / "not there")
     assert watch.stage("a") is watch.stage("b")
 
 

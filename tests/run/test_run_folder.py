@@ -220,7 +220,7 @@ def test_another_resolution_is_detected_from_the_checkpoint(folder, scene_file):
     finer = changed(folder, scene_file, "domain.resolution=16")
     assert finer.resume().resampled_from == 8
     # Killed here: scene.toml is new, the checkpoint is old.
-    finer.go_on(RunRecord("dots", "dots", "cpu"), 8)
+    finer.prepare_continuation(RunRecord("dots", "dots", "cpu"), 8)
     assert finer.resume().resampled_from == 8
 
 
@@ -292,7 +292,7 @@ def test_resuming_removes_unfinished_files(folder):
             "frames/grid_000001.vtu",
         ],
     )
-    folder.go_on(RunRecord("dots", "dots", "cpu"), 8)
+    folder.prepare_continuation(RunRecord("dots", "dots", "cpu"), 8)
     assert [path.name for path in folder.path.rglob(".*")] == [SPARE]
     assert sorted(path.name for path in folder.checkpoints.folder.iterdir()) == [
         "refused_000012.npz",

@@ -19,7 +19,7 @@ from warp_lcp.cli import commands as cli
 from warp_lcp.files.size_limits import one_line, visible
 from warp_lcp.run import folder as run_folder
 from warp_lcp.run.progress import ProgressLines
-from warp_lcp.run.terminal import Terminal, say
+from warp_lcp.run.terminal import Terminal, print_text
 from warp_lcp.scene.scene_file import load_scene
 
 FORGED = "finished: frame 4 of 4 reached"
@@ -195,7 +195,7 @@ def test_colors_and_bars_of_our_own_reach_the_terminal(capsys):
     table = Table("[bold]one\x1b[2J")
     table.add_row("\x9bA")
     console.print(table)
-    say(console, "\x1b]0;x\x07")
+    print_text(console, "\x1b]0;x\x07")
     written = capsys.readouterr().out
     assert "\x1b[1m" in written
     assert "\x1b[2J" not in written

@@ -28,7 +28,7 @@ def build(motion: object, dimension: int = 2, solids: str = "cut-cell") -> Scene
     return validate(Scene, data, "dam.toml")
 
 
-complaint = partial(scene_error, build)
+error = partial(scene_error, build)
 
 
 def place(motion: dict, time: float, point: list[float]) -> list[float]:
@@ -199,7 +199,7 @@ def test_motions_become_poses(motion, time, point, expected):
     ],
 )
 def test_refused_motions(motion, expected):
-    assert complaint(motion).startswith(f"dam.toml: solid[0].motion{expected}")
+    assert error(motion).startswith(f"dam.toml: solid[0].motion{expected}")
 
 
 @pytest.mark.parametrize(
@@ -230,11 +230,11 @@ def test_refused_motions(motion, expected):
     ],
 )
 def test_refused_motions_in_space(motion, expected):
-    assert complaint(motion, dimension=3).startswith(f"dam.toml: solid[0].motion{expected}")
+    assert error(motion, dimension=3).startswith(f"dam.toml: solid[0].motion{expected}")
 
 
 def test_solids_of_whole_cells_do_not_move():
-    text = complaint({"kind": "translation", "velocity": [1.0, 0.0]}, solids="voxel")
+    text = error({"kind": "translation", "velocity": [1.0, 0.0]}, solids="voxel")
     assert (
         text
         == 'dam.toml: solid[0].motion: needs domain.solids = "cut-cell": solids that fill whole '

@@ -32,7 +32,7 @@ def build(changes: dict[str, Any]) -> Scene:
     return validate(Scene, data, "dam.toml")
 
 
-complaint = partial(scene_error, build)
+error = partial(scene_error, build)
 
 
 def test_defaults_and_derived_numbers():
@@ -117,7 +117,7 @@ def test_frame_times_end_with_the_run():
     ],
 )
 def test_refused_values_name_key_value_and_what_is_allowed(changes, expected):
-    assert complaint(changes).startswith(f"dam.toml: {expected}")
+    assert error(changes).startswith(f"dam.toml: {expected}")
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_refused_values_name_key_value_and_what_is_allowed(changes, expected):
     ],
 )
 def test_unknown_keys_suggest(changes, expected):
-    assert complaint(changes) == f"dam.toml: {expected}"
+    assert error(changes) == f"dam.toml: {expected}"
 
 
 @pytest.mark.parametrize(
@@ -149,14 +149,14 @@ def test_unknown_keys_suggest(changes, expected):
     ],
 )
 def test_keys_of_another_simulator_are_no_typo(changes, path):
-    assert complaint(changes) == f'dam.toml: {path}: needs scene.simulator = "granular"'
+    assert error(changes) == f'dam.toml: {path}: needs scene.simulator = "granular"'
 
 
 def test_unsupported_features_may_be_set_to_off():
     scene = build({"domain.periodic": [False, False]})
     assert scene.domain.periodic == [False, False]
     assert (
-        complaint({"domain.periodic": [False]})
+        error({"domain.periodic": [False]})
         == "dam.toml: domain.periodic = [false]: must have 2 entries"
     )
 
@@ -212,11 +212,11 @@ def test_all_errors_are_listed():
     ],
 )
 def test_refused_shapes(shape, expected):
-    assert complaint({"solid": [shape]}).startswith(f"dam.toml: {expected}")
+    assert error({"solid": [shape]}).startswith(f"dam.toml: {expected}")
 
 
 def test_an_array_of_tables_is_asked_for():
-    assert "must be an array of tables, written [[solid]]" in complaint({"solid": BOX})
+    assert "must be an array of tables, written [[solid]]" in error({"solid": BOX})
 
 
 def test_angles_are_numbers_or_lists():
@@ -243,8 +243,8 @@ def test_enclosed_volume_counts_what_is_inside_the_domain():
     )
     volumes = [scene.enclosed_volume(solid) for solid in scene.solid]
     assert volumes == pytest.approx([0.08, 0.0, 1.28])
-    complaints = scene.shape_complaints("liquid", scene.solid, inside=True)
-    assert [complaint.place for complaint in complaints] == [("liquid", 1)]
+    errors = scene.shape_errors("liquid", scene.solid, inside=True)
+    assert [error.place for error in errors] == [("liquid", 1)]
 
 
 def test_shapes_become_geometry_in_place():

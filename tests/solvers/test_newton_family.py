@@ -352,7 +352,7 @@ def test_levenberg_marquardt_steps_lower_the_residual_from_anywhere():
         for _ in range(10):
             before = high * rng.random(n)
             work.x.assign(before)
-            assert work.system.damped.take(work.x, work.residual)
+            assert work.system.damped.take_shortest_step(work.x, work.residual)
             own = [natural_residual(A, b, np.zeros(n), high, x) for x in (before, work.x.numpy())]
             assert own[1] < own[0]
 
@@ -401,11 +401,11 @@ def test_units_of_x_do_not_matter():
 
 def test_nonmonotone_search_remembers():
     search = NonmonotoneSearch(memory=2)
-    search.remember(9.0)
-    search.remember(1.0)
+    search.store_merit(9.0)
+    search.store_merit(1.0)
     # Above the last merit, below the largest of two.
     assert search.search(lambda t: 5.0, -1e-3) == (1.0, 5.0)
-    search.remember(5.0)
+    search.store_merit(5.0)
     assert search.search(lambda t: 6.0, -1e-3)[0] == 0.0
     assert search.search(lambda t: 4.0 if t < 0.3 else float("nan"), -1e-3)[0] == 0.25
 

@@ -36,7 +36,7 @@ from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profiler
 from warp_lcp.run.progress import ProgressBar, ProgressLines
-from warp_lcp.run.terminal import CommandGroup, Terminal, say, table_lines, tell
+from warp_lcp.run.terminal import CommandGroup, Terminal, print_lines, print_text, table_lines
 from warp_lcp.run.trial import step_seconds
 from warp_lcp.run.tune import FRAMES, TuningResult, tune, write_tuned
 from warp_lcp.scene.presets import PresetName
@@ -138,7 +138,7 @@ ForceMemory = Annotated[
 
 def _print_version(asked: bool) -> None:
     if asked:
-        tell(versions()["warp-lcp"])
+        print_lines(versions()["warp-lcp"])
         raise typer.Exit
 
 
@@ -240,9 +240,9 @@ def run(
         loaded = launcher.load(scene, overrides or (), options)
         chosen_device, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
-        say(console, f"{name} on {launcher.place(chosen_device)}, into {folder}")
+        print_text(console, f"{name} on {launcher.place(chosen_device)}, into {folder}")
         if loaded.kept:
-            say(console, f"earlier --set values: {', '.join(loaded.kept)}")
+            print_text(console, f"earlier --set values: {', '.join(loaded.kept)}")
         request = RunRequest(
             scene=loaded.scene,
             out=folder,
@@ -261,7 +261,7 @@ def run(
 
         if window:
             check_window(folder)
-        stop = Interruption(partial(say, console), at_once=at_once, last=last)
+        stop = Interruption(partial(print_text, console), at_once=at_once, last=last)
         with (
             stop,
             ProgressBar(console) if console.is_terminal else ProgressLines(console) as observer,
@@ -274,7 +274,7 @@ def run(
     if not launcher.is_root:
         raise typer.Exit(0 if record.status == "finished" else FAILED)
     if watch:
-        tell(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds))
+        print_lines(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds))
     _report(record, folder)
 
 
@@ -363,7 +363,7 @@ def tune_scene(
                 accuracy=accuracy,
                 device=chosen_device,
                 frames=frames,
-                say=partial(say, Terminal(stderr=True)),
+                say=partial(print_text, Terminal(stderr=True)),
             )
         except (StepFailed, SimulationFailed) as error:
             end(str(error), FAILED)
@@ -396,7 +396,9 @@ def schema(
             f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}",
             WRONG_INPUT,
         )
-    tell(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
+    print_lines(
+        json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2)
+    )
 
 
 @app.command()
@@ -509,11 +511,11 @@ def solve(
     if not launcher.is_root:
         raise typer.Exit(0 if outcome.result else FAILED)
     console = Terminal(soft_wrap=True, highlight=False)
-    say(console, outcome.heading())
+    print_text(console, outcome.heading())
     console.print(outcome.table())
     if not outcome.result:
         end(outcome.ending(), FAILED)
-    say(console, outcome.ending())
+    print_text(console, outcome.ending())
 
 
 @app.command()
@@ -590,13 +592,13 @@ def bench(
         )
     try:
         if compare is not None:
-            tell(installed[suite].compare(*compare))
+            print_lines(installed[suite].compare(*compare))
             return
         options: Tables = ({"scene": scene} if scene else {}) | (
             {} if seed is None else {"seed": seed}
         )
         if not shared:  # called on every rank
-            tell(f"{suite}: takes about {installed[suite].takes}", error=True)
+            print_lines(f"{suite}: takes about {installed[suite].takes}", error=True)
         files = installed[suite].run(
             device=chosen_device,
             out=out,
@@ -611,7 +613,7 @@ def bench(
     except RuntimeError as error:
         end(str(error), FAILED)
     for file in files:
-        tell(file)
+        print_lines(file)
 
 
 @app.command()
@@ -644,31 +646,33 @@ def _use_threads(count: int | None) -> None:
 def _print_tuning(tuning: TuningResult, accuracy: str, device: str) -> None:
     """Print the measurements and the fastest settings."""
     rows = tuning.rows()
-    tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
-    tell(
+    print_lines(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
+    print_lines(
         f"{tuning.frames} frames on {device}; distance: displaced fraction of the mass; reference: "
         f"{tuning.reference.steps} steps"
     )
     for line in tuning.verdict(accuracy):
-        tell(line)
+        print_lines(line)
 
 
 def _print_pairs(pairs: list[tuple[str, str]]) -> None:
     for word, line in pairs:
-        tell(f"{word:<20}  {line}")
+        print_lines(f"{word:<20}  {line}")
 
 
 def _report(record: RunRecord, folder: Path) -> None:
     """Print the exit status of a run."""
     summary = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
     if record.status == "finished" and record.steps and record.resumed_from_step == record.steps:
-        tell(
+        print_lines(
             f"finished earlier, nothing to do: {record.reason}; {record.steps} steps, "
             f"{record.time:.6g} s simulated, in {folder}"
         )
         return
     if record.status == "finished":
-        tell(f"finished: {record.reason}; {summary}; ParaView opens the .pvd files in {folder}")
+        print_lines(
+            f"finished: {record.reason}; {summary}; ParaView opens the .pvd files in {folder}"
+        )
         return
     message = (
         f"{record.status}: {record.reason}\n{summary}; frames 0 to {record.frames} are in {folder}"

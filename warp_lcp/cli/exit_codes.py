@@ -11,7 +11,7 @@ from typing import NoReturn, TextIO
 import typer
 
 from warp_lcp.run.interruption import RunInterrupted
-from warp_lcp.run.terminal import tell
+from warp_lcp.run.terminal import print_lines
 from warp_lcp.scene.renamed_keys import RenamedKeyWarning
 from warp_lcp.simulation import InputError
 
@@ -52,12 +52,12 @@ def _show_renamed_keys(
 ) -> None:
     """Print a warning about a renamed key as one line; others as Python does."""
     if issubclass(category, RenamedKeyWarning):
-        tell(str(message), error=True)
+        print_lines(str(message), error=True)
     else:
         _SHOW(message, category, filename, lineno, file, line)
 
 
 def end(message: str, code: int) -> NoReturn:
     """Print a message and exit with a code."""
-    tell(message, error=True)
+    print_lines(message, error=True)
     raise typer.Exit(code)

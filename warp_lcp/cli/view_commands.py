@@ -33,7 +33,7 @@ from warp_lcp.render.render import ImageStyle, film_run, parse_size, render_run
 from warp_lcp.run.devices import devices
 from warp_lcp.run.log import Value
 from warp_lcp.run.progress import Observer, ProgressCounter
-from warp_lcp.run.terminal import Terminal, say, tell
+from warp_lcp.run.terminal import Terminal, print_lines, print_text
 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Run folder.")]
 ShowOption = Annotated[
@@ -150,7 +150,7 @@ def render(
     console = Terminal(stderr=True)
 
     def estimated(seconds: float) -> None:
-        say(
+        print_text(
             console,
             "drawing takes about "
             f"{timedelta(seconds=math.ceil(seconds))}"
@@ -186,10 +186,10 @@ def render(
                     out=out,
                     on_progress=counter,
                     estimated=estimated,
-                    noted=partial(say, console),
+                    noted=partial(print_text, console),
                 )
             )
-            tell(f"{film}: {len(images)} frames" if film else _listed(images))
+            print_lines(f"{film}: {len(images)} frames" if film else _listed(images))
             return
         if samples is not None or shutter is not None:
             raise RenderError(
@@ -216,7 +216,7 @@ def render(
                     )
                 )
             )
-            tell(f"{film}: {count} frames")
+            print_lines(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: needs --film")
@@ -231,7 +231,7 @@ def render(
                 estimated=estimated,
             )
         )
-    tell(_listed(images))
+    print_lines(_listed(images))
 
 
 def refuse_quick_options(**options: bool) -> None:
@@ -288,7 +288,7 @@ def serve(
             )
         server = live_server(folder, port=port, show=show)
     with server:
-        tell(f"{folder}: {server.address}  (Ctrl-C ends)")
+        print_lines(f"{folder}: {server.address}  (Ctrl-C ends)")
         with suppress(KeyboardInterrupt):
             server.serve_forever()
 
@@ -324,7 +324,7 @@ def export(
         count = len(
             list(export_run(folder, out, show=show, first=first, last=last, on_progress=told))
         )
-    tell(f"{out}: {count} frames")
+    print_lines(f"{out}: {count} frames")
 
 
 class _StartObserver:

@@ -91,12 +91,12 @@ class JointTable(Table):
         default=None, description="largest torque of the motor [N m]"
     )
 
-    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int, solids: Sequence[SolidProperties]) -> list[CrossKeyError]:
         """Return errors of the joint among these solids in 2 or 3 dimensions."""
-        complaints, hinge = [], self.kind == "hinge"
+        errors, hinge = [], self.kind == "hinge"
         for number in self.solids:
             if not 0 <= number < len(solids):
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("solids",),
                         self.solids,
@@ -104,15 +104,15 @@ class JointTable(Table):
                     )
                 )
             elif solids[number].motion is not None:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("solids",),
                         self.solids,
                         f"solid[{number}] has a motion: bodies can be joined only to a fixed solid",
                     )
                 )
-        if not complaints and not solids[self.solids[0]].is_body:
-            complaints.append(
+        if not errors and not solids[self.solids[0]].is_body:
+            errors.append(
                 CrossKeyError(
                     ("solids",),
                     self.solids,
@@ -120,43 +120,43 @@ class JointTable(Table):
                 )
             )
         if len(set(self.solids)) < len(self.solids):
-            complaints.append(CrossKeyError(("solids",), self.solids, "must differ"))
+            errors.append(CrossKeyError(("solids",), self.solids, "must differ"))
         for key in ("anchor", "axis"):
             value = getattr(self, key)
             if value is not None and len(value) != dimension:
-                complaints.append(
+                errors.append(
                     CrossKeyError((key,), value, f"must {counted(dimension)} in {dimension}-D")
                 )
         for key in ("axis", "limits", "motor_speed", "motor_torque"):
             if not hinge and getattr(self, key) is not None:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         (key,), getattr(self, key), f"is only for hinges: this joint is {self.kind}"
                     )
                 )
         if (self.motor_speed is None) != (self.motor_torque is None):
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("motor_torque",), self.motor_torque, "must be given together with motor_speed"
                 )
             )
         if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero"
                 )
             )
         if hinge and dimension == 2 and self.axis is not None:
-            complaints.append(
+            errors.append(
                 CrossKeyError(("axis",), self.axis, "must be left out in 2-D, where it is z")
             )
         if self.kind == "ball" and dimension == 2:
-            complaints.append(CrossKeyError(("kind",), self.kind, "must be hinge in 2-D"))
+            errors.append(CrossKeyError(("kind",), self.kind, "must be hinge in 2-D"))
         if self.limits is not None and not -180.0 <= self.limits[0] <= self.limits[1] <= 180.0:
-            complaints.append(
+            errors.append(
                 CrossKeyError(("limits",), self.limits, "must be in order and within 180 degrees")
             )
-        return complaints
+        return errors
 
     def to_joint(self, bodies: Sequence[int]) -> Joint:
         """Return the joint.
@@ -189,11 +189,11 @@ class TargetTable(Table):
         min_length=1, description="its places at these times [m], straight lines between"
     )
 
-    def complaints(self, dimension: int, solids: Sequence[SolidProperties]) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int, solids: Sequence[SolidProperties]) -> list[CrossKeyError]:
         """Return errors of the target among these solids in 2 or 3 dimensions."""
-        complaints = []
+        errors = []
         if self.solid >= len(solids) or not solids[self.solid].is_body:
-            complaints.append(
+            errors.append(
                 CrossKeyError(("solid",), self.solid, "must be the number of a rigid body")
             )
         for place, value in [
@@ -201,20 +201,20 @@ class TargetTable(Table):
             *((("places", index), row) for index, row in enumerate(self.places)),
         ]:
             if len(value) != dimension:
-                complaints.append(
+                errors.append(
                     CrossKeyError(place, value, f"must {counted(dimension)} in {dimension}-D")
                 )
         if not (np.diff(self.times) > 0.0).all():
-            complaints.append(CrossKeyError(("times",), self.times, "must increase"))
+            errors.append(CrossKeyError(("times",), self.times, "must increase"))
         if len(self.places) != len(self.times):
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("places",),
                     self.places,
                     f"must have {len(self.times)} entries, one for each time",
                 )
             )
-        return complaints
+        return errors
 
 
 class ContactScene(Scene):
@@ -264,20 +264,18 @@ class ContactScene(Scene):
             for table, of in rows
         ]
 
-    def complaints(self) -> list[CrossKeyError]:
+    def find_errors(self) -> list[CrossKeyError]:
         """Return errors that involve several keys."""
-        complaints = super().complaints()
+        errors = super().find_errors()
         if not any(solid.is_body for solid in self.solid):
-            complaints.append(
+            errors.append(
                 CrossKeyError(("solid",), None, "has no rigid body: give one a density or a mass")
             )
         for key in ("particles", "grid", "surface", "volume", "forces"):
             if getattr(self.output, key):
-                complaints.append(
-                    CrossKeyError(("output", key), True, f"must be false: {NO_MATERIAL}")
-                )
+                errors.append(CrossKeyError(("output", key), True, f"must be false: {NO_MATERIAL}"))
         if self.physics.density != type(self.physics).model_fields["density"].default:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("physics", "density"),
                     self.physics.density,
@@ -286,7 +284,7 @@ class ContactScene(Scene):
             )
         for key, usual in (("wall", "separating"), ("solids", "cut-cell"), ("follow", True)):
             if getattr(self.domain, key) != usual:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("domain", key),
                         getattr(self.domain, key),
@@ -294,7 +292,7 @@ class ContactScene(Scene):
                     )
                 )
         if self.solver.preset is not None:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("solver", "preset"),
                     self.solver.preset,
@@ -302,7 +300,7 @@ class ContactScene(Scene):
                 )
             )
         if self.solver.precision != "double":
-            complaints.append(
+            errors.append(
                 CrossKeyError(("solver", "precision"), self.solver.precision, "must be double")
             )
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
@@ -315,70 +313,68 @@ class ContactScene(Scene):
                 f"is only for the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} "
                 f"{incompatible}"
             )
-            complaints.append(
-                CrossKeyError(("solver", "directions"), self.solver.directions, message)
-            )
+            errors.append(CrossKeyError(("solver", "directions"), self.solver.directions, message))
         return (
-            complaints
-            + (self._joint_complaints() if self.joint else [])
-            + (self._target_complaints() if self.target else [])
+            errors
+            + (self._joint_errors() if self.joint else [])
+            + (self._target_errors() if self.target else [])
         )
 
-    def _target_complaints(self) -> list[CrossKeyError]:
+    def _target_errors(self) -> list[CrossKeyError]:
         """Return errors of targets and of the bodies that they move."""
-        complaints = [
+        errors = [
             CrossKeyError(("target", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.target)
-            for c in table.complaints(self.dimension, self.solid)
+            for c in table.find_errors(self.dimension, self.solid)
         ]
         if self.solver.method not in KINEMATIC:
             message = f"cannot be used for inverse kinematics; choose from {', '.join(KINEMATIC)}"
-            complaints.append(CrossKeyError(("solver", "method"), self.solver.method, message))
+            errors.append(CrossKeyError(("solver", "method"), self.solver.method, message))
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("joint", index, "motor_torque"),
                         table.motor_torque,
                         "must be left out: targets move the bodies",
                     )
                 )
-        if not complaints and not self._joint_complaints():
+        if not errors and not self._joint_errors():
             try:
                 tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
             except ValueError as error:
-                complaints.append(CrossKeyError(("target",), None, str(error)))
-        return complaints
+                errors.append(CrossKeyError(("target",), None, str(error)))
+        return errors
 
-    def _joint_complaints(self) -> list[CrossKeyError]:
+    def _joint_errors(self) -> list[CrossKeyError]:
         """Return errors of joints, and of keys that exclude joints."""
-        complaints = [
+        errors = [
             CrossKeyError(("joint", index, *c.place), c.value, c.message)
             for index, table in enumerate(self.joint)
-            for c in table.complaints(self.dimension, self.solid)
+            for c in table.find_errors(self.dimension, self.solid)
         ]
         if self.solver.method in (DEFAULT, *CONE):
             message = (
                 "cannot solve joints, which are equations; choose from "
                 f"{', '.join((*BOXED, *STEWART_TRINKLE))}"
             )
-            complaints.append(CrossKeyError(("solver", "method"), self.solver.method, message))
+            errors.append(CrossKeyError(("solver", "method"), self.solver.method, message))
         if self.domain.open:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("domain", "open"), self.domain.open, "must be left out in a scene with joints"
                 )
             )
         for index, solid in enumerate(self.solid):
             if solid.restitution:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("solid", index, "restitution"),
                         solid.restitution,
                         "must be 0 where there are joints",
                     )
                 )
-        return complaints
+        return errors
 
     def plan(self) -> list[tuple[str, str]]:
         """Return a summary of the run."""

@@ -76,7 +76,7 @@ class ContactSimulation:
             status = self._method.status.name  # before the solve for overlaps
         with self.watch.stage("motion"):
             self.bodies.end_step(dt)
-        if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
+        if trouble := self.bodies.stop_reason(self.scene.domain.size, self.scene.endless):
             raise SimulationFailed(f"step {self.step_count + 1}: {trouble}")
         self.bodies.leave()
         self.time, self.step_count, self._last_dt = self.time + dt, self.step_count + 1, dt

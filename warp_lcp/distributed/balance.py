@@ -125,12 +125,12 @@ class WorkLoad:
         )
         for place, other in enumerate(other_axes, start=1):
             material = np.diff(
-                _through(material, place).take(
+                _prefix_sums(material, place).take(
                     -(-np.cumsum([0, *cut[other]]) // self.edge), axis=place
                 ),
                 axis=place,
             )
-        through = _through(material.reshape(len(material), -1), 0)
+        through = _prefix_sums(material.reshape(len(material), -1), 0)
         thick = ends[None] - ends[:, None]
         seen = (
             OPEN
@@ -155,7 +155,7 @@ class WorkLoad:
         return float(most[-1]), [b - a for a, b in itertools.pairwise(cuts)]
 
 
-def _through(material: np.ndarray, axis: int) -> np.ndarray:
+def _prefix_sums(material: np.ndarray, axis: int) -> np.ndarray:
     """Return sums along an axis from its start up to each block's."""
     return np.insert(np.cumsum(material, axis=axis), 0, 0.0, axis=axis)
 

@@ -144,7 +144,7 @@ class Collective:
                 the rank.
         """
         failure = self._failure(error)
-        found = self._meet(error, failure)
+        found = self._gather_outcomes(error, failure)
         self._depth -= 1
         if self.ranks.size == 1:
             self.failed = [] if failure is None else [0]
@@ -175,7 +175,7 @@ class Collective:
         errno = error.errno if isinstance(error, OSError) else None
         return RankException(kind, text, errno, planned, error is self._raised)
 
-    def _meet(
+    def _gather_outcomes(
         self, error: BaseException | None, failure: RankException | None
     ) -> list[RankException | None]:
         """Gather the outcome of a block on every rank."""

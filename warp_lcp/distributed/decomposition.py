@@ -132,7 +132,7 @@ class Decomposition:
         each = [(0, n, -n) if axis in axes else (0,) for axis, n in enumerate(self.counts)]
         return [(x, y, z) for x in each[0] for y in each[1] for z in each[2]]
 
-    def meet(self, box: CellBox, other: CellBox) -> bool:
+    def boxes_overlap(self, box: CellBox, other: CellBox) -> bool:
         """Return whether two boxes share cells, periodic images included."""
         return any(box.moved(shift).common(other).cells for shift in self._shifts(self.periodic))
 
@@ -324,7 +324,7 @@ def balanced_processes(
     for p in cuttings(counts, size):
         cuts = [parts(n, a) for n, a in zip(counts, p, strict=True)]
         if all(len(cut) == 1 or min(cut) >= layers for cut in cuts):
-            found.append((sum(_most_work(counts, cuts, layers, state) for state in states), p))
+            found.append((sum(_largest_work(counts, cuts, layers, state) for state in states), p))
     return min(found)[1] if found else None
 
 
@@ -350,7 +350,7 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
     return low, high
 
 
-def _most_work(
+def _largest_work(
     counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]
 ) -> float:
     """Return the work of the busiest rank, in cells full of material."""

@@ -33,14 +33,14 @@ def check_shared(
         ValueError: the message names the key and what is allowed; on all ranks.
     """
     ranks.agree("the scene", scene.model_dump(mode="json"))
-    complaints = [f"{key} {NOT_ON_RANKS}" for key in refused]
+    errors = [f"{key} {NOT_ON_RANKS}" for key in refused]
     if scene.solver.method not in methods:
-        complaints.append(
+        errors.append(
             f"solver.method = {scene.solver.method} works on one process only (without --engine "
             f"petsc): {' or '.join(methods)}"
         )
-    if complaints:
-        raise ValueError("; ".join(complaints))
+    if errors:
+        raise ValueError("; ".join(errors))
 
 
 def part_of(

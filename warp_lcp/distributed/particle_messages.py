@@ -156,7 +156,7 @@ class ParticleMessages:
         incoming = self.part.mailbox.swap(dict(zip(self._neighbors, messages, strict=False)))
         incoming += messages[len(self._neighbors) :]
         come = sum(map(len, incoming)) // words
-        self._take_in(incoming, come, words)
+        self._store_received(incoming, come, words)
         particles.make_room(come)
         self._place.reserve(count + come, count)
         self._come.value = come
@@ -192,7 +192,7 @@ class ParticleMessages:
         self._place.reserve(self._particles.count)
         self._giving.run()
 
-    def _take_in(self, incoming: Sequence[np.ndarray], come: int, words: int) -> None:
+    def _store_received(self, incoming: Sequence[np.ndarray], come: int, words: int) -> None:
         self._incoming.reserve(come * words)
         if come:
             np.concatenate(incoming, out=self._incoming.host[: come * words])

@@ -80,7 +80,7 @@ def take_pieces(
                     ..., *shared.moved(box.low, -1).slices
                 ]
             # Particles migrate to their rank when the next step begins.
-            if part.decomposition.meet(box.grown(part.layers), part.box):
+            if part.decomposition.boxes_overlap(box.grown(part.layers), part.box):
                 inside = part.owners(cells_of(part, piece["position"])) == part.ranks.rank
                 parts.append({name: np.asarray(piece[name])[inside] for name in own_piece})
         own_piece = {

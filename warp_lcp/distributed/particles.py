@@ -67,7 +67,7 @@ class ParticleMigration(ParticleExchange):
         self._neighbors = [
             r
             for r, box in enumerate(decomposition.boxes)
-            if r != part.ranks.rank and decomposition.meet(box, around)
+            if r != part.ranks.rank and decomposition.boxes_overlap(box, around)
         ]
         self._messages = ParticleMessages(part, self.particles, self._places, self._neighbors)
         if self._neighbors:
@@ -116,7 +116,7 @@ class ParticleMigration(ParticleExchange):
             if self._neighbors:
                 self._find_runs()
 
-    def look_around(self) -> None:
+    def exchange_ghost_positions(self) -> None:
         """Make ghosts available with their positions alone.
 
         Own particles stay on this rank, wherever they are.
@@ -165,14 +165,14 @@ class ParticleMigration(ParticleExchange):
         """Sort the first particles by place, after some were added or removed."""
         place = self.place[:count]
         if (place[1:] < place[:-1]).any():
-            self._take(
+            self._gather_rows(
                 np.append(np.argsort(place, kind="stable"), np.arange(count, self.particles.count))
             )
             self.particles.number()
 
-    def _take(self, order: np.ndarray) -> None:
+    def _gather_rows(self, order: np.ndarray) -> None:
         """Keep the particles of these numbers, in this order."""
-        self.particles.take(order)
+        self.particles.gather_rows(order)
         self.place = self.place[order]
 
     def _lie_in_order(self) -> None:
@@ -229,7 +229,7 @@ class ParticleMigration(ParticleExchange):
             self.particles.resize(mine)
             self._placed = mine
         elif mine is not None:
-            self._take(np.flatnonzero(mine))
+            self._gather_rows(np.flatnonzero(mine))
             self.particles.number()
             self._lying = SummationOrder(self.place.copy())
 

@@ -31,7 +31,7 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
     own_rank, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
 
     def gives(giver: int, taker: int) -> bool:  # particles migrate when a step begins
-        return now.decomposition.meet(old[giver].grown(before.layers), new[taker])
+        return now.decomposition.boxes_overlap(old[giver].grown(before.layers), new[taker])
 
     other_ranks = [
         rank

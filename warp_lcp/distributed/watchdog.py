@@ -193,13 +193,13 @@ class Watchdog:
                     self._board.write(self._ranks.rank, own_message)
             if idle < self._limit + min(self._ranks.rank, FIRST) * self._beat:
                 self._observed.clear()
-            elif text := self._look(own_message):
+            elif text := self._check_progress(own_message):
                 threading.Timer(GRACE, os._exit, [1]).start()
                 self._board.clear(range(self._ranks.size))
                 self._end(f"{text}\nall ranks are aborted: --rank-timeout {self._limit:g}")
                 return
 
-    def _look(self, own_message: HeartbeatMessages) -> str:
+    def _check_progress(self, own_message: HeartbeatMessages) -> str:
         """Return the error message; "" while ranks make progress.
 
         It is also "" until two different heartbeats of each rank, or none for long, show that it

@@ -97,7 +97,7 @@ class LiveRun:
         }
         with self._lock:
             try:
-                numbers = self._recording.look_again()
+                numbers = self._recording.find_new_frames()
             except InputError as error:
                 return state | {"waits": str(error)}
         scene = self._recording.scene
@@ -129,7 +129,7 @@ class LiveRun:
         """
         with self._lock:
             recording = self._recording
-            if number not in recording.look_again():
+            if number not in recording.find_new_frames():
                 raise RenderError(f"there is no frame {number}")
             frame = recording.frame(number)
             solids = self._solid_points(frame.time)
@@ -210,16 +210,16 @@ class PageRequestHandler(BaseHTTPRequestHandler):
         """Answer a request."""
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or not HOST.fullmatch(hosts[0]):
-            return self._tell(HTTPStatus.FORBIDDEN, b"this page is for this machine alone")
+            return self._send_response(HTTPStatus.FORBIDDEN, b"this page is for this machine alone")
         try:
             answer, kind = self._answer()
         except QueryError as error:
-            return self._tell(HTTPStatus.BAD_REQUEST, str(error).encode())
+            return self._send_response(HTTPStatus.BAD_REQUEST, str(error).encode())
         except InputError as error:
-            return self._tell(HTTPStatus.NOT_FOUND, str(error).encode())
+            return self._send_response(HTTPStatus.NOT_FOUND, str(error).encode())
         except OSError as error:
-            return self._tell(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode())
-        return self._tell(HTTPStatus.OK, answer, kind)
+            return self._send_response(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode())
+        return self._send_response(HTTPStatus.OK, answer, kind)
 
     def _answer(self) -> tuple[bytes, str]:
         """Return the content of a request, and its type.
@@ -245,7 +245,7 @@ class PageRequestHandler(BaseHTTPRequestHandler):
             return live.log(_number(words, "from")), "text/csv; charset=utf-8"
         raise RenderError("no such page")
 
-    def _tell(
+    def _send_response(
         self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8"
     ) -> None:
         self.send_response(status)

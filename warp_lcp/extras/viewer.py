@@ -93,7 +93,7 @@ class Viewer:
     def tick(self, _: int = 0) -> None:
         """Show the frame of the current time; omit frames if drawing is too slow."""
         if self.clock() - self._looked >= LOOK:
-            self._look_again()
+            self._add_new_frames()
         if self.playing_since is None:
             return
         since, begin = self.playing_since
@@ -103,13 +103,13 @@ class Viewer:
         if place != self.place:
             self.go(place)
 
-    def _look_again(self) -> None:
+    def _add_new_frames(self) -> None:
         """Add new frames of a running run.
 
         If the last frame is shown, the newest one is shown next.
         """
         last, self._looked = len(self.recording.numbers) - 1, self.clock()
-        newest = len(self.recording.look_again()) - 1
+        newest = len(self.recording.find_new_frames()) - 1
         if newest > last:
             if self._slider is not None:
                 self._slider.GetRepresentation().SetMaximumValue(newest)

@@ -205,7 +205,8 @@ class Frames(Protocol):
 class FrameWriter:
     """Write frames on a thread of its own while the simulation continues.
 
-    At most WAITING frames are in memory. Errors are raised by every later call of `put`, `then`,
+    At most WAITING frames are in memory.
+    Errors are raised by every later call of `put`, `queue_files`,
     `check` or `flush`, and nothing is written after an error. The end of the `with` block waits for
     queued frames, whatever ended the block, and raises only if nothing else did.
     """
@@ -230,9 +231,9 @@ class FrameWriter:
             self.newest = index
             return files
 
-        self.then("frames, written", write)
+        self.queue_files("frames, written", write)
 
-    def then(self, name: str, write: Callable[[], list[Path]]) -> None:
+    def queue_files(self, name: str, write: Callable[[], list[Path]]) -> None:
         """Queue a function that returns its files; wait if the queue is full.
 
         It is called after all earlier items are on disk.
@@ -294,7 +295,7 @@ class FrameWriter:
         self._failed = True
         with self._watch.beside(name):
             files = write()
-        self._watch.wrote(name, *files)
+        self._watch.add_file_sizes(name, *files)
         self._failed = False
 
 

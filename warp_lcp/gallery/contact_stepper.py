@@ -166,7 +166,7 @@ class ContactStepper:
         )
         return np.concatenate(
             [
-                self.world.contact_solve.memory.recall(
+                self.world.contact_solve.memory.initial_impulses(
                     assembly.contacts, self.world.bodies
                 ).ravel(),
                 known,

@@ -155,7 +155,7 @@ class ParticleExchange:
         else:
             self.particles.number()
 
-    def look_around(self) -> None:
+    def exchange_ghost_positions(self) -> None:
         """Copy positions of other ranks' particles within a cell as ghosts; collective."""
 
     def drop_ghosts(self) -> None:

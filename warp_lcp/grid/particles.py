@@ -389,7 +389,7 @@ class Particles:
             self.resize(self.count - first - others)
         return first, others
 
-    def take(self, order: np.ndarray) -> None:
+    def gather_rows(self, order: np.ndarray) -> None:
         """Keep the particles with these numbers, in this order."""
         device, count = self.grid.device, len(order)
         if count:
@@ -489,9 +489,9 @@ class Particles:
         """
         self.exchange.arrange(sort=self.offsets is not None or step % SORT_EVERY == 0)
 
-    def look_around(self) -> None:
+    def exchange_ghost_positions(self) -> None:
         """Copy positions of other ranks' particles within a cell as ghosts; collective."""
-        self.exchange.look_around()
+        self.exchange.exchange_ghost_positions()
 
     def drop_ghosts(self) -> None:
         """Remove the ghosts of other processes."""

@@ -344,7 +344,7 @@ class ThinWalls:
         )
         return float(speed.numpy().max())
 
-    def remember(self, position: wp.array) -> None:
+    def store_positions(self, position: wp.array) -> None:
         """Store the positions of particles [m], shape (n,), before they move."""
         count = len(position)
         if count == 0:  # a rank without material
@@ -361,7 +361,7 @@ class ThinWalls:
     def stop(self, position: wp.array, *, still: bool) -> None:
         """Move particles that have crossed a thin solid back to its surface, and along it.
 
-        The paths start at the positions stored by `remember`.
+        The paths start at the positions stored by `store_positions`.
 
         Args:
             position: [m], shape (n,) (updated).

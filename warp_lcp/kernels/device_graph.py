@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.joined_graphs import settle, waits
+from warp_lcp.kernels.joined_graphs import queue_stretch, settle
 from warp_lcp.kernels.kernel_variant import BLOCKS_OF_QUADS, KernelVariant, task_of
 from warp_lcp.kernels.launch_graph import (
     Command,
@@ -376,7 +376,7 @@ class DeviceGraph(CommandBuffer):
         settle(self)  # in case its buffer is still queued
         if self._buffer is not None:
             self._refresh()
-        if not waits(self):
+        if not queue_stretch(self):
             self.launch_now()
 
     def launch_now(self) -> None:
@@ -402,7 +402,7 @@ class DeviceGraph(CommandBuffer):
 
     def _note_copy(self) -> None:
         if self._buffer is not None:
-            self._copied = noted(self.device, self._copied)
+            self._copied = record_event(self.device, self._copied)
 
     def _refresh(self) -> None:
         """Write changed arguments to the pinned buffer.
@@ -457,7 +457,7 @@ class Upload(DeviceGraph):
         super().run()
 
 
-def noted(device: wp.Device, event: wp.Event | None) -> wp.Event | None:
+def record_event(device: wp.Device, event: wp.Event | None) -> wp.Event | None:
     """Record an event behind all launches so far, and return it."""
     return wp.get_stream(device).record_event(event) if device.is_cuda else None
 

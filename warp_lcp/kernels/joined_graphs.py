@@ -99,7 +99,7 @@ def joined(device: wp.Device) -> Iterator[None]:
         settle()
 
 
-def waits(program: DeviceGraph) -> bool:
+def queue_stretch(program: DeviceGraph) -> bool:
     """Queue a stretch whose changed arguments are in its buffer.
 
     Returns False if it is to be launched now.

@@ -135,7 +135,7 @@ __syncthreads();
 #endif
 """
 )
-def meet():
+def sync_block():
     """Wait for all threads of the block."""
 
 
@@ -193,7 +193,7 @@ def _sequence_kernel(
         *["cluster"] * clustered,
     ]
     variant = f"{'_'.join(kinds)}.{'_'.join(words)}"
-    wait = meet_in_cluster if clustered else meet
+    wait = meet_in_cluster if clustered else sync_block
     structs = (One, Two, Three, Four, Five)
     members = {"order": wp.array(dtype=wp.vec2i)} | {
         n: wp.array(dtype=s) for n, s in zip(TABLES, structs, strict=True)

@@ -266,7 +266,7 @@ class BallisticFragments:
         number = np.maximum(before[:, :1], 1.0)
         center, drift = before[:, 1:4] / number, before[:, 4:7] / number + self._change
         spin = np.zeros_like(drift) if self._flight.straight else _turning(before, had)[0]
-        self._tell(drift * dx / dt, spin / dt, center * dx)
+        self._copy_to_kernels(drift * dx / dt, spin / dt, center * dx)
         self._flying.run(particles, list(velocity))
         after = self._sums(len(before))
         has, missing = _about_center(after), drift - after[:, 4:7] / number
@@ -279,7 +279,9 @@ class BallisticFragments:
         push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
         share[after[:, kernels.LEAVES] > 0.0] = -1.0  # the body meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift
-        self._tell(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
+        self._copy_to_kernels(
+            shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1)
+        )
         self._landing.run(particles)
 
     def _board(self, particles: Particles) -> int:
@@ -310,7 +312,7 @@ class BallisticFragments:
         sums[:, 1 : kernels.LEAVES] /= self._quanta.value
         return sums
 
-    def _tell(self, *vectors: np.ndarray) -> None:
+    def _copy_to_kernels(self, *vectors: np.ndarray) -> None:
         """Copy vectors of each body, shape (bodies, 3) each, to the kernels' memory."""
         for number, values in enumerate(vectors):
             self._vectors[: len(values), number] = values

@@ -417,7 +417,7 @@ class CutBoundary:
         The solids have not moved yet.
         """
         if self.thin is not None:
-            self.thin.remember(position)
+            self.thin.store_positions(position)
             if self.barriers is not None:
                 self.barriers.carry(fields, dt, self.thin.start_of(position))
 

@@ -144,7 +144,7 @@ def density_of_all(
 
     Arguments as of `particle_density`.
     """
-    particles.look_around()
+    particles.exchange_ghost_positions()
     particle_density(grid, particles, window, particles_a_cell, density)
     particles.drop_ghosts()
     grid.part.fill(density)
@@ -320,7 +320,7 @@ class DensityCorrection:
             # The particles have moved. Gathering needs the order, and gives the same bits on every
             # run.
             particles.sort()
-        particles.look_around()
+        particles.exchange_ghost_positions()
         variant = window.near is None, contact is None, particles.runs is None
         self._preparation.run(particles, window, fill, contact, variant=variant)
         particles.drop_ghosts()
@@ -328,7 +328,7 @@ class DensityCorrection:
         if self._inside is not None:
             self._lacking.changed()
         result = self._solve_counting() if self._begins_on_gpu() else None
-        over_full, most = self._found()
+        over_full, most = self._count_wrong_cells()
         if over_full == 0:
             self.x.zero_()
             return Correction(None, 0, most)
@@ -344,7 +344,7 @@ class DensityCorrection:
 
     def _launch_displacement(self, x: wp.array) -> None:
         """Launch the computation of the displacement on all faces."""
-        self._take(x)
+        self._store_solution(x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
@@ -374,7 +374,7 @@ class DensityCorrection:
     def _displace_particles(self, particles: Particles) -> None:
         self.boundary.displace(self.displacement, particles.position)
 
-    def _take(self, x: wp.array) -> None:
+    def _store_solution(self, x: wp.array) -> None:
         """Store the solution of the problem."""
         part = self.grid.part
         part.store(x, self.x, self._guess)
@@ -399,7 +399,7 @@ class DensityCorrection:
                     device=self.grid.device,
                 )
 
-    def _found(self) -> tuple[int, float]:
+    def _count_wrong_cells(self) -> tuple[int, float]:
         """Count the cells that are overfull or lack material deep inside; collective.
 
         Returns their number, and the largest density.
@@ -436,7 +436,7 @@ class DensityCorrection:
             rtol=self.tolerance,
             atol=EXCESS,
             max_iterations=self.max_iterations,
-            count=lambda: self._found()[0],
+            count=lambda: self._count_wrong_cells()[0],
             counted=counted,
         )
         return self._solved_to(criteria)

@@ -191,7 +191,7 @@ class ParticleCheckpoints(ParticleFrames):
             self.restore(state_of(pieces, self.state()))
             return
         part = subdomain_of(self.grid)
-        expected, found = self._everyone(), part.of_pieces(pieces)
+        expected, found = self._global_count(), part.of_pieces(pieces)
         if found is not None and found is not part:
             self._work_on(found)
         self._take_pieces(pieces, expected)
@@ -201,11 +201,11 @@ class ParticleCheckpoints(ParticleFrames):
 
     def repartition(self, part: Subdomain) -> None:
         """Continue in other boxes of the same ranks; collective."""
-        before, piece, expected = subdomain_of(self.grid), self.state(), self._everyone()
+        before, piece, expected = subdomain_of(self.grid), self.state(), self._global_count()
         self._work_on(part)
         self._take_pieces([part.migrate(piece, list(self.particles.arrays()), before)], expected)
 
-    def _everyone(self) -> int:
+    def _global_count(self) -> int:
         """Return the number of particles on all ranks, narrow band interior included."""
         return sum(self.particles.exchange.counts) + (
             self.band.held if self.band is not None else 0

@@ -75,10 +75,10 @@ class ParticleRedistribution:
         self._severe = severe if driven and scene.keeps_volume else math.inf
         self.moved = False
         # Whether a step has measured the density monitor, and the number of the last step that
-        # called `look`.
+        # called `measure_density`.
         self._looked, self._step = False, -1
 
-    def look(
+    def measure_density(
         self, step: int, density: wp.array | None, particles: Particles, window: Window
     ) -> None:
         """Measure the density at the start of a step, if a density monitor decides.
@@ -100,7 +100,7 @@ class ParticleRedistribution:
             self.density_monitor.measure(density, particles, window)
 
     def has_looked(self, step: int) -> bool:
-        """Return whether `look` has been called in a step."""
+        """Return whether `measure_density` has been called in a step."""
         return self._step == step
 
     @property

@@ -227,37 +227,37 @@ class ParticleScene(Scene):
         """
         return self.particles.narrow_band is None and not self.stays_full and not self.endless
 
-    def complaints(self) -> list[CrossKeyError]:
+    def find_errors(self) -> list[CrossKeyError]:
         """Return errors that concern several keys."""
         key, materials = self.materials()
-        complaints = (
+        errors = (
             []
             if materials or self.source
             else [CrossKeyError((key,), None, "is missing, and there is no [[source]] either")]
         )
-        complaints += self.shape_complaints(key, materials, inside=True)
-        complaints += self.shape_complaints(
-            "source", self.source, inside=True
-        ) + self.shape_complaints("drain", self.drain, inside=True)
+        errors += self.shape_errors(key, materials, inside=True)
+        errors += self.shape_errors("source", self.source, inside=True) + self.shape_errors(
+            "drain", self.drain, inside=True
+        )
         if self.particles.narrow_band is not None and not self.carried_by_grid:
             message = "is for liquids only: the state of sand is stored on its particles"
-            complaints.append(CrossKeyError(("particles", "narrow_band"), None, message))
+            errors.append(CrossKeyError(("particles", "narrow_band"), None, message))
         if self.output.forces and not self.carried_by_grid:
-            complaints.append(CrossKeyError(("output", "forces"), True, "is for liquids only"))
+            errors.append(CrossKeyError(("output", "forces"), True, "is for liquids only"))
         for number, source in enumerate(self.source if not self.carried_by_grid else []):
             if source.viscosity is not None:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("source", number, "viscosity"), source.viscosity, "is for liquids only"
                     )
                 )
-        return super().complaints() + complaints + self._reseed_complaints()
+        return super().find_errors() + errors + self._reseed_errors()
 
     def notes(self) -> list[str]:
         """Return settings that look like mistakes."""
         return [*super().notes(), *material_notes(self, *self.materials())]
 
-    def _reseed_complaints(self) -> list[CrossKeyError]:
+    def _reseed_errors(self) -> list[CrossKeyError]:
         least, most = self.particles.reseed_range(self.dimension)
         at_rest = self.particles.per_axis**self.dimension
         if self.particles.reseed is None or least <= at_rest <= most:

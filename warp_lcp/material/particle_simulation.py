@@ -635,7 +635,7 @@ class ParticleSimulation(ParticleCheckpoints):
             density: density of the particles, in units of that at rest, where it is known.
         """
         with self.watch.stage("density monitor", self.particles.position):
-            self.rearrangement.look(self.step_count, density, self.particles, window)
+            self.rearrangement.measure_density(self.step_count, density, self.particles, window)
 
     @property
     def _monitored(self) -> bool:
@@ -668,7 +668,7 @@ class ParticleSimulation(ParticleCheckpoints):
         """Move particles and solids by dt [s]; airborne bodies keep their momenta."""
         if self.bodies is not None:
             self.bodies.end_step(dt)
-            if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
+            if trouble := self.bodies.stop_reason(self.scene.domain.size, self.scene.endless):
                 raise SimulationFailed(f"step {self.step_count}: {trouble}")
             self.bodies.leave()
         self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)

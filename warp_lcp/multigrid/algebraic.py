@@ -236,11 +236,11 @@ class AlgebraicHierarchy:
         host = A.matrix()
         pattern = _with_diagonal(host if A.symmetric else _union(host))
         self._order = self._find_entries(host, pattern)
-        self.levels = _coarsen(A, host, pattern, real, self.settings, self._most)
+        self.levels = _coarsen(A, host, pattern, real, self.settings, self._coarsest_limit)
         n, last = A.unknowns, self.levels[-1].size
         self.scale = zeros(n, real, self.device)
         self.weight = zeros(n, real, self.device)
-        self.inverts = last <= self._most
+        self.inverts = last <= self._coarsest_limit
         shape = (last, last) if self.inverts else (0, 0)
         self._matrix, self._inverse = (
             wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2)
@@ -348,7 +348,7 @@ class AlgebraicHierarchy:
         )
 
     @property
-    def _most(self) -> int:
+    def _coarsest_limit(self) -> int:
         return self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
 
     def _find_entries(self, host: Matrix, pattern: Matrix) -> DeviceArray:

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.layout import RowLayout, stencil_struct
-from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, meet
+from warp_lcp.kernels.persistent_kernel import CUDA_THREADS, sync_block
 from warp_lcp.kernels.types import DataType
 
 square = wp.array2d(dtype=wp.float64)
@@ -186,7 +186,7 @@ def coarsest_kernels(variable: bool, d_type: DataType, real: DataType) -> Simple
             else:
                 v -= old[i, c] * (old[c, j] * reciprocal)
             new[i, j] = v
-        meet()
+        sync_block()
 
     @forward_kernel(module=f"warp_lcp.coarsest.invert_{name}", launch_bounds=CUDA_THREADS)
     def invert(
@@ -209,7 +209,7 @@ def coarsest_kernels(variable: bool, d_type: DataType, real: DataType) -> Simple
                 assemble(S, L, periodic, r, inverse)
             else:
                 assemble(S, L, periodic, r, other)
-        meet()
+        sync_block()
         for c in range(m):
             least = rounding * S.unit * wp.float64(S.d[element(L, c)])
             if (m - c) % 2 == 0:

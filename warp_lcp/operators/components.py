@@ -356,13 +356,13 @@ class ComponentFinder:
             ]
             label = A._ghosts.join_components(number, held, faces)
             return None if label is None else FloatingComponents(label, A.device, comm)
-        tell = self.look(scratch)
+        tell = self.launch_search(scratch)
         if tell():
             return None
         parent, grounded = self._scratch
         return self._label(parent.numpy(), grounded.numpy())
 
-    def look(self, scratch: Scratch | None = None) -> Callable[[], bool]:
+    def launch_search(self, scratch: Scratch | None = None) -> Callable[[], bool]:
         """Launch the search; return a function that says whether there are none.
 
         That function waits for the device; `scratch` as of `find`.

@@ -588,7 +588,7 @@ class _SolveLoop:
         if x0 is not None:
             self.work.x.assign(x0)
         self.warm = True
-        self._refer(self._begun_in_place())
+        self._set_reference_residual(self._begun_in_place())
         self._record(0, Step("start", 0))
         self._keep(0)
         return None if math.isfinite(self.reference) else SolveStatus.NON_FINITE
@@ -617,7 +617,7 @@ class _SolveLoop:
             guess, self.criteria, 0 if watched else self.stopping.max_iterations
         )
 
-    def _refer(self, reference: float | None = None) -> None:
+    def _set_reference_residual(self, reference: float | None = None) -> None:
         """Set the residual that tolerances refer to; None: that of the iterate."""
         self.reference = self.residual.evaluate(self.work.x) if reference is None else reference
         if isinstance(self.criteria, MeanCriteria):
@@ -729,7 +729,7 @@ class _SolveLoop:
         relative = norm / self.reference if self.reference > 0 else 0.0
         version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
         return SolveResult(
-            self._found(),
+            self._result_x(),
             status,
             iterations,
             self.linear,
@@ -741,7 +741,7 @@ class _SolveLoop:
             version=version,
         )
 
-    def _found(self) -> DeviceArray:
+    def _result_x(self) -> DeviceArray:
         """Return the x of the result: the iterate in place."""
         return self.work.x
 
@@ -760,7 +760,7 @@ class _BoxSolveLoop(_SolveLoop):
         reference = self._begin_on_device(x0)
         if reference is not None:
             self.warm = True
-            self._refer(reference)
+            self._set_reference_residual(reference)
             self._record(0, Step("start", 0))
             self._keep(0)
             return None
@@ -770,7 +770,7 @@ class _BoxSolveLoop(_SolveLoop):
         self.problem.bounds.refresh()
         residual.start(x, keep=False)
         self.work.round_iterate()
-        self._refer()
+        self._set_reference_residual()
         ended = self._trivial()
         if ended is not None:
             self._record(0, Step("start", 0))
@@ -875,7 +875,7 @@ class _BoxSolveLoop(_SolveLoop):
         if not math.isfinite(self.residual.evaluate(self.work.x)):
             raise ValueError("x0 gives a residual that is not finite")
 
-    def _found(self) -> DeviceArray:
+    def _result_x(self) -> DeviceArray:
         """Return x in the problem's original layout, rounded to its precision."""
         layout, x = self.problem.layout, self.work.x
         if self.problem.in_place and isinstance(self.work, WorkspaceDefaults):

@@ -203,7 +203,7 @@ class Recording:
                 "both or particles"
             )
         self.color = Color.PLAIN if self.show not in WITH_PARTICLES else color or Color.SPEED
-        self.look_again()
+        self.find_new_frames()
         if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
             raise RenderError(
                 f"{folder}: --color pressure needs a frame of cells for each frame of particles; "
@@ -362,7 +362,7 @@ class Recording:
             suffix for suffix in READABLE if suffix != "ply" or self.scene.output.format == "ply"
         ]
 
-    def look_again(self) -> list[int]:
+    def find_new_frames(self) -> list[int]:
         """Search for new frames; return the numbers of the complete ones.
 
         Complete frames have all parts that are shown.

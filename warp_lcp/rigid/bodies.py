@@ -214,7 +214,7 @@ class RigidBodies:
             self.solve_contacts()
         assert self._begun is not None
         pending = self._begun
-        self._solve.remember(pending.contacts, pending.impulses)
+        self._solve.store_impulses(pending.contacts, pending.impulses)
         self.contacts = len(pending.contacts)
         ways = self._solve.separation(pending.contacts, dt, pending.detour)
         self.bodies.release()
@@ -273,7 +273,7 @@ class RigidBodies:
             self.bodies.restore(self._begun.states)
             self._begun = None
 
-    def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
+    def stop_reason(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
         """Return the reason why the simulation cannot continue, or "".
 
         A body is not finite, or touches its own periodic image.

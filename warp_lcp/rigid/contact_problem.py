@@ -189,7 +189,9 @@ class ContactProblem:
         )
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
-            x[mine], residual[island], more = self.part(order[mine])._go_on(stopping.rtol, x[mine])
+            x[mine], residual[island], more = self.part(order[mine])._improve_by_newton(
+                stopping.rtol, x[mine]
+            )
             rounds[island] += more
         result = np.empty((k, rows))
         result[order] = x
@@ -197,7 +199,7 @@ class ContactProblem:
             result, float(residual.max(initial=0.0)), int(rounds.max(initial=0.0))
         )
 
-    def _go_on(self, rtol: float, x: np.ndarray) -> ContactImpulses:
+    def _improve_by_newton(self, rtol: float, x: np.ndarray) -> ContactImpulses:
         """Improve the impulses of the sweeps by Newton's methods.
 
         Active sets solve contacts at rest in a few steps, starting from the sweeps. Interior points

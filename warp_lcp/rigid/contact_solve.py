@@ -254,7 +254,7 @@ class ContactSolve:
         hits = may & (t >= 0.0) & (t <= dt)
         t = np.where(hits, t, 0.0)
         for k in np.flatnonzero(hits & (contacts.second < len(self.bodies))).tolist():
-            self._meet(contacts, k, float(t[k]), V)
+            self._advance_contact(contacts, k, float(t[k]), V)
         free[hits] = contacts.velocities(V)[hits, 0]
         after, rest = -e * (free + a * (t - 0.5 * dt)), dt - t
         # Smaller bounces, not apart at the end of the step, are ignored.
@@ -276,7 +276,7 @@ class ContactSolve:
         contacts.target[along] = np.where(free[along] > 0.0, np.minimum(-left, -free[along]), -left)
         return before
 
-    def _meet(self, contacts: Contacts, k: int, t: float, V: np.ndarray) -> None:
+    def _advance_contact(self, contacts: Contacts, k: int, t: float, V: np.ndarray) -> None:
         """Move contact k of two bodies to their positions at time t of the step.
 
         V are the velocities, shape (n, q); the rows of the contact are updated. Both bodies get the
@@ -361,7 +361,7 @@ class ContactSolve:
                 return solved.impulses
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
-        start = self.memory.recall(contacts, self.bodies) if start is None else start
+        start = self.memory.initial_impulses(contacts, self.bodies) if start is None else start
         problem = self._problem_of_step(contacts, b)
         if self.joints:
             impulses, pushes = self._hold_joints(problem, contacts, start, dt, kick_dt)
@@ -439,7 +439,7 @@ class ContactSolve:
         moved.advance(dt)
         return moved
 
-    def remember(self, contacts: Contacts, impulses: np.ndarray) -> None:
+    def store_impulses(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Store impulses, shape (k, dimension), as the start of the next step."""
         if self._pushed is not None and self._pushed.impulses is impulses:
             self.memory.take(self._pushed.memory)

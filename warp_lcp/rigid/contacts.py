@@ -115,7 +115,7 @@ class ContactMemory:
         """Store values, shape (k, 8), up to the capacity."""
         self.values = values[: self._most]
 
-    def recall(self, contacts: Contacts, bodies: BodyStates) -> np.ndarray:
+    def initial_impulses(self, contacts: Contacts, bodies: BodyStates) -> np.ndarray:
         """Return initial impulses, shape (k, dimension).
 
         They are those of the nearest stored contact of the same pair, each used once.

@@ -385,31 +385,31 @@ class RunFolder:
         logs = {self.log.with_stem(name): columns for name, columns in tables.items()}
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
-    def lacks(self, index: int, frame: list[Part]) -> bool:
+    def is_missing_files(self, index: int, frame: list[Part]) -> bool:
         """Return whether a file of a frame, as the run would write it, is missing or cut.
 
         Raises:
             OSError: a file cannot be read.
         """
-        return bool(self.collective.share(self._lacks(index, frame)))
+        return bool(self.collective.share(self._is_missing_files(index, frame)))
 
     @on_root
-    def _lacks(self, index: int, frame: list[Part]) -> bool:
+    def _is_missing_files(self, index: int, frame: list[Part]) -> bool:
         whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
         return any(index in whole.missing(kind, index + 1) for kind in whole.kinds(frame))
 
-    def go_on(self, record: RunRecord, step: int) -> None:
+    def prepare_continuation(self, record: RunRecord, step: int) -> None:
         """Prepare a checked folder to continue after a step; delete incomplete files.
 
         Raises:
             OSError: a file cannot be written, renamed or deleted.
             OutputError: ranks do not see the same folder.
         """
-        self._go_on(record, step)
+        self._prepare_continuation(record, step)
         self._check_shared()
 
     @on_root
-    def _go_on(self, record: RunRecord, step: int) -> None:
+    def _prepare_continuation(self, record: RunRecord, step: int) -> None:
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
         for file in (path for path, _ in _walk(self.path) if TEMPORARY.fullmatch(path.name)):

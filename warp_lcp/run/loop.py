@@ -202,7 +202,9 @@ def _simulation(
     simulation = start(scene, request.device, collective.ranks if collective else None)
     try:
         if folder and continued and continued.checkpoint:
-            notes = _go_on(simulation, folder, continued, on_ranks=collective is not None)
+            notes = _continue_from_checkpoint(
+                simulation, folder, continued, on_ranks=collective is not None
+            )
     except ValueError as error:
         raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error
     if request.record_problems is not None:
@@ -213,7 +215,7 @@ def _simulation(
     return RankSimulation(cast(HasPieces, simulation), collective), notes
 
 
-def _go_on(
+def _continue_from_checkpoint(
     simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool
 ) -> list[str]:
     """Continue from a checkpoint; return remarks for the user.
@@ -402,14 +404,16 @@ class RunLoop:
         self._first_step = self.simulation.step_count
         self._count()
         times = [self.time.frame_time(index) for index in range(done + 1)]
-        self._owes = self._is_frame_time(done) and done <= last and folder.lacks(done, frame)
+        self._owes = (
+            self._is_frame_time(done) and done <= last and folder.is_missing_files(done, frame)
+        )
         if self._owes:
             times.pop()
         for gap in folder.gaps(
             {"log": self._columns(), **self._table_columns()}, self._first_step, times, frame
         ):
             self._warn(gap)
-        folder.go_on(self.record, self._first_step)
+        folder.prepare_continuation(self.record, self._first_step)
         folder.frames.resume(times)
         self._open_log(stack, "log", self._columns(), self._first_step)
         if self._owes:
@@ -581,14 +585,14 @@ class RunLoop:
                 log.sync()
             if beside and isinstance(self.writer, FrameWriter):  # ranks write together
                 state = {name: np.array(array) for name, array in self.simulation.state().items()}
-                self.writer.then(
+                self.writer.queue_files(
                     "checkpoints, written",
                     partial(store, Checkpoint(step, self.simulation.time, state)),
                 )
             else:
                 self.writer.flush()
                 files = store(Checkpoint(step, self.simulation.time, self.simulation.state()))
-        self.watch.wrote("checkpoints", *files)
+        self.watch.add_file_sizes("checkpoints", *files)
         self._checkpointed, self._checkpoint_time = step, clock.monotonic()
 
     def _store(self, folder: RunFolder, checkpoint: Checkpoint) -> list[Path]:

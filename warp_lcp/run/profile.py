@@ -135,7 +135,7 @@ class Profiler:
         finally:
             self.stages.setdefault(name, ProfileStage(beside=True)).add(time.perf_counter() - begun)
 
-    def wrote(self, name: str, *files: Path) -> None:
+    def add_file_sizes(self, name: str, *files: Path) -> None:
         """Add the sizes of files to a stage; a missing file counts as 0."""
         for file in files:
             with suppress(FileNotFoundError):

@@ -16,7 +16,7 @@ from rich.table import Column
 from warp_lcp.files.size_limits import one_line
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.run.log import Value
-from warp_lcp.run.terminal import say
+from warp_lcp.run.terminal import print_text
 
 # The first of these columns in a log is the one that the scene's tolerance bounds.
 RESIDUALS = "coupled_residual", "solve_residual"
@@ -93,7 +93,7 @@ class ProgressLines:
         )
 
     def _write(self, text: str) -> None:
-        say(self._console, text)
+        print_text(self._console, text)
 
 
 class ProgressBar:
@@ -131,7 +131,7 @@ class ProgressBar:
 
     def note(self, text: str) -> None:
         """Print a remark above the bar."""
-        say(self._console, one_line(text))
+        print_text(self._console, one_line(text))
 
     def start(self, time: float, end: float) -> None:
         """Store the start and end time [s] of the run."""
@@ -195,7 +195,7 @@ class ProgressCounter:
             self._status.update(text)
         elif done < of and self._clock() - self._last_report >= LINE_EVERY:
             self._last_report = self._clock()
-            say(self._console, text)
+            print_text(self._console, text)
 
 
 def _begin(progress: Progress, time: float, end: float) -> None:

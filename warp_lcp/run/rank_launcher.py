@@ -27,7 +27,7 @@ from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.profile import Profiler
 from warp_lcp.run.progress import Observer
 from warp_lcp.run.resolve_scene import ResolvedScene
-from warp_lcp.run.terminal import Terminal, say, tell
+from warp_lcp.run.terminal import Terminal, print_lines, print_text
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.table import written
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
@@ -53,7 +53,7 @@ class RankLauncher(Launcher):
         super().__init__(Terminal(stderr=True, quiet=not ranks.is_root))
         if not ranks.is_root:
             wp.config.log_level = wp.LOG_ERROR
-        self.collective: Collective = Collective(ranks, PLANNED, self._last_words)
+        self.collective: Collective = Collective(ranks, PLANNED, self._report_abort)
         self.watchdog = self.collective.watchdog = Watchdog(
             ranks, rank_timeout, self.collective.end_all
         )
@@ -152,12 +152,12 @@ class RankLauncher(Launcher):
             "\n  ".join(["the ranks were started with different scenes or options", *lines])
         )
 
-    def _last_words(self, text: str) -> None:
+    def _report_abort(self, text: str) -> None:
         """Print why all processes end now, and write it into run.json.
 
         The root rank cannot do this inside an MPI call.
         """
-        tell(text, error=True)
+        print_lines(text, error=True)
         if self._folder is not None:
             lines = text.splitlines()
             who = f"rank {self.collective.ranks.rank}"
@@ -202,7 +202,7 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
         with launcher.watchdog, launcher.collective.together():
             yield launcher
     except RankFailed as error:
-        say(launcher.console, str(error))
+        print_text(launcher.console, str(error))
         raise typer.Exit(1) from error
     except PLANNED as error:
         if ranks.is_root:

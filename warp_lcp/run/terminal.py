@@ -110,19 +110,19 @@ class CommandGroup(TyperGroup):
             error.message = visible(error.message)
             raise
         except (KernelCacheError, KeyboardInterrupt) as error:
-            tell(
+            print_lines(
                 error if isinstance(error, KernelCacheError) else "stopped: interrupted", error=True
             )
             raise typer.Exit(1) from error
 
 
-def say(console: Console, text: str) -> None:
+def print_text(console: Console, text: str) -> None:
     """Print a text to a console, without markup; a closed terminal is no error."""
     with suppress(OSError):
         console.print(visible(text), markup=False, highlight=False, soft_wrap=True)
 
 
-def tell(text: object, *, error: bool = False) -> None:
+def print_lines(text: object, *, error: bool = False) -> None:
     """Print lines to the output or the error stream; a closed stream is no error."""
     with suppress(BrokenPipeError):
         typer.echo(visible(str(text)), err=error)

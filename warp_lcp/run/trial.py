@@ -183,9 +183,9 @@ class _TrialRun:
             while end - self.simulation.time > SAME_TIME / self.scene.time.frames_per_second:
                 self._step(end)
                 if not looks:
-                    looks.append(self._look())  # then energy and mass are known
+                    looks.append(self._measure_material())  # then energy and mass are known
             if any(abs(end - time) < SAME_TIME for time in times):
-                looks.append(self._look())
+                looks.append(self._measure_material())
         volumes = self._known("volume")
         return Trial(
             self.seconds,
@@ -194,11 +194,11 @@ class _TrialRun:
             self._sum("linear_iterations"),
             tuple(looks),
             volume=(volumes[0], volumes[-1]) if volumes else None,
-            residual=self._most(
+            residual=self._largest_of_run(
                 "coupled_residual" if "coupled_residual" in self.rows[-1] else "solve_residual"
             )
             or 0.0,
-            packing=self._most("max_fraction"),
+            packing=self._largest_of_run("max_fraction"),
             penetration=self._penetration(),
         )
 
@@ -212,7 +212,7 @@ class _TrialRun:
         wp.synchronize_device(self.device)
         self.seconds += clock_of() - begun
 
-    def _look(self) -> MaterialSnapshot:
+    def _measure_material(self) -> MaterialSnapshot:
         """Return mass distribution, energy and front at the current time."""
         row, points = self.rows[-1], self._points()
         energy = float(row.get("kinetic_energy") or 0.0) + float(row.get("potential_energy") or 0.0)
@@ -253,7 +253,7 @@ class _TrialRun:
     def _sum(self, name: str) -> int:
         return sum(int(row.get(name) or 0) for row in self.rows)
 
-    def _most(self, name: str) -> float | None:
+    def _largest_of_run(self, name: str) -> float | None:
         return max(self._known(name), default=None)
 
     def _known(self, name: str) -> list[float]:

@@ -51,15 +51,15 @@ class Camera(Table):
         description="upper corner of the image [m], 2-D; default: the domain's",
     )
 
-    def complaints(self, dimension: int, size: list[float]) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int, size: list[float]) -> list[CrossKeyError]:
         """Return errors of the camera in a domain of two or three sides [m]."""
         wrong, right = (ROOM_KEYS, WINDOW_KEYS) if dimension == 2 else (WINDOW_KEYS, ROOM_KEYS)
-        complaints = []
+        errors = []
         for key in wrong:
             if getattr(self, key) is not None:
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
                 message = f"cannot be used in {dimension}-D; allowed are {allowed}"
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         (type(self).model_fields[key].alias or key,), getattr(self, key), message
                     )
@@ -67,18 +67,18 @@ class Camera(Table):
         for key in right:
             value = getattr(self, key)
             if isinstance(value, list) and len(value) != dimension:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         (type(self).model_fields[key].alias or key,),
                         value,
                         f"must have {dimension} entries",
                     )
                 )
-        if complaints:
-            return complaints
-        return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
+        if errors:
+            return errors
+        return self._window_errors(size) if dimension == 2 else self._room_errors(size)
 
-    def _window_complaints(self, size: list[float]) -> list[CrossKeyError]:
+    def _window_errors(self, size: list[float]) -> list[CrossKeyError]:
         """Return errors of the window of a 2-D domain."""
         low, high = self.low or [0.0, 0.0], self.high or size
         if all(a < b for a, b in zip(low, high, strict=True)):
@@ -91,7 +91,7 @@ class Camera(Table):
             )
         ]
 
-    def _room_complaints(self, size: list[float]) -> list[CrossKeyError]:
+    def _room_errors(self, size: list[float]) -> list[CrossKeyError]:
         """Return errors of the view of a 3-D domain."""
         if self.position is None:
             given = [key for key in ("look_at", "up") if getattr(self, key) is not None]

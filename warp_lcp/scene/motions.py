@@ -36,18 +36,18 @@ class PrescribedMotion(Table):
             ValueError: a value is not allowed.
         """
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the motion in a scene of 2 or 3 dimensions."""
-        complaints = self._size_complaints(dimension)
-        if complaints:
-            return complaints
+        errors = self._size_errors(dimension)
+        if errors:
+            return errors
         try:
             self.to_motion(dimension)
         except ValueError as error:
-            complaints.append(CrossKeyError((), None, str(error)))
-        return complaints
+            errors.append(CrossKeyError((), None, str(error)))
+        return errors
 
-    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
+    def _size_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the number of entries, and missing or superfluous keys."""
         return [
             CrossKeyError((name,), value, f"must have {dimension} entries in {dimension}-D")
@@ -97,8 +97,8 @@ class RotationMotion(PrescribedMotion):
             stop=_or_never(self.stop),
         )
 
-    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
-        return super()._size_complaints(dimension) + _axis_complaints(self.axis, dimension)
+    def _size_errors(self, dimension: int) -> list[CrossKeyError]:
+        return super()._size_errors(dimension) + _axis_errors(self.axis, dimension)
 
 
 class SinusoidMotion(PrescribedMotion):
@@ -130,21 +130,19 @@ class SinusoidMotion(PrescribedMotion):
             axis=_or_z(self.axis),
         )
 
-    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
-        complaints = super()._size_complaints(dimension)
+    def _size_errors(self, dimension: int) -> list[CrossKeyError]:
+        errors = super()._size_errors(dimension)
         if self.angle is not None:
-            complaints += _center_complaints(self.center, "angle") + _axis_complaints(
-                self.axis, dimension
-            )
+            errors += _center_errors(self.center, "angle") + _axis_errors(self.axis, dimension)
         elif self.amplitude is None:
-            complaints.append(CrossKeyError((), None, "a sinusoid needs amplitude, angle or both"))
+            errors.append(CrossKeyError((), None, "a sinusoid needs amplitude, angle or both"))
         else:
-            complaints += [
+            errors += [
                 CrossKeyError((name,), value, "has no effect without angle")
                 for name, value in (("center", self.center), ("axis", self.axis))
                 if value is not None
             ]
-        return complaints
+        return errors
 
 
 class KeyframesMotion(PrescribedMotion):
@@ -181,34 +179,32 @@ class KeyframesMotion(PrescribedMotion):
             smooth=self.interpolation == "smooth",
         )
 
-    def _size_complaints(self, dimension: int) -> list[CrossKeyError]:
-        complaints = super()._size_complaints(dimension)
+    def _size_errors(self, dimension: int) -> list[CrossKeyError]:
+        errors = super()._size_errors(dimension)
         if not (np.diff(self.times) > 0.0).all():
-            complaints.append(CrossKeyError(("times",), self.times, "must increase"))
+            errors.append(CrossKeyError(("times",), self.times, "must increase"))
         if self.translate is None and self.rotate is None:
-            complaints.append(CrossKeyError((), None, "keyframes need translate, rotate or both"))
+            errors.append(CrossKeyError((), None, "keyframes need translate, rotate or both"))
         if self.rotate is not None:
-            complaints += _center_complaints(self.center, "rotate")
+            errors += _center_errors(self.center, "rotate")
         elif self.center is not None:
-            complaints.append(
-                CrossKeyError(("center",), self.center, "has no effect without rotate")
-            )
+            errors.append(CrossKeyError(("center",), self.center, "has no effect without rotate"))
         for name, rows, width in (
             ("translate", self.translate, dimension),
             ("rotate", self.rotate, 1 if dimension == 2 else 3),
         ):
             if rows is not None and len(rows) != len(self.times):
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         (name,), rows, f"must have {len(self.times)} entries, one for each time"
                     )
                 )
-            complaints += [
+            errors += [
                 CrossKeyError((name, index), row, f"must {counted(width)} in {dimension}-D")
                 for index, row in enumerate(rows or ())
                 if len(row) != width
             ]
-        return complaints
+        return errors
 
 
 Motion = Annotated[
@@ -225,7 +221,7 @@ def _or_z(axis: list[float] | None) -> list[float]:
     return axis or [0.0, 0.0, 1.0]
 
 
-def _axis_complaints(axis: list[float] | None, dimension: int) -> list[CrossKeyError]:
+def _axis_errors(axis: list[float] | None, dimension: int) -> list[CrossKeyError]:
     if dimension == 2:
         return (
             []
@@ -245,7 +241,7 @@ def _axis_complaints(axis: list[float] | None, dimension: int) -> list[CrossKeyE
     )
 
 
-def _center_complaints(center: list[float] | None, key: str) -> list[CrossKeyError]:
+def _center_errors(center: list[float] | None, key: str) -> list[CrossKeyError]:
     return (
         [
             CrossKeyError(

@@ -236,7 +236,7 @@ class Domain(Table):
         """Return whether the domain is unbounded."""
         return self.spacing is not None
 
-    def spacing_complaints(self) -> list[CrossKeyError]:
+    def spacing_errors(self) -> list[CrossKeyError]:
         """Return errors of `spacing` and `dimension`."""
         place, axes = ("domain", "spacing"), int(self.dimension or 0)
         if self.spacing is None:
@@ -377,7 +377,7 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _check_across_tables(self) -> Self:
-        refuse(type(self).__name__, self.complaints())
+        refuse(type(self).__name__, self.find_errors())
         return self
 
     @property
@@ -443,41 +443,39 @@ class Scene(Table):
         ]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
-    def complaints(self) -> list[CrossKeyError]:
+    def find_errors(self) -> list[CrossKeyError]:
         """Return errors that involve several keys.
 
-        Subclasses add theirs to `super().complaints()`.
+        Subclasses add theirs to `super().find_errors()`.
         """
-        complaints = self._grid_complaints()
+        errors = self._grid_errors()
         if len(self.physics.gravity) != self.dimension:
             message = f"must have {self.dimension} entries, as domain.size has"
-            complaints.append(CrossKeyError(("physics", "gravity"), self.physics.gravity, message))
+            errors.append(CrossKeyError(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("time", "dt_min"),
                     self.time.dt_min,
                     f"must not exceed time.dt_max = {self.time.dt_max}",
                 )
             )
-        complaints += [
+        errors += [
             CrossKeyError(("camera", *c.place), c.value, c.message)
-            for c in self.camera.complaints(self.dimension, self.domain.size)
+            for c in self.camera.find_errors(self.dimension, self.domain.size)
         ]
         if self.output.volume and self.dimension == 2:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"
                 )
             )
-        complaints += (
-            self.shape_complaints("solid", self.solid)
-            + self._motion_complaints()
-            + self._side_complaints()
+        errors += (
+            self.shape_errors("solid", self.solid) + self._motion_errors() + self._side_errors()
         )
-        return complaints + self._outside_complaints()
+        return errors + self._outside_errors()
 
-    def shape_complaints(
+    def shape_errors(
         self, key: str, shapes: Sequence[Shape], *, inside: bool = False
     ) -> list[CrossKeyError]:
         """Return errors of an array of shapes.
@@ -487,11 +485,11 @@ class Scene(Table):
             shapes: its entries.
             inside: also refuse entries that lie wholly outside the domain.
         """
-        complaints = []
+        errors = []
         for index, shape in enumerate(shapes):
-            own_complaints = shape.complaints(self.dimension)
-            if inside and not own_complaints and self.enclosed_volume(shape) == 0.0:
-                own_complaints = [
+            own_errors = shape.find_errors(self.dimension)
+            if inside and not own_errors and self.enclosed_volume(shape) == 0.0:
+                own_errors = [
                     CrossKeyError(
                         (),
                         None,
@@ -499,11 +497,11 @@ class Scene(Table):
                         f"{self.domain.size} m",
                     )
                 ]
-            complaints += [
-                CrossKeyError((key, index, *complaint.place), complaint.value, complaint.message)
-                for complaint in own_complaints
+            errors += [
+                CrossKeyError((key, index, *error.place), error.value, error.message)
+                for error in own_errors
             ]
-        return complaints
+        return errors
 
     def enclosed_volume(self, shape: Shape) -> float:
         """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D].
@@ -607,23 +605,23 @@ class Scene(Table):
             ),
         ]
 
-    def _side_complaints(self) -> list[CrossKeyError]:
+    def _side_errors(self) -> list[CrossKeyError]:
         """Return errors of the domain's open sides."""
-        complaints = []
+        errors = []
         for index, side in enumerate(self.domain.open):
             if side in self.domain.open[:index]:
-                complaints.append(CrossKeyError(("domain", "open", index), side, "is named twice"))
+                errors.append(CrossKeyError(("domain", "open", index), side, "is named twice"))
             if side in SIDES[2 * self.dimension :]:
-                complaints.append(
+                errors.append(
                     CrossKeyError(
                         ("domain", "open", index),
                         side,
                         "is a side of a 3-D domain; domain.size has 2 entries",
                     )
                 )
-        return complaints
+        return errors
 
-    def _outside_complaints(self) -> list[CrossKeyError]:
+    def _outside_errors(self) -> list[CrossKeyError]:
         """Return errors of rigid bodies that lie wholly outside the domain.
 
         As far as their keys tell, without mesh files.
@@ -636,11 +634,11 @@ class Scene(Table):
             )
             for index, solid in enumerate(self.solid)
             if solid.is_body
-            and not solid.complaints(self.dimension)
+            and not solid.find_errors(self.dimension)
             and self.enclosed_volume(solid) == 0.0
         ]
 
-    def _motion_complaints(self) -> list[CrossKeyError]:
+    def _motion_errors(self) -> list[CrossKeyError]:
         """Return errors of moving solids that fill whole cells."""
         if self.domain.solids == "cut-cell":
             return []
@@ -659,18 +657,18 @@ class Scene(Table):
             f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3"
         )
 
-    def _grid_complaints(self) -> list[CrossKeyError]:
+    def _grid_errors(self) -> list[CrossKeyError]:
         """Return errors of the grid: spacing, periodic axes."""
-        complaints = self.domain.spacing_complaints()
+        errors = self.domain.spacing_errors()
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("domain", "periodic"),
                     self.domain.periodic,
                     f"must have {self.dimension} entries",
                 )
             )
-        return complaints
+        return errors
 
 
 def _shown(tolerance: float | str) -> str:

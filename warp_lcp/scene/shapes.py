@@ -139,7 +139,7 @@ class Shape(Table):
     def _boxes(self) -> _BoundsCache:
         return _BoundsCache()
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the shape in a scene of 2 or 3 dimensions."""
         lengths = {name: dimension for name, value in self if isinstance(value, list)}
         lengths |= {
@@ -184,18 +184,16 @@ class BoxTable(Shape):
             lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert
         )
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the box in a scene of 2 or 3 dimensions."""
-        complaints = super().complaints(dimension)
-        if not complaints and any(
-            low >= high for low, high in zip(self.min, self.max, strict=True)
-        ):
-            complaints.append(
+        errors = super().find_errors(dimension)
+        if not errors and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
+            errors.append(
                 CrossKeyError(
                     ("max",), self.max, f"must be greater than min = {self.min} along every axis"
                 )
             )
-        return complaints
+        return errors
 
 
 class SphereTable(Shape):
@@ -237,9 +235,9 @@ class CapsuleTable(Shape):
             invert=self.invert,
         )
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the capsule in a scene of 2 or 3 dimensions."""
-        found = super().complaints(dimension)
+        found = super().find_errors(dimension)
         if self.start == self.end:
             found.append(
                 CrossKeyError(("to",), self.end, 'must differ from "from"; use a sphere otherwise')
@@ -265,9 +263,9 @@ class PlaneTable(Shape):
             invert=self.invert,
         )
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the plane in a scene of 2 or 3 dimensions."""
-        found = super().complaints(dimension)
+        found = super().find_errors(dimension)
         if not any(self.normal):
             found.append(CrossKeyError(("normal",), self.normal, "must not be zero"))
         return found
@@ -393,28 +391,28 @@ class SolidProperties(Shape):
         """Return whether it moves."""
         return self.is_body or self.motion is not None
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the solid in a scene of 2 or 3 dimensions."""
-        moves = self.motion.complaints(dimension) if self.motion else []
-        found = super().complaints(dimension) + [
+        moves = self.motion.find_errors(dimension) if self.motion else []
+        found = super().find_errors(dimension) + [
             CrossKeyError(("motion", *c.place), c.value, c.message) for c in moves
         ]
         if self.drag is not None and self.rubs:
             found.append(CrossKeyError(("drag",), self.drag, "is for liquids; sand uses friction"))
-        return found + (self._body_complaints() if self.is_body else self._still_complaints())
+        return found + (self._body_errors() if self.is_body else self._still_errors())
 
-    def _body_complaints(self) -> list[CrossKeyError]:
+    def _body_errors(self) -> list[CrossKeyError]:
         """Return errors of a rigid body."""
         key = "mass" if self.mass is not None else "density"
-        complaints = []
+        errors = []
         if self.mass is not None and self.density is not None:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("density",), self.density, "cannot be combined with mass: give one of them"
                 )
             )
         if self.motion is not None:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("motion",),
                     None,
@@ -422,7 +420,7 @@ class SolidProperties(Shape):
                 )
             )
         if self.invert:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("invert",),
                     True,
@@ -430,14 +428,14 @@ class SolidProperties(Shape):
                 )
             )
         if self.shape == "plane":
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     (key,), getattr(self, key), "not for a plane: a half space has no mass"
                 )
             )
-        return complaints
+        return errors
 
-    def _still_complaints(self) -> list[CrossKeyError]:
+    def _still_errors(self) -> list[CrossKeyError]:
         """Return errors of keys that need a rigid body."""
         body_keys: dict[str, object] = {
             "velocity": self.velocity,
@@ -445,18 +443,18 @@ class SolidProperties(Shape):
             "restitution": self.restitution or None,
         }
         message = "needs mass or density, which make the solid a rigid body"
-        complaints = [
+        errors = [
             CrossKeyError((name,), value, message)
             for name, value in body_keys.items()
             if value is not None
         ]
         if self.friction is not None and not self.rubs:
-            complaints.append(
+            errors.append(
                 CrossKeyError(
                     ("friction",), self.friction, f"{message}: a liquid has no friction with solids"
                 )
             )
-        return complaints
+        return errors
 
 
 class MaterialProperties(Shape):
@@ -484,7 +482,7 @@ class Schedule(Table):
     begin: NonNegative = Field(alias="start", default=0.0, description="start time [s]")
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
-    def schedule_complaints(self) -> list[CrossKeyError]:
+    def schedule_errors(self) -> list[CrossKeyError]:
         """Return errors of the times."""
         if self.stop is not None and self.stop <= self.begin:
             return [
@@ -506,9 +504,9 @@ class SourceProperties(Schedule, Shape):
         description="viscosity [Pa s]; default: viscosity.value",
     )
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the source in a scene of 2 or 3 dimensions."""
-        found = super().complaints(dimension) + self.schedule_complaints()
+        found = super().find_errors(dimension) + self.schedule_errors()
         if not any(self.velocity):
             found.append(
                 CrossKeyError(
@@ -523,9 +521,9 @@ class DrainProperties(Schedule, Shape):
 
     noun: ClassVar[str] = "Drain"
 
-    def complaints(self, dimension: int) -> list[CrossKeyError]:
+    def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the drain in a scene of 2 or 3 dimensions."""
-        return super().complaints(dimension) + self.schedule_complaints()
+        return super().find_errors(dimension) + self.schedule_errors()
 
 
 Solid = ShapeUnion[SolidProperties]

@@ -119,22 +119,22 @@ class CrossKeyError:
     message: str
 
 
-def refuse(title: str, complaints: Iterable[CrossKeyError]) -> None:
-    """Raise pydantic's error for the complaints, if any, each with its place.
+def refuse(title: str, errors: Iterable[CrossKeyError]) -> None:
+    """Raise pydantic's error for these errors, if any, each with its place.
 
     Raises:
-        pydantic.ValidationError: there is a complaint.
+        pydantic.ValidationError: there is an error.
     """
-    errors = [
+    details = [
         InitErrorDetails(
             type=PydanticCustomError("cross_check", "{message}", {"message": c.message}),
             loc=c.place,
             input=c.value,
         )
-        for c in complaints
+        for c in errors
     ]
-    if errors:
-        raise ValidationError.from_exception_data(title, errors)
+    if details:
+        raise ValidationError.from_exception_data(title, details)
 
 
 def validate(model: type[ModelT], data: TableView, source: str) -> ModelT:

@@ -287,7 +287,7 @@ class FischerWorkspace(WorkspaceBase):
             self.floating.project(self.system.r, self._without_bounds)
         norm = self.map.norm if fused else self.system.norm()
         iterations = self.system.solve(s.eta * norm, s.max_linear_iterations)[0] if norm > 0 else 0
-        self._search.remember(merit)
+        self._search.store_merit(merit)
         self._gone = 0.0
         if not s.safeguard:
             wp.copy(self._from, x)
@@ -534,7 +534,7 @@ class FischerDenseWorkspace(DenseWorkspace):
             f = self.map.value(moved, data.affine(moved))
             return 0.5 * float(f @ f)
 
-        self._search.remember(merit)
+        self._search.store_merit(merit)
         length, _ = self._search.search(trial, slope)
         if length == 0.0:
             return SolveStatus.NON_DESCENT

@@ -128,7 +128,7 @@ class DescentWorkspace(WorkspaceBase):
         self._square = square
         wp.copy(self._from, x)
         # A projected step decreases the merit less than Armijo's condition for a free one requires.
-        self._search.remember(merit * (1 - LEAST))
+        self._search.store_merit(merit * (1 - LEAST))
         length, reached = self._search.search(
             lambda t: self._trial(x, t), 0.0, first=min(self.length, LONGEST)
         )

@@ -170,7 +170,7 @@ class ContactWorkspace:
         self._program = CommandBuffer(device)
         for count in range(method.check_every):
             self._record(count % 2)
-        self._look(self._program.launch)
+        self._compute_residual(self._program.launch)
 
     def _contacts(self) -> ContactFields:
         """Return the contacts in the layout of the kernels, color by color."""
@@ -236,7 +236,7 @@ class ContactWorkspace:
         if self.method.accelerate:
             self._changes.dot(self._g, self._g, 1 - now, launch=launch)
 
-    def _look(self, launch: Launch = launch_now) -> None:
+    def _compute_residual(self, launch: Launch = launch_now) -> None:
         """Compute w and the squared residual from the impulses alone."""
         self._gather.launch(launch)
         self._left.launch(launch)
@@ -278,7 +278,7 @@ class ContactWorkspace:
 
     def evaluate(self, x: DeviceArray) -> float:
         """Return the residual's norm at x, recomputed in float64 from x alone."""
-        self._look()
+        self._compute_residual()
         return self._read()
 
     def rounding_floor(self, x: DeviceArray, epsilon: float) -> float:

@@ -259,7 +259,7 @@ class CorrectionSystem:
         if self.damped is None:
             return self._take_back(iterations, "regularized")
         wp.copy(x, self.start_of_step)
-        lower = self.damped.take(x, residual)
+        lower = self.damped.take_shortest_step(x, residual)
         residual.evaluate(x)
         if lower:
             norms.clear()

@@ -125,7 +125,7 @@ class DampedSteps:
         self._least, self._waited = min(norm, self._least), 0 if falls else self._waited + 1
         return False
 
-    def take(self, x: DeviceArray, residual: NaturalResidual) -> bool:
+    def take_shortest_step(self, x: DeviceArray, residual: NaturalResidual) -> bool:
         """Take the shortest of some steps that reduces the residual's norm.
 
         With r = d (x - clip(x - y / d, l, u)) and its Jacobian J, d on held rows and A elsewhere,

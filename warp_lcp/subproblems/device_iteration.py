@@ -401,7 +401,7 @@ class DeviceIteration:
             work.distrust_hierarchy()  # the hierarchy may be of any free set now
             return None
         for classified in (False, True):
-            r.take(self.rows.popleft(), size, classified=classified)
+            r.store_evaluation(self.rows.popleft(), size, classified=classified)
         return reference
 
     def forget_guess(self) -> None:

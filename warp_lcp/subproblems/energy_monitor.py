@@ -153,7 +153,7 @@ class NonmonotoneSearch:
         """Delete the merits of the last solve."""
         self.merits.clear()
 
-    def remember(self, merit: float) -> None:
+    def store_merit(self, merit: float) -> None:
         """Store the merit at the start of a step."""
         self.merits = [*self.merits, merit][-self.memory :]
 

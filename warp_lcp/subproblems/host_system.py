@@ -147,7 +147,7 @@ class HostResidual(NaturalResidual):
         """The memory in which `evaluate` computes y, as a device array."""
         return wp.array(self._y, dtype=wp.float64, device=self.problem.device, copy=False)
 
-    def _take(self) -> None:
+    def _read_problem(self) -> None:
         """Read the current A, b and bounds."""
         self.matrix.refresh()
         bounds = self.problem.bounds
@@ -158,7 +158,7 @@ class HostResidual(NaturalResidual):
 
     def start(self, x: DeviceArray, *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u)."""
-        self._take()
+        self._read_problem()
         values = self.values(x)
         np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
         self.invalidate()
@@ -166,7 +166,7 @@ class HostResidual(NaturalResidual):
     def evaluate(self, x: DeviceArray) -> float:
         """Compute y and return the norm of the natural residual at x."""
         if not self._evaluated:  # a block among others is evaluated before it is solved
-            self._take()
+            self._read_problem()
         values, y, d = self.values(x), self._y, self.scale
         np.add(self.matrix.product(values), self.b, out=y)
         with np.errstate(invalid="ignore", over="ignore"):

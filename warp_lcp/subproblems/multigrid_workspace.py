@@ -434,7 +434,7 @@ class MultigridWorkspace(WorkspaceBase):
         if not (ahead.rows or (starts and ahead.steps(self._tolerance, left))):
             return False
         self._built = self.residual.free_set
-        self.residual.take(ahead.rows.popleft(), classified=True)
+        self.residual.store_evaluation(ahead.rows.popleft(), classified=True)
         return True
 
     def _needs_cycle(self) -> bool:

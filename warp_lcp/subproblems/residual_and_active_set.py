@@ -199,15 +199,15 @@ class ResidualAndActiveSet(NaturalResidual):
         """
         self._reading.changed()
         scalars = self._reading.numpy()
-        return self.take(
+        return self.store_evaluation(
             [*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]],
             classified=classified,
         )
 
-    def take(
+    def store_evaluation(
         self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool
     ) -> float:
-        """Store the results of an evaluation, see `multigrid_ahead.keep_row`.
+        """Store the results of an evaluation, see `device_iteration.keep_row`.
 
         Returns the norm.
         """

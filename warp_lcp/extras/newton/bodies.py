@@ -161,7 +161,7 @@ class WorldBodies(RigidBodies):
             self.bodies.restore(self._before)
             self._before = None
 
-    def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
+    def stop_reason(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
         """Return the reason why the simulation cannot continue, if any.
 
         A body is not finite.
