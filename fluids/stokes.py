@@ -394,7 +394,9 @@ class StokesSolve:
                 diagonal=level.diagonal[axis],
             )
 
-    def _launch_reduction(self, name: str, kernel: StencilKernel, part: int, **arguments: object) -> None:
+    def _launch_reduction(
+        self, name: str, kernel: StencilKernel, part: int, **arguments: object
+    ) -> None:
         """Launch a kernel that reduces; `_read` returns its results."""
         tally = self._tallies.get((name, part))
         if tally is None:
