@@ -43,6 +43,7 @@ class ThinWallScene:
         side: of points [m], shape (n, 3), in the simulation, int of shape (n,); -1: in a wall.
         until: time to simulate [s].
         weight: of the liquid that the solids bear [N; 2-D: N/m]; None: they do not bear all.
+        depth: of liquid at rest [m]; None: it is not at rest.
     """
 
     label: str
@@ -50,6 +51,7 @@ class ThinWallScene:
     side: Sides
     until: float
     weight: float | None = None
+    depth: float | None = None
 
 
 @dataclass
@@ -62,6 +64,7 @@ class ThinWallOutcome:
         load: that of the solids in the last third, in weights of the liquid; None: not measured.
         density: the largest of the last step, in that at rest.
         failures: solves that did not converge, by status.
+        speed: largest of a particle, in units of sqrt(g depth); None: it is not at rest.
     """
 
     particles: int
@@ -69,6 +72,7 @@ class ThinWallOutcome:
     load: float | None
     density: float
     failures: Counter[str] = field(default_factory=Counter)
+    speed: float | None = None
 
 
 def scene(
@@ -263,6 +267,25 @@ def divider(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWal
     )
 
 
+def pools(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
+    """Draw an upright sheet between two pools at rest, of different height."""
+    dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
+    offset = rng.integers(0, OFFSETS) / OFFSETS
+    first, last = 0.45 + offset * dx, 0.45 + (offset + thick) * dx
+    low, high = np.full(dimension, -1.0), np.full(dimension, 2.0)
+    low[0], high[0] = first, last
+    a, b, c, d = (np.full(dimension, end) for end in (0.0, 1.0, 0.0, 1.0))
+    b[:2], c[0], d[1] = (first, 0.5), last, 0.25
+    tables = scene(simulator, dimension, [box(a, b), box(c, d)], [box(low, high)])
+
+    def side(x: np.ndarray, simulation: Any) -> np.ndarray:
+        right = np.where(x[:, 0] > last - SLACK * dx, 2, -1)
+        return np.asarray(np.where(x[:, 0] < first + SLACK * dx, 1, right))
+
+    label = f"pools {thick} cells, offset {offset}"
+    return ThinWallScene(label, tables, side, 0.1, depth=0.5)
+
+
 def funnel(rng: np.random.Generator, simulator: str, dimension: int) -> ThinWallScene:
     """Draw a closed vee, of capsules in 2-D and of boxes in 3-D."""
     dx, thick = 1.0 / COUNTS[dimension], float(rng.choice(THICKNESSES))
@@ -380,6 +403,7 @@ KINDS: dict[str, Callable[[np.random.Generator, str, int], ThinWallScene]] = {
     "mesh": lambda rng, sim, dim: bottle(rng, sim, 3, None, True),
     "piston": pushed,
     "blade": blade,
+    "pools": pools,
 }
 
 
@@ -396,11 +420,15 @@ def run(draw: ThinWallScene) -> ThinWallOutcome:
     start = Counter(draw.side(key, simulation).tolist())
     loads: list[float] = []
     failures: Counter[str] = Counter()
+    fastest = 0.0
     row: dict[str, Any] = {}
     while simulation.time < draw.until - 1e-9:
         row = simulation.step(min(simulation.stable_dt(), 0.02, draw.until - simulation.time))
         if row.get("solve_status") not in (None, "CONVERGED"):
             failures[str(row["solve_status"])] += 1
+        if draw.depth is not None:
+            speeds = np.linalg.norm(simulation.particles.velocity.numpy(), axis=1)
+            fastest = max(fastest, float(speeds.max()))
         forces = getattr(simulation, "measured", {}).get("forces")
         if draw.weight and forces and simulation.time > draw.until * 2.0 / 3.0:
             own = [v for k, v in forces.items() if k.startswith("solid") and k.endswith("_fy")]
@@ -410,7 +438,8 @@ def run(draw: ThinWallScene) -> ThinWallOutcome:
     passed = sum(abs(end[s] - start[s]) for s in {*start, *end}) // 2 + start[-1]
     density = row.get("max_density", row.get("max_fraction", 0.0))
     load = float(np.mean(loads)) if loads else None
-    return ThinWallOutcome(len(x), passed, load, density, failures)
+    speed = fastest / math.sqrt(GRAVITY * draw.depth) if draw.depth is not None else None
+    return ThinWallOutcome(len(x), passed, load, density, failures, speed)
 
 
 def made(tables: Tables) -> Any:
@@ -444,6 +473,8 @@ def main() -> None:
                     total["draws"] += 1
                     total["held"] += out.passed == 0
                     load = "" if out.load is None else f", load {out.load:.3f}"
+                    if out.speed is not None:
+                        load += f", speed {out.speed:.4f} sqrt(g h)"
                     print(
                         f"{model} {dimension}-D {draw.label}: {out.passed} of {out.particles} "
                         "passed"
