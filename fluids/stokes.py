@@ -204,8 +204,8 @@ class StokesSolve:
         self._rank = 0 if self._bodies is None else self._bodies.rank
         self._tallies: dict[tuple[str, int], WindowReduction] = {}
         self._estimation = LaunchGraph(grid.device, self._launch_estimation)
-        # Launches between two decisions of the host. On CUDA they contain cycles, which are programs
-        # of their own there.
+        # Launches between two decisions of the host. On CUDA they contain cycles, which are
+        # programs of their own there.
         launches = (
             self._launch_product,
             self._launch_velocities,

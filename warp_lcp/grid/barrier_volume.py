@@ -38,7 +38,7 @@ def phi_at(apart: U8, planes: int, phi: F32, known: I8, k: int, j: int, i: int, 
 
 @wp.func
 def open_at(nodes: F32, planes: int, k: int, j: int, i: int, x: wp.vec3):
-    """Return the distance [cells] to thick solids at a place x in a cell, 0 to 1 along each axis."""
+    """Return the distance [cells] to thick solids at a place in a cell, 0 to 1 along each axis."""
     total = float(0.0)
     for n in range(wp.where(planes == 2, 8, 4)):
         a = n & 1

@@ -203,8 +203,8 @@ for (int start = first; start < last; start += M) {
 // kernel warp_lcp.grid.volume.volume: Volume of the liquid [cells]. Cells that neither surface can
 // cross are counted whole. In the other cells phi is multilinear between cell centers, and the
 // distance to walls between nodes. Each of `parts` points per axis stands for its part of the cell,
-// which is filled as far as a plane at that distance fills it. Where `beside` is not negative, it is
-// the filled share of a cell beside thin solids. In a module of its own, since few runs need it.
+// which is filled as far as a plane at that distance fills it. Where `beside` is not negative, it
+// is the filled share of a cell beside thin solids. In a module of its own, since few runs need it.
 //   compute    float32
 //   box        float32 phi, distance?, beside?; int8 known
 //   numbers    int planes, parts
