@@ -45,7 +45,7 @@ REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")
 ADDRESS = 0x6F0000000000  # address at which compiled kernels read the order of threads
 # Kernels (module:name) whose results depend on the order of threads, and why they may.
 ORDER_MATTERS = {
-    "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
+    "warp_lcp.components*:components_unite": "trees differ, their roots do not",
     "warp_lcp.material.ballistic_fragments:unite": "trees differ, their roots do not",
     "warp_lcp.material.ballistic_fragments:board_kernel": "a list in the order in which threads "
     "come; sums over it are rounded in that order",

@@ -73,7 +73,7 @@ def totals(numbers, threads):
 # Kernels (module:name) whose integers (i) or floats (f) depend on the order or number of threads,
 # and a function of them that does not.
 UNORDERED = {
-    "warp_lcp.components.unite.*:unite": ("i", roots),
+    "warp_lcp.components*:components_unite": ("i", roots),
     "warp_lcp.material.ballistic_fragments:unite": ("i", roots),
     "warp_lcp.material.ballistic_fragments:board_kernel": ("i", in_order),
     "warp_lcp.grid.node_distance:claim_groups": ("i", in_order),
@@ -81,8 +81,8 @@ UNORDERED = {
 }
 # Kernels whose float64 numbers are computed from numbers rounded to float32.
 SINGLE = (
-    "warp_lcp.projected_multigrid.measure.*_float32:*",
-    "*conjugate_gradient.update.float32:*",
+    "warp_lcp.projected_multigrid.measure.*_float32*:*",
+    "*conjugate_gradient.update.float32*:*",
     "*conjugate_gradient.step.*float32*",
     "warp_lcp.grid.particles:total",
     "warp_lcp.grid.volume:*",
