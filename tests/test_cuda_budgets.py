@@ -29,6 +29,14 @@ SPILLS = {
     "warp_lcp.blocked_gauss_seidel.*_[56]:*": "a thread enumerates the sets of a block of 5 or 6 "
     "unknowns with its matrix at hand",
     "warp_lcp.coarsest.invert_*": "20 bytes once a solve, in one block",
+    "*quads_at1or3_of1or3:*": "36 to 140 bytes on levels with odd rows: the row function is there "
+    "for both alignments, in at most 128 registers",
+    "warp_lcp.mprgp.split.variable_float64_float32_float64_quads:split": "20 bytes, in float64",
+    "warp_lcp.cycle.correct_and_sweep.variable_float64_float64_quads:*": "32 bytes, in float64",
+    "warp_lcp.grid.barriers.*": "faces, cells and particles beside thin solids only",
+    "warp_lcp.grid.thin_walls:stop_kernel": "particles beside thin solids only",
+    "fluids.thin_forces:*": "cells beside thin solids only",
+    "fluids.wall_drag:*": "cells at walls, if the scene has wall drag",
 }
 # Kernels with more than 128 registers, so that fewer than 512 threads fit on a multiprocessor, and
 # the reason.
@@ -44,6 +52,22 @@ LARGE = {
     "warp_lcp.grid.mesh_crossings:find_crossings": "once a mesh",
     "fluids.coupling:*": "bodies' cells only",
     "warp_lcp.small_levels.*": "blocks of 256 threads, which have a multiprocessor each",
+    "warp_lcp.grid.barriers.*": "faces, cells and particles beside thin solids only",
+    "warp_lcp.grid.thin_walls:stop_kernel": "particles beside thin solids only",
+    "warp_lcp.grid.distance_advection*": "cells near moving solids only",
+    "warp_lcp.grid.node_distance:place": "nodes near solids, when these move",
+    "warp_lcp.grid.cut_cells:velocity_kernel": "cut cells only",
+    "warp_lcp.grid.particles:total": "once a step, a few thousand threads",
+    "warp_lcp.rigid.*": "a thread for each body or pair of bodies",
+    "warp_lcp.matrix_stencil.recognize.*": "once a problem",
+    "warp_lcp.cycle.correct_and_sweep.variable_float64_float64:*": "in float64",
+    "fluids.forces:pressure_kernel": "cells at solids, if forces are logged",
+    "fluids.thin_forces:*": "cells beside thin solids only",
+    "fluids.wall_drag:*": "cells at walls, if the scene has wall drag",
+    "fluids.viscosity_*:force": "cells at solids, if forces are logged",
+    "fluids.viscosity_?d:restrict": "142 on sm_80 only; not among the passes that take the time",
+    "granular.stress_3d_float32_step*": "up to 140: six stresses and their return to the cone",
+    "granular.stress_3d_float64_residual*": "up to 134: the same in float64",
 }
 
 # Instructions that passes may issue a cell, of the finer grid of a transfer, on sm_90; variable:
