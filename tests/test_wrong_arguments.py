@@ -353,6 +353,13 @@ def test_methods_by_name():
     for name, method in meant.items():
         with pytest.raises(KeyError, match=f"no such method: '{name}'; did you mean '{method}'"):
             wl.METHODS[name]
+    for name, method in wl.METHODS.items():
+        assert wl.METHODS.nearest(method.__name__) == f"did you mean {name!r}?"
+    for name in wl.METHODS:
+        initials = "".join(word[0] for word in name.split("-"))
+        # "ip" is that of two methods, "pgs" that of projected Gauss-Seidel, which is "psor" here.
+        if len(initials) > 1 and name not in ("interior-point", "proximal-gauss-seidel"):
+            assert wl.METHODS.nearest(initials) == f"did you mean {name!r}?"
     with pytest.raises(
         ValueError, match=r"method = 'ipm': must be one of .*; did you mean 'interior-point'"
     ):
