@@ -120,12 +120,25 @@ def first_hits(
     place[i] = at
 
 
+def places_of_hits(walls: ThinWalls, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the first place on each path where it meets the first shape, from 0 to 1."""
+    place = wp.zeros(len(start), dtype=wp.float64, device="cpu")
+    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
+    wp.launch(first_hits, len(start), [walls.shapes, *ends, place], device="cpu")
+    return place.numpy()
+
+
+def drawn_mesh_box(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, ThinWalls]:
+    """Return the corners of a random box [m], and its mesh as a thin wall."""
+    low = rng.uniform(0.1, 0.3, 3)
+    high = low + rng.uniform(0.3, 0.6, 3)
+    return low, high, thin_walls(grid(3), [sheet(low, high)])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_no_path_slips_through_the_edges_and_corners_of_a_mesh(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 20000
-    low = rng.uniform(0.1, 0.3, 3)
-    high = low + rng.uniform(0.3, 0.6, 3)
-    walls = thin_walls(grid(3), [sheet(low, high)])
+    low, high, walls = drawn_mesh_box(rng)
     # Points on edges and corners: two or three coordinates are those of sides.
     upper, free = rng.random((count, 3)) < 0.5, np.zeros((count, 3), dtype=bool)
     edges = rng.random(count) < 0.7
@@ -133,24 +146,18 @@ def test_no_path_slips_through_the_edges_and_corners_of_a_mesh(seed: int) -> Non
     on_edge = np.where(free, rng.uniform(low, high, (count, 3)), np.where(upper, high, low))
     start = rng.uniform(low + 0.02 * (high - low), high - 0.02 * (high - low), (count, 3))
     end = 2.0 * on_edge - start
-    place = wp.zeros(count, dtype=wp.float64, device="cpu")
-    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
-    wp.launch(first_hits, count, [walls.shapes, *ends, place], device="cpu")
+    place = places_of_hits(walls, start, end)
     # All paths leave the box halfway. Vertices are rounded to float32, which shifts the place by
     # about 1e-7 / 0.02.
-    np.testing.assert_allclose(place.numpy(), 0.5, rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(place, 0.5, rtol=0.0, atol=2e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_paths_meet_a_mesh_where_they_meet_its_box(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 5000
-    low = rng.uniform(0.1, 0.3, 3)
-    high = low + rng.uniform(0.3, 0.6, 3)
-    walls = thin_walls(grid(3), [sheet(low, high)])
+    low, high, walls = drawn_mesh_box(rng)
     start, end = rng.uniform(0.0, 1.0, (2, count, 3))
-    place = wp.zeros(count, dtype=wp.float64, device="cpu")
-    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
-    wp.launch(first_hits, count, [walls.shapes, *ends, place], device="cpu")
+    place = places_of_hits(walls, start, end)
     # Exact slabs: the path is in the box between the last entry and the first exit.
     sides = np.stack([low, high])[:, None] - start
     crossed = np.sort(sides / (end - start), axis=0)
@@ -159,8 +166,8 @@ def test_paths_meet_a_mesh_where_they_meet_its_box(seed: int) -> None:
     hits = (enter <= leave) & (first >= 0.0) & (first <= 1.0)
     clear = (np.abs(leave - enter) > 1e-4) & (np.abs(first) > 1e-4) & (np.abs(first - 1.0) > 1e-4)
     assert hits.sum() > count / 4 and clear.sum() > 0.95 * count
-    np.testing.assert_array_equal((place.numpy() <= 1.0)[clear], hits[clear])
-    np.testing.assert_allclose(place.numpy()[clear & hits], first[clear & hits], atol=1e-4)
+    np.testing.assert_array_equal((place <= 1.0)[clear], hits[clear])
+    np.testing.assert_allclose(place[clear & hits], first[clear & hits], atol=1e-4)
 
 
 def leaning_shape(kind, rng):
