@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 from hypothesis import HealthCheck, settings
 
+from default_run import mark_repeated_cases
 from dots import dots, scene_file  # noqa: F401  # fixtures of whatever runs scenes
 from warp_lcp.kernels.log_filter import start_warp
 
@@ -52,7 +53,9 @@ def pytest_collection_finish():
     gc.enable()
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest leaves out the slow ones
 def pytest_collection_modifyitems(items):
+    mark_repeated_cases(items)
     # The longest first, so that others run beside it.
     items.sort(key=lambda item: item.name.startswith("test_kernels_compile_for_cuda"), reverse=True)
     if len(DEVICES) == 1:

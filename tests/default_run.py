@@ -1,14 +1,19 @@
-"""Choice of the parameters of a test that run by default; the others are marked `slow`.
+"""Choice of the cases of a test that run by default; the others are marked `slow`.
 
-`make slow` runs those, too.
+`make slow` runs those, too. A function that marks none itself runs by default with each value of
+each of its arguments at least once (`mark_repeated_cases`). The functions of this module choose the
+cases of one test.
 """
 
 import itertools
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import pytest
+
+FEWEST = 3  # cases of a function that run by default in any case
+SAMPLED = ("seed",)  # arguments of which some values stand for all
 
 
 def few(values: Iterable[Any], count: int = 3) -> list[Any]:
@@ -31,29 +36,84 @@ def covering(*axes: Sequence[Any], count: int | None = None) -> list[Any]:
     As many as the longest axis has, or `count`, run by default: first those with new values, then
     those with new pairs of values, then those with values that are rare so far.
     """
-    rest = list(itertools.product(*(range(len(axis)) for axis in axes)))
-    default: list[tuple[int, ...]] = []
-    seen: Counter[Any] = Counter()
-
-    def news(places: tuple[int, ...]) -> tuple[int, int, int]:
-        values = list(enumerate(places))
-        pairs = itertools.combinations(values, 2)
-        return (
-            sum(seen[value] == 0 for value in values),
-            sum(seen[pair] == 0 for pair in pairs),
-            -sum(seen[value] for value in values),
-        )
-
-    for _ in range(min(count or max(map(len, axes)), len(rest))):
-        default.append(max(rest, key=news))
-        rest.remove(default[-1])
-        values = list(enumerate(default[-1]))
-        seen.update([*values, *itertools.combinations(values, 2)])
+    cases = list(itertools.product(*(range(len(axis)) for axis in axes)))
+    order = by_news([tuple(enumerate(places)) for places in cases])
+    default = {cases[n] for n, _ in itertools.islice(order, count or max(map(len, axes)))}
     found = []
-    for places in itertools.product(*(range(len(axis)) for axis in axes)):
+    for places in cases:
         combined = tuple(axis[place] for axis, place in zip(axes, places, strict=True))
         found.append(combined if places in default else slow(combined))
     return found
+
+
+def by_news(cases: Sequence[tuple[Any, ...]]) -> Iterable[tuple[int, int]]:
+    """Yield the places of cases, those with the most new values first.
+
+    Each case is a tuple of hashable values, which name their argument. Of cases with as many new
+    values those with more new pairs of values come first, then those with values that are rare so
+    far, then those that stand first.
+
+    Yields:
+        The place of a case, and its number of new values.
+    """
+    rest = dict(enumerate(cases))
+    seen: Counter[Any] = Counter()
+
+    def news(place: int) -> tuple[int, int, int]:
+        values = rest[place]
+        return (
+            sum(seen[value] == 0 for value in values),
+            sum(seen[pair] == 0 for pair in itertools.combinations(values, 2)),
+            -sum(seen[value] for value in values),
+        )
+
+    while rest:
+        place = max(rest, key=news)
+        yield place, news(place)[0]
+        values = rest.pop(place)
+        seen.update([*values, *itertools.combinations(values, 2)])
+
+
+def mark_repeated_cases(items: Iterable[pytest.Item]) -> None:
+    """Mark the cases of each function that repeat all values of its arguments as `slow`.
+
+    By default each value of each argument runs at least once on each device, in `FEWEST` cases or
+    more; `SAMPLED` arguments need not have all of their values. Functions of which some cases are
+    marked `slow` already have made their choice.
+
+    Marks:
+        default_cases(count): as many cases run by default, whatever their number of values.
+        every_case: all cases run by default.
+    """
+    functions: defaultdict[Any, list[pytest.Function]] = defaultdict(list)
+    for item in items:
+        if isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+            device = item.callspec.params.get("device")
+            functions[item.parent, item.originalname, device].append(item)
+    for cases in functions.values():
+        marked = cases[0].get_closest_marker("default_cases")
+        free = [case for case in cases if not case.get_closest_marker("slow")]
+        if cases[0].get_closest_marker("every_case") or (len(free) < len(cases) and not marked):
+            continue
+        default = set()
+        for place, new in by_news([tuple(named_values(case)) for case in free]):
+            if len(default) >= (marked.args[0] if marked else FEWEST if not new else len(free)):
+                break  # those that follow have nothing new
+            default.add(place)
+        for place, case in enumerate(free):
+            if place not in default:
+                case.add_marker(pytest.mark.slow)
+
+
+def named_values(case: pytest.Function) -> Iterable[tuple[str, Any]]:
+    """Yield names and values of the arguments of a case, by which cases are compared."""
+    for name, value in case.callspec.params.items():
+        if name not in SAMPLED:
+            try:
+                hash(value)
+            except TypeError:
+                value = id(value)
+            yield name, type(value), value
 
 
 def by_turns(pairs: Sequence[tuple[str, str]]) -> list[Any]:

@@ -64,6 +64,7 @@ def places(simulation: ContactSimulation) -> np.ndarray:
     return np.array([body.position for body in simulation.bodies.bodies])
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(
     "name", ["box-stack", "heavy-on-light", "leaning-wall", "sphere-stack", "wall"]
 )
@@ -119,6 +120,7 @@ def test_a_body_falls_as_a_stone_does_and_hits_the_floor() -> None:
     assert tuple(row) == simulation.columns()
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("method", few([DEFAULT, "proximal-gauss-seidel", "psor", "lemke"], 2))
 def test_energy_does_not_grow_without_restitution(method: str) -> None:
     """Energy of bodies that fall on each other, tilted and turning.

@@ -53,6 +53,7 @@ def velocity_errors(simulation: Any, steps: int, patch: pytest.MonkeyPatch) -> n
     return np.array(errors)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("model", ["incompressible", "unilateral"])
 def test_a_solve_leaves_a_stated_part_of_the_time_steps_error(
     model: str, monkeypatch: pytest.MonkeyPatch

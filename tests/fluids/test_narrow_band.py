@@ -166,6 +166,7 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
     assert filled == pytest.approx(ball, rel=0.05)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_liquid_separates_from_a_ceiling(dimension):
     """Separation of a block from a ceiling.
@@ -376,6 +377,7 @@ def test_a_state_belongs_to_its_band():
         tank().restore(tank(particles={}).state())
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(("resolution", "particles"), covering([24, 40], [BAND, {}]), ids=str)
 def test_another_resolution(resolution, particles):
     """Transfer to another resolution.

@@ -182,6 +182,7 @@ def test_a_container_that_moves() -> None:
     assert abs(row["a_vy"]) < 0.02
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_grids_that_follow_the_liquid_measure_the_same(dimension: int) -> None:
     """Measurements on grids that follow the liquid.

@@ -49,11 +49,13 @@ def largest_speed(simulation: LiquidSimulation, until: float) -> float:
     )
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize(("case", "until"), [*((case, 1.5) for case in CASES), *LONG])
 def test_a_liquid_of_whole_cells_stays_at_rest(case: str, until: float) -> None:
     assert largest_speed(tank(case, **VOXEL), until) < 1e-3
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(("case", "until"), [*((case, 1.0) for case in CASES), *LONG])
 def test_a_liquid_with_a_surface_between_cells_comes_to_rest(case: str, until: float) -> None:
     simulation = tank(case)

@@ -150,6 +150,7 @@ def drawn(seed: int) -> LiquidSimulation:
     )
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("seed", few(range(12), 5))
 def test_it_solves_the_dense_problem(seed: int) -> None:
     simulation = drawn(seed)

@@ -570,6 +570,7 @@ def cap(angle: float, prescribed_angle: float) -> tuple[LiquidSimulation, float,
     return simulation, height, radius
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("angle", [60.0, 90.0, 120.0])
 def test_a_drop_keeps_its_contact_angle(angle: float) -> None:
     heights = {}
@@ -674,6 +675,7 @@ def test_a_wetting_drop_hangs_from_a_separating_ceiling(angle: float, hangs: boo
     assert fallen < 0.001 if hangs else fallen > 0.005
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("width", "angle"), [(0.004, 30.0), (0.004, 70.0), (0.008, 20.0), (0.008, 60.0)]
 )
@@ -701,6 +703,7 @@ def test_a_meniscus_rises_along_separating_walls(width: float, angle: float) -> 
     assert fastest["separating"] < 1.1 * fastest["free-slip"]
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("angle", [60.0, 30.0])
 def test_liquid_rises_between_plates(angle: float) -> None:
     """Rise of liquid between plates.

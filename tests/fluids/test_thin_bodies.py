@@ -33,6 +33,7 @@ def cup(folder: Path, bottom: float) -> Path:
     return file
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(("density", "bottom", "inner"), [(200.0, 0.31, 0.08), (3000.0, 0.33, 0.0)])
 def test_a_cup_floats_and_keeps_its_water(
     tmp_path: Path, density: float, bottom: float, inner: float

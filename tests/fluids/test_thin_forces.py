@@ -47,6 +47,7 @@ def totals(simulation: LiquidSimulation, about: np.ndarray) -> np.ndarray:
     return result
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(("angle", "offset"), covering([45.0, 30.0], [0.1, 0.4, 0.6, 0.9], count=4))
 def test_a_tilted_bottle_carries_its_content(angle: float, offset: float) -> None:
     """Force and line of action are those of the weight.

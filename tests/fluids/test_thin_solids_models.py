@@ -74,6 +74,7 @@ def test_pools_on_two_sides_of_a_sheet_rest_as_beside_a_thick_wall(name: str) ->
         )
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("name", ["plain", "viscosity", "surface tension"])
 def test_pools_come_to_rest(name: str) -> None:
     assert speeds(pools(THIN, MODELS[name]), 1.0)[-1] < 1e-3 * SPEED
@@ -102,6 +103,7 @@ def flow(width: float, tables: dict[str, Any]) -> tuple[np.ndarray, float]:
     return np.array(layers), simulation.measured["forces"]["solid0_fx"]
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     "tables",
     [

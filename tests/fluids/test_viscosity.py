@@ -157,6 +157,7 @@ def test_rigid_motions_stay_and_momenta_are_kept(dimension: int) -> None:
     assert energy[1] < 0.1 * energy[0]
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("above", [0.1, 0.3, 0.45])
 def test_the_surface_bears_no_shear_however_short_the_step(above: float) -> None:
     """Surface without shear, however short the step.
@@ -440,6 +441,7 @@ def test_couette_flow_between_cut_walls() -> None:
     assert errors[0] / errors[1] > 2.8
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("slip", [0.0, 0.1])
 def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
     """Front of a thin layer on a no-slip floor.

@@ -299,6 +299,7 @@ def quiet() -> ProgressLines:
     return ProgressLines(Console(quiet=True))
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("name", ["xdmf", "vtk", "gmsh"])
 def test_a_run_in_another_format_goes_on_and_is_drawn(scene_file, tmp_path, name):
     plain, other = tmp_path / "plain", tmp_path / "other"

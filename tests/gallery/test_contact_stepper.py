@@ -89,6 +89,7 @@ def collision():
     return world
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("stabilization", ["none", "baumgarte", "split"])
 def test_momentum_stays_without_gravity(stabilization):
     """Momentum without gravity.

@@ -140,6 +140,7 @@ def black_scholes(m, spot):
     ) - spot * scipy.stats.norm.cdf(-d)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("correlation", [0.1, -0.7, 0.0])
 def test_european_puts_by_the_closed_form(correlation):
     m, spots = Heston(correlation=correlation), np.arange(8.0, 13.0)

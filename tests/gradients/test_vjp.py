@@ -117,6 +117,7 @@ def test_grids_with_random_masks_and_coefficients(shape, seed):
     assert not gradients.b.numpy()[cells != wl.FLUID].any()
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(("shape", "seed"), [((9, 8), 12), ((4, 4, 5), 29)])
 def test_numbers_have_derivatives_that_are_numbers(shape, seed):
     cells, data = random_grid(shape, seed)
@@ -343,6 +344,7 @@ def test_matrices(symmetric):
     assert 0 < one.free < 25
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_large_sparse_matrices_by_their_own_methods(symmetric):
     """Large sparse matrices by methods beyond the direct ones.
@@ -382,6 +384,7 @@ class ProductOperator:
         raise NotImplementedError
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_operators_of_a_users_own(symmetric):
     A, rng = random_matrix(20, 61, symmetric)

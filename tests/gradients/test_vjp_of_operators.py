@@ -123,6 +123,7 @@ def test_more_gradients_are_those_of_the_matrix(kind, seed):
     check(kind, seed)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("kind", ["rows", "columns", "circulant"])
 def test_gradients_of_singular_stencils_are_those_of_the_pseudo_inverse(kind):
     """Gradients of singular stencils: those of the pseudo-inverse.

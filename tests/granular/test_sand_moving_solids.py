@@ -34,6 +34,7 @@ def depth_in_solids(simulation: SandSimulation) -> float:
     return deepest / simulation.grid.spacing
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_paddle_pushes_sand_and_none_gets_behind_it(dimension: int) -> None:
     """Sand pushed by a paddle; none gets behind it.
@@ -148,6 +149,7 @@ def test_a_belt_drags_sand_along_with_friction_and_not_without() -> None:
     assert found[1] == pytest.approx(0.3 * GRAVITY * 0.1, rel=0.25)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_solid_comes_in_from_outside_and_leaves(dimension: int) -> None:
     ball = {

@@ -59,6 +59,7 @@ def test_a_grain_falls_freely(dimension: int) -> None:
     np.testing.assert_allclose(simulation.particles.velocity.numpy()[0], expected, atol=1e-5)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_block_falls_freely(dimension: int) -> None:
     """Free fall of a block.
@@ -106,6 +107,7 @@ def settled(dimension: int) -> tuple[SandSimulation, list[dict[str, float]]]:
     return simulation, advance(simulation, 0.25)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_each_layer_bears_the_weight_above(dimension: int) -> None:
     """Load of each layer.

@@ -144,6 +144,7 @@ def drawn_criteria(rng: np.random.Generator) -> wl.StoppingCriteria:
     )
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize("seed", range(18))
 def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Solves equal to those of the host.

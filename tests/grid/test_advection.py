@@ -57,6 +57,7 @@ def test_third_order_on_a_rotating_blob() -> None:
     assert 6.5 < errors[0] / errors[1] < 9.5
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("grid", [FLAT, SPACE], ids=["2d", "3d"])
 @settings(max_examples=60, deadline=None)
 @given(random_seed=st.integers(0, 10**6), speed=st.sampled_from([0.1, 1.0, 10.0, 1e4]))

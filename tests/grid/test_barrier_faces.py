@@ -247,6 +247,7 @@ def plate_in(dimension, rng, turned):
     return PlateAcrossFaces(half, turn, place)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", few(range(2), 1))

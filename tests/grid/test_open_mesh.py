@@ -125,6 +125,7 @@ def test_meshes_that_are_no_walls_are_refused(tmp_path):
         load_surface("builtin:torus", tmp_path, 0.01)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("thickness", [0.05, 0.6])
 def test_a_bowl_of_an_open_mesh_holds_its_water(tmp_path: Path, thickness: float):
     cell = 1.0 / 16

@@ -286,6 +286,7 @@ def test_separation_at_a_sliver_depends_on_the_sliver_itself(contact: int, speed
     assert v[row, 5:-5] == pytest.approx(-1.0)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("counts", [(7, 6, 1), (5, 6, 4)])
 @settings(max_examples=30, deadline=None)
 @given(random_seed=st.integers(0, 10**6))

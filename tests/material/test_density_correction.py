@@ -489,6 +489,7 @@ def test_every_third_step() -> None:
     ]
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     "tables", [{}, {"solid": [box([0.5, 0.0], [0.7, 0.11], rotate=20)]}, {"dimension": 3}]
 )

@@ -83,6 +83,7 @@ def run(simulation: ParticleSimulation, steps: int) -> list[Mapping[str, Any]]:
     return [simulation.step(0.008 if n % 3 else 0.004) for n in range(steps)]
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize("name", chosen(CASES, CASES[::3]))
 def test_a_moving_window_has_the_results_of_the_whole_domain(name: str, small: None) -> None:
     """Moving window against a grid of the domain.
@@ -105,6 +106,7 @@ def test_a_moving_window_has_the_results_of_the_whole_domain(name: str, small: N
     assert np.array_equal(np.unique(cells, axis=0), np.unique(whole.frame()[1].index, axis=0))  # type: ignore[union-attr]
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize("name", chosen(CASES, CASES[2::3]))
 def test_a_moving_window_resumes_bit_for_bit_and_on_the_whole_grid(name: str, small: None) -> None:
     through, later, whole = (
@@ -134,6 +136,7 @@ def test_a_moving_window_resumes_bit_for_bit_and_on_the_whole_grid(name: str, sm
     assert later.grid == whole.grid
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.cpu_form("pieces of rows are the CPU's")
 @pytest.mark.parametrize("name", chosen(CASES, CASES[1::3]))
 def test_active_rows_leave_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:

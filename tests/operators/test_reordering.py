@@ -47,6 +47,7 @@ def test_the_order_is_a_permutation_that_gathers_entries(block):
     assert np.abs(entries.row - entries.col).max() < 4 * block * N
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("wind", [0.0, 0.4])
 def test_results_come_back_in_the_numbering_of_the_problem(wind):
     A, b, lower, order = shuffled(wind=wind)

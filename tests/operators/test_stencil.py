@@ -63,6 +63,7 @@ def check_definition(seed, kind, device):
         assert B.symmetric <= np.allclose(other.matrix(), other.matrix().T, atol=1e-14)
 
 
+@pytest.mark.default_cases(5)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", few(range(5200, 5205), 2))
 def test_products_and_matrices_are_those_of_the_definition(seed, kind, device):

@@ -68,6 +68,7 @@ def solves(up, method, *, in_place):
     return A, results
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.cpu_form("boxes that are partly in use are the CPU's")
 @pytest.mark.parametrize(
     ("method", "up", "in_place"),

@@ -44,6 +44,7 @@ def tops(bodies, number, floor, lengths, duration):
     return np.array(heights)
 
 
+@pytest.mark.default_cases(5)
 @pytest.mark.parametrize("lengths", STEPS)
 @pytest.mark.parametrize(
     ("restitution", "drop", "dimension"),

@@ -135,6 +135,7 @@ def test_every_command_shows_random_text(scene_file, tmp_path, monkeypatch, seed
     )
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize("text", [ALL, *CONTROLS], ids=ascii)
 def test_matrices(tmp_path, text):
     b = tmp_path / "b.mtx"

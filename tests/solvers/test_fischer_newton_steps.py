@@ -101,6 +101,7 @@ def operators(A, device):
     )
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("kink", "share", "safeguard"),
     covering(["perturbation", "zero"], [1.0, 0.6], [False, True], count=4),

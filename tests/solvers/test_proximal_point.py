@@ -76,6 +76,7 @@ def test_linear_programs(kind, method):
         assert c @ x[:9] == pytest.approx(h @ x[9:], abs=1e-5)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
 @pytest.mark.parametrize("zeros", [0.5, 0.8])
 def test_semidefinite_matrices_are_solved(zeros, method):

@@ -231,6 +231,7 @@ def test_rigid_motions_make_contact_as_cheap_as_a_linear_solve(numbered):
     )
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("name", WEAK)
 def test_weak_preconditioners_cost_one_linear_solve(name, device):
     """Weak preconditioners: the cost of one linear solve.
