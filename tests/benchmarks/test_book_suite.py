@@ -18,6 +18,7 @@ from warp_lcp.gallery import contact_scenes as gallery
 SMALL = ProblemScale.of(Options("cpu", (8,), 1, print))
 
 
+@pytest.mark.slow
 def test_the_suite_runs_every_experiment(monkeypatch, tmp_path):
     kept = {name: gallery.SCENES[name] for name in ("sphere-stack", "incline")}
     monkeypatch.setattr(gallery, "SCENES", kept)

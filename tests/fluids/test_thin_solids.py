@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from default_run import covering
+from default_run import covering, slow
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
@@ -303,7 +303,9 @@ def test_a_surface_mesh_ends_at_both_sides_of_a_sheet(thickness: float, angle: f
     assert volume == pytest.approx(0.25 - taken, rel=0.01)
 
 
-@pytest.mark.parametrize(("thickness", "period"), [(0.5, 0.3), (0.5, 0.04), (4.0, 0.1)])
+@pytest.mark.parametrize(
+    ("thickness", "period"), [(0.5, 0.04), *map(slow, [(0.5, 0.3), (4.0, 0.1)])]
+)
 def test_a_bottle_shaken_hard_keeps_its_volume(thickness: float, period: float) -> None:
     """Liquid in a bottle at up to 2.5, 19 and 7.5 m/s, which gravity is too weak to spread."""
     cells, count = 48, 20

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
+from default_run import slow
 from warp_lcp.gallery.contact_scenes import (
     SCENES,
     box,
@@ -220,7 +221,7 @@ BLOCKED = {
 
 
 @pytest.mark.parametrize(
-    "method", [None, wl.NNCG(), DIRECT, BLOCKED["blocked"], BLOCKED["staggering"]]
+    "method", [None, wl.NNCG(), DIRECT, BLOCKED["blocked"], slow(BLOCKED["staggering"])]
 )
 def test_a_stack_stands_with_every_method(method):
     world = box_stack(3)

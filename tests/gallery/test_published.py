@@ -18,7 +18,12 @@ from warp_lcp.gallery import PUBLISHED, Heston, IceDome, journal_bearing, sine_o
 
 SLOW = pytest.mark.slow
 ROWS = [
-    pytest.param(p, marks=SLOW if p.slow else (), id=f"{p.problem}, {p.case}, {p.source}")
+    # Prices of puts take seconds; others below compare them.
+    pytest.param(
+        p,
+        marks=SLOW if p.slow or p.problem == "American put" else (),
+        id=f"{p.problem}, {p.case}, {p.source}",
+    )
     for p in PUBLISHED
 ]
 # Triangles of a cell: corners (x, y), the right angle first.

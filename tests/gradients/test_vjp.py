@@ -13,7 +13,7 @@ from default_run import covering
 
 TIGHT = wl.StoppingCriteria(rtol=1e-13, atol=1e-13, max_iterations=300)
 STEP = 1e-6
-DIRECTIONS = 8  # number of fields along which differences are taken
+DIRECTIONS = 3  # number of fields along which differences are taken
 F64 = {"device": "cpu", "dtype": wp.float64}
 
 

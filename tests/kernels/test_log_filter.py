@@ -43,6 +43,7 @@ def messages() -> tuple[KernelMessages, MessageLog, io.StringIO]:
     return KernelMessages(said, stream), said, stream
 
 
+@pytest.mark.slow
 def test_a_script_has_one_message_of_its_kernels_and_no_compiler_warning(tmp_path: Path) -> None:
     for compiles in (1, 0):
         done = subprocess.run(
@@ -64,7 +65,7 @@ def test_a_script_has_one_message_of_its_kernels_and_no_compiler_warning(tmp_pat
     ("made", "stream"),
     [
         slow(("wl.DenseOperator(np.eye(2), device='cpu')", "open")),
-        ("wl.DenseOperator(np.eye(2), device='cpu')", "closed"),
+        slow(("wl.DenseOperator(np.eye(2), device='cpu')", "closed")),
         (
             "wl.DirectEnumeration; from warp_lcp.grid.staggered import StaggeredGrid; "
             "StaggeredGrid((2, 2, 1), 1.0, 2, device='cpu')",

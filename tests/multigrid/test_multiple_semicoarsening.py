@@ -142,9 +142,9 @@ def solved(shape, strengths, lower=-np.inf, upper=np.inf, solver=None):
     ("n", "strengths"),
     [
         *((64, strengths) for strengths in (turn, circles, waves, halves)),
-        (256, patch),
+        slow((256, patch)),
         *(slow((256, strengths)) for strengths in (turn, circles, waves, halves)),
-        slow((64, patch)),
+        (64, patch),
     ],
 )
 def test_the_default_solves_turning_anisotropy(n, strengths):

@@ -73,7 +73,7 @@ METHODS = [
         METHODS,
         ["bare", "with rmatvec", "function", "said", "product", "own"],
         [True, False],
-        count=4 * len(METHODS),
+        count=2 * len(METHODS),
     ),
 )
 def test_methods_that_need_only_products_accept_a_linear_operator(name, kind, symmetric):

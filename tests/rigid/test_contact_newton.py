@@ -54,7 +54,7 @@ def creep(bodies, steps, lengths):
     ("dimension", "count", "ratio", "heavy_on_top"),
     [
         (2, 20, 1e3, True),
-        (3, 20, 1e2, False),
+        slow((3, 20, 1e2, False)),
         (3, 8, 1e6, True),
         slow((2, 20, 1e3, False)),
         slow((3, 20, 1e2, True)),

@@ -116,7 +116,7 @@ def across(kind, bottom):
         ("capsule", "capsule"),
         ("capsule", "box"),
         slow(("box", "capsule")),
-        ("mesh", "mesh"),
+        slow(("mesh", "mesh")),
         slow(("capsule", "mesh")),
         ("mesh", "capsule"),
         slow(("mesh", "box")),

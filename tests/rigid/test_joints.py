@@ -104,7 +104,7 @@ def double_pendulum(duration: float, dimension: int) -> np.ndarray:
     ).y[:2, -1]
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [slow(2), 3])
 def test_a_double_pendulum_goes_as_lagrange_says(dimension):
     """Double pendulum by Lagrange's equations, of second order.
 
@@ -139,7 +139,7 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
         turned,
     )
     zeros, last = [], 0.0
-    for step in go(bodies, dt, 130):
+    for step in go(bodies, dt, 95):
         angle = bodies.joints[0].angle(bodies.bodies) + np.pi / 2
         if last * angle < 0.0:
             zeros.append((step + 1) * dt - dt * angle / (angle - last))
@@ -149,7 +149,7 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
     assert 2 * np.diff(zeros).mean() == pytest.approx(period, rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["ball", slow("hinge"), "fixed"])
+@pytest.mark.parametrize("kind", [slow("ball"), slow("hinge"), "fixed"])
 def test_joined_bodies_in_flight_keep_both_momenta(kind):
     bodies = system(
         tuple(
@@ -173,7 +173,7 @@ def test_joined_bodies_in_flight_keep_both_momenta(kind):
         return np.sum(each, axis=0)
 
     before = momenta()
-    for _ in go(bodies, 0.01, 40, np.zeros(3)):
+    for _ in go(bodies, 0.01, 25, np.zeros(3)):
         pass
     # J is that of the begin of the step, where anchors are 1e-9 apart.
     assert momenta() == pytest.approx(before, abs=1e-6)
@@ -204,10 +204,10 @@ def test_a_limit_stops_a_bar_and_releases_it():
     it at 0.3.
     """
     bodies = system(chain(1, limits=(-0.5, 0.3)), 1)
-    for _ in go(bodies, 0.01, 60):
+    for _ in go(bodies, 0.01, 30):
         assert bodies.joints[0].angle(bodies.bodies) > -0.5 - 1e-7
     assert bodies.joints[0].angle(bodies.bodies) == pytest.approx(-0.5, abs=1e-6)
-    for _ in go(bodies, 0.01, 80, -DOWN):
+    for _ in go(bodies, 0.01, 40, -DOWN):
         assert bodies.joints[0].angle(bodies.bodies) < 0.3 + 1e-7
     assert bodies.joints[0].angle(bodies.bodies) == pytest.approx(0.3, abs=1e-6)
 
@@ -220,7 +220,7 @@ def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
     bodies = system(chain(1, motor_speed=3.0, motor_torque=2.0), 1)
     body = bodies.bodies[0]
     inertia = body.properties.inertia[2, 2] + body.properties.mass * (LENGTH / 2) ** 2
-    for step in go(bodies, 0.02, 45, np.zeros(3)):
+    for step in go(bodies, 0.02, 36, np.zeros(3)):
         # Velocities are those of the middle of steps; the first gravity step is half of one.
         middle = (step + 0.5) * 0.02
         assert body.angular_velocity[2] == pytest.approx(min(3.0, 2.0 / inertia * middle), rel=2e-3)
@@ -229,10 +229,10 @@ def test_a_motor_reaches_its_speed_with_the_torque_that_it_has():
     assert torque == pytest.approx(0.0, abs=1e-6)
     for most, lifts in ((2.0, False), (20.0, True)):
         bodies = system(chain(1, motor_speed=1.0, motor_torque=most), 1)
-        for _ in go(bodies, 0.01, 20):
+        for _ in go(bodies, 0.01, 10):
             pass
         assert (bodies.joints[0].angle(bodies.bodies) > 0.0) == lifts
-    weight = 9.81 * 5.0 * LENGTH / 2 * np.cos(0.2)
+    weight = 9.81 * 5.0 * LENGTH / 2 * np.cos(0.1)
     assert bodies.row()["joint0_torque"] == pytest.approx(weight, rel=0.02)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from command_line import invoke
+from default_run import slow
 from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak
 from warp_lcp.cli import commands as cli
 from warp_lcp.files import size_limits as claims
@@ -23,7 +24,7 @@ from warp_lcp.simulation import StepFailed
 
 @pytest.mark.usefixtures("only_new_objects")
 @pytest.mark.parametrize(
-    ("name", "every"), [("dam-break-2d", 0), ("dam-break", 1), ("mesh-obstacle", 1)]
+    ("name", "every"), [("dam-break-2d", 0), ("dam-break", 1), slow(("mesh-obstacle", 1))]
 )
 def test_the_parts_add_up_to_what_a_simulation_takes(name: str, every: int) -> None:
     """Sum of the parts: memory of a simulation.

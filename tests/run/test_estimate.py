@@ -130,7 +130,7 @@ def test_suspicious_settings_are_reported() -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned"),
+        slow((lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned")),
         (lambda v, t: (v, [*t[:9, ::-1], *t[9:]]), "turned 9 of 9216 triangles that disagreed"),
         (lambda v, t: (v, [*t, *t[:20]]), "dropped 20 repeated triangles"),
         (

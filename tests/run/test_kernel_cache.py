@@ -121,6 +121,7 @@ def test_a_cache_that_cannot_be_written(compiled, tmp_path):
     assert launch() == 3.0
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     command = [sys.executable, "-c", "from warp_lcp.cli.commands import main; main()", "info"]
