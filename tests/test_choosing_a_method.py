@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
+from default_run import slow
 from warp_lcp import gallery
 from warp_lcp.gallery import PlantedSolution, planted
 from warp_lcp.gallery.matrices import spectrum_matrix
@@ -102,7 +103,7 @@ def test_costs_are_of_methods():
 HEADER, CLAIMS = table("What A must be")
 
 
-@pytest.mark.parametrize("name", CLAIMS)
+@pytest.mark.parametrize("name", [slow(n) if n == "gradient-descent" else n for n in CLAIMS])
 def test_claims_about_matrices_hold(name):
     if name == "quadratic-program":
         pytest.importorskip("piqp")

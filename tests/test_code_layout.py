@@ -3,7 +3,6 @@
 A line has at most 100 columns, and a class name is defined once.
 """
 
-import ast
 import re
 import subprocess
 from collections import Counter
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from parsed_sources import parsed
+from parsed_sources import classes
 
 ROOT = Path(__file__).parents[1]
 PRODUCT = ("warp_lcp", "fluids", "granular")
@@ -56,10 +55,5 @@ def test_the_formatter_has_no_exemptions():
 
 
 def test_a_class_name_is_defined_once():
-    defined = Counter(
-        node.name
-        for path in sources("*.py")
-        for node in ast.walk(parsed(path))
-        if isinstance(node, ast.ClassDef)
-    )
+    defined = Counter(name for path in sources("*.py") for name, _ in classes(path))
     assert [name for name, count in defined.items() if count > 1] == []

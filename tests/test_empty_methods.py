@@ -114,7 +114,7 @@ class Base:
     @abstractmethod
     def e(self): pass
     def f(self): pass
-class Other(Protocol):
+class Interface(Protocol):
     def a(self): ...
 class Middle(Base):
     def a(self): return 1 + 1
@@ -123,7 +123,7 @@ class Middle(Base):
 class Last(Middle):
     def b(self, x): return 2 * x
     def c(self): return (1, 2, self)
-class Mine(Other):
+class Mine(Interface):
     def a(self): return 3 + 4
 """
     assert set(overridden([ast.parse(source)])) == {"Base.a", "Base.b", "Base.c"}

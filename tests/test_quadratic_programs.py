@@ -85,6 +85,7 @@ def optimal(program, found, message, accuracy=2e-8):
     ).all(), message
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize("seed", few(range(40, 72), 12))
 def test_drawn_programs(seed):
     check(seed)

@@ -3,14 +3,14 @@
 import ast
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
 import typer
 
 import warp_lcp as wl
-from parsed_sources import parsed
+from parsed_sources import classes, functions, parsed
 from warp_lcp import gallery
 from warp_lcp.cli.commands import app
 
@@ -458,14 +458,15 @@ def test_the_glossary_names_code_that_exists(term, file, name):
     assert not name or name in defined, term
 
 
-def definitions(kind: type[ast.ClassDef] | type[ast.FunctionDef], *folders: str) -> dict[str, str]:
+def places_of(
+    defined: Callable[[Path], Iterable[tuple[str, int]]], *folders: str
+) -> dict[str, str]:
     """Return the place of each class or function, nested ones included, by its name."""
     return {
-        node.name: f"{file.relative_to(ROOT)}:{node.lineno}"
+        name: f"{file.relative_to(ROOT)}:{line}"
         for folder in folders
         for file in (ROOT / folder).rglob("*.py")
-        for node in ast.walk(parsed(file))
-        if isinstance(node, kind)
+        for name, line in defined(file)
     }
 
 
@@ -481,9 +482,7 @@ def is_term(name: str) -> bool:
 
 
 def test_class_names_are_terms():
-    places = definitions(
-        ast.ClassDef, "warp_lcp", "fluids", "granular", "benchmarks", "tests", "docs"
-    )
+    places = places_of(classes, "warp_lcp", "fluids", "granular", "benchmarks", "tests", "docs")
     assert len(places) > 900
     assert {name: place for name, place in places.items() if not is_term(name)} == {}
     assert not any(map(is_term, ("Kept", "_Planned", "StoresRounded", "ReplacedTaken", "Told")))
@@ -491,7 +490,7 @@ def test_class_names_are_terms():
 
 
 def test_older_names_of_functions_do_not_come_back():
-    places = definitions(ast.FunctionDef, "warp_lcp", "fluids", "granular")
+    places = places_of(functions, "warp_lcp", "fluids", "granular")
     found = {
         f"{name} ({places[name]})": OLDER_FUNCTIONS[name]
         for name in OLDER_FUNCTIONS.keys() & places.keys()

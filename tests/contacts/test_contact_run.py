@@ -226,7 +226,7 @@ def test_in_a_plane() -> None:
                 *solids, domain={"size": [3.0, 3.0]}, solver={"method": method, "tolerance": 1e-6}
             )
         )
-        for _ in range(8):
+        for _ in range(4):
             row = simulation.step(0.01)
         assert row["body2_y"] == pytest.approx(1.25, abs=1e-5)
         assert row["max_speed"] < 1e-4  # type: ignore[operator]

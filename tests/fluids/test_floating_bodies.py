@@ -58,6 +58,7 @@ def dense_columns(simulation):
     return U
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("model", ["incompressible", "unilateral"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, model):

@@ -42,6 +42,7 @@ def dense(path: Path, outside: float, shape: tuple[int, int, int]) -> np.ndarray
     return values[tuple(slice(count) for count in shape)]
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("scene", ["dam-break", "column-collapse"])
 def test_volumes_lie_where_the_particles_are(tmp_path, scene):
     sizes = SMALL if scene == "dam-break" else ("domain.resolution=24", "time.duration=0.05")
@@ -76,6 +77,7 @@ def test_volumes_lie_where_the_particles_are(tmp_path, scene):
     assert not list(plain.glob("frames/*.nvdb"))
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("scene", ["dam-break", "dam-break-2d"])
 def test_images_show_what_hexahedra_do(tmp_path, scene):
     sizes = SMALL if scene == "dam-break" else ("domain.resolution=32", "time.duration=0.1")

@@ -53,6 +53,7 @@ def test_resumed_equals_uninterrupted(name: str, overrides: list[str], tmp_path:
 BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize(
     ("dimension", "tables"),
     [

@@ -175,6 +175,7 @@ def test_particles_stay_out_of_a_cross_that_turns(half):
     assert moment > 0.02  # the liquid turns with it, counterclockwise
 
 
+@pytest.mark.slow
 def test_waves_of_a_flap_are_as_long_and_high_as_linear_theory_says():
     """Waves of a flap against linear theory.
 

@@ -52,6 +52,7 @@ def states(tables: dict[str, Any]) -> list[dict[str, bytes]]:
     return found
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize("tables", TABLES.values(), ids=TABLES)
 def test_kernels_on_windows_have_the_results_of_kernels_on_all_cells(tables, monkeypatch):
     found = states(tables)

@@ -252,6 +252,7 @@ def wave(rows: list[dict[str, Any]]) -> tuple[float, float]:
     return 2.0 * float(np.diff(times).mean()), -float(np.polyfit(times, np.log(heights), 1)[0])
 
 
+@pytest.mark.slow
 def test_a_band_does_not_change_speed_and_damping_of_a_wave():
     """Speed and damping of a wave.
 
@@ -295,10 +296,10 @@ def test_a_splash_keeps_mass_and_volume():
     Waves break and enclose air: the mass is exact, the volume that of particles everywhere, with a
     third of them.
     """
-    simulation, rows = dams(BAND, 1.5)
-    other, reference = dams({}, 1.5)
+    simulation, rows = dams(BAND, 1.0)
+    other, reference = dams({}, 1.0)
     assert {row["mass"] for row in rows} == {reference[0]["mass"]}
-    times = np.linspace(0.05, 1.45, 100)
+    times = np.linspace(0.05, 0.95, 100)
     volume, expected = (volumes(log, times) for log in (rows, reference))
     assert np.abs(volume / expected - 1.0).max() < 0.03
     assert np.mean([row["particles"] for row in rows]) < 0.33 * other.particles.count
@@ -343,7 +344,7 @@ MODELS: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize(
-    "tables", chosen(MODELS, MODELS[::2]), ids=["apic", "flip", "pic", "moving", "sources"]
+    "tables", chosen(MODELS, MODELS[:3:2]), ids=["apic", "flip", "pic", "moving", "sources"]
 )
 def test_a_run_goes_on_as_if_it_had_not_stopped(tables):
     """Resumed runs, equal bit for bit, including the carried fields."""

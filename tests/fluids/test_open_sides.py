@@ -102,6 +102,7 @@ def test_a_block_leaves_as_if_there_were_no_side(side: str, solids: str, cut: bo
     ]
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bool) -> None:

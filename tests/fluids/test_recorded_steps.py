@@ -33,6 +33,7 @@ def steps(tables: dict[str, Any]) -> tuple[LiquidSimulation, list[dict[str, Any]
     return simulation, [dict(simulation.step(dt)) for dt in STEPS]
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize("model", MODELS)
 def test_recorded_launches_give_the_same_bits(monkeypatch, model):
     """Equal bits of recorded and immediate launches: positions, velocities, log."""

@@ -206,6 +206,7 @@ def test_the_push_is_a_jump_of_the_pressure(dimension: int) -> None:
     assert max(np.abs(field.numpy()).max() for field in simulation.velocity) < 1e-4
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize(
     ("dimension", "degrees", "angle"),
     [
@@ -317,6 +318,7 @@ def meniscus(
     )
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(
     ("place", "angle"),
     covering(
@@ -616,6 +618,7 @@ def test_invalid_settings_are_refused(tables: dict[str, Any], message: str) -> N
         scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], **tables)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(("angle", "dimension"), covering([20.0, 60.0, 100.0, 150.0], [2, 3]))
 def test_separating_walls_do_not_accelerate_a_splash(dimension: int, angle: float) -> None:
     """Speed of a splash at separating walls.

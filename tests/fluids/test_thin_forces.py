@@ -65,6 +65,7 @@ def test_a_tilted_bottle_carries_its_content(angle: float, offset: float) -> Non
     assert abs(torque) < 0.15 * CELL * weight
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("offset", [0.1, 0.4, 0.7])
 def test_both_sides_of_an_upright_bottle_bear_the_hydrostatic_load(offset: float) -> None:
     simulation, _low = bottle_at_rest(0.0, np.array([offset, 1.0 - offset]))

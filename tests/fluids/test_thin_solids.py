@@ -69,6 +69,7 @@ def test_a_closed_bottle_keeps_all(thickness: float, motion: dict[str, Any] | No
         assert rows[-1]["max_density"] < 1.2 and rows[-1]["max_speed"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_closed_bottle_in_space_keeps_all() -> None:
     solids, ends = bottle(3, 0.4, SHAKEN | {"amplitude": [0.1, 0.0, 0.05]})
     simulation = create(

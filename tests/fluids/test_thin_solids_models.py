@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from default_run import chosen
 from small_liquids import GRAVITY, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
@@ -52,7 +53,9 @@ def speeds(simulation: LiquidSimulation, until: float) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name", chosen(MODELS, ["plain", "contact angle", "unilateral", "whole cells", "flip"])
+)
 def test_pools_on_two_sides_of_a_sheet_rest_as_beside_a_thick_wall(name: str) -> None:
     thin, thick = (pools(width, MODELS[name]) for width in (THIN, THICK))
     found, expected = speeds(thin, 0.3), speeds(thick, 0.3)

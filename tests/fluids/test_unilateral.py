@@ -160,6 +160,7 @@ def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
     assert np.abs(velocity - expected).std() < 0.01
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(
     ("dimension", "cut"), [(2, False), slow((3, False)), slow((2, True)), (3, True)]
 )

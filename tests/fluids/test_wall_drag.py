@@ -214,6 +214,7 @@ def test_a_viscous_channel_is_dragged_as_its_equation_says() -> None:
     assert middle(simulation) == pytest.approx(exact, rel=0.02)
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize(
     ("degrees", "dimension"), covering([0.0, 7.0, 20.0, 31.0, 45.0, 68.0], [2, 3])
 )

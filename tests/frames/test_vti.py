@@ -30,6 +30,7 @@ def drawn(image):
     return shell.GetOutput()
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("whole", [False, True])
 def test_vtk_shows_exactly_the_cells(pyvista, tmp_path, dimension, whole):

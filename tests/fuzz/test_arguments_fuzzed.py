@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 from mutated import mutated
-from told import told
+from told import costly, told
 
 WORDS = [
     b"domain.resolution=8",
@@ -17,6 +17,7 @@ WORDS = [
 ]
 
 
+@costly
 @given(st.lists(mutated(WORDS), max_size=3))
 def test_overrides(words: list[bytes]) -> None:
     told(

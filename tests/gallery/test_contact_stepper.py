@@ -112,6 +112,7 @@ def test_momentum_stays_without_gravity(stabilization):
     assert touched > 2
 
 
+@pytest.mark.slow
 def test_energy_does_not_grow():
     world = collision()
     stepper = ContactStepper(world, wl.NNCG(), dt=DT, stabilization="none", stopping=TIGHT)
@@ -127,7 +128,11 @@ def test_energy_does_not_grow():
 
 @pytest.mark.parametrize(
     ("method", "model"),
-    [(None, None), (wl.NNCG(), None), (DIRECT, None), (wl.Lemke(), StewartTrinkleModel(4))],
+    [
+        (None, None),
+        *map(slow, [(wl.NNCG(), None), (DIRECT, None)]),
+        (wl.Lemke(), StewartTrinkleModel(4)),
+    ],
 )
 def test_a_box_slides_down_a_slope_with_the_acceleration_of_coulombs_law(method, model):
     mu, angle = 0.3, 0.5
@@ -168,6 +173,7 @@ def test_overlaps_are_removed_as_asked(stabilization):
     assert (top > 0.1) == (stabilization == "baumgarte")
 
 
+@pytest.mark.slow
 def test_a_pendulum_keeps_its_length_and_its_period():
     bob = Sphere(center=[np.sin(0.1), 0, -np.cos(0.1)], radius=0.1)
     world = World(
@@ -189,6 +195,7 @@ def test_a_pendulum_keeps_its_length_and_its_period():
     assert np.diff(crossings)[0] == pytest.approx(np.pi * np.sqrt(inertia / 9.81), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_limits_hold_a_hanging_chain_and_gears_turn_each_other():
     world = hanging_snake(4)
     stepper = ContactStepper(world, DIRECT, dt=DT, stopping=TIGHT)

@@ -9,7 +9,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from default_run import covering
+from default_run import covering, slow
 
 TIGHT = wl.StoppingCriteria(rtol=1e-13, atol=1e-13, max_iterations=300)
 STEP = 1e-6
@@ -109,7 +109,7 @@ def grid_problem(cells, **options):
     return make
 
 
-@pytest.mark.parametrize(("shape", "seed"), [((7, 6), 11), ((6, 7), 23), ((3, 4, 5), 37)])
+@pytest.mark.parametrize(("shape", "seed"), [((7, 6), 11), slow(((6, 7), 23)), ((3, 4, 5), 37)])
 def test_grids_with_random_masks_and_coefficients(shape, seed):
     cells, data = random_grid(shape, seed)
     gradients = check(grid_problem(cells), data, seed)
@@ -181,6 +181,7 @@ STENCILS = {
 }
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(("name", "outside"), covering(list(STENCILS), [wl.AIR, wl.SOLID]))
 def test_stencils_of_arrays_and_numbers(name, outside):
     varying, numbers, center, periodic = STENCILS[name]

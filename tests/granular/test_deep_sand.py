@@ -56,6 +56,7 @@ def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction:
     assert row["solve_iterations"] <= (3.0 if friction else 5.0) * cells + 40
 
 
+@pytest.mark.slow
 def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields() -> None:
     """Limit of the momentum: smaller residual where deep sand yields.
 

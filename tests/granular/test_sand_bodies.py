@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 import warp_lcp as wl
+from default_run import slow
 from scene_tables import ball, box
 from stepping import advance
 from warp_lcp.granular.scene import SandScene
@@ -51,6 +52,7 @@ def height(simulation: SandSimulation) -> float:
     return float(simulation.bodies.bodies[0].position[1])
 
 
+@pytest.mark.slow
 def test_a_light_ball_stays_on_top_and_a_heavy_one_digs_in_and_stops() -> None:
     """Light and heavy ball on sand.
 
@@ -121,7 +123,7 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
     assert abs(np.degrees(body.bodies[0].angle)) < 0.5
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.25, 0.7])
+@pytest.mark.parametrize("friction", [slow(0.0), 0.25, 0.7])
 def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float) -> None:
     """Block on a slope of firm sand, by Coulomb's law.
 

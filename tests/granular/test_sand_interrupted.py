@@ -52,6 +52,7 @@ def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_
     assert written_files(uninterrupted) == written_files(parts)
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(
     ("dimension", "tables"),
     [

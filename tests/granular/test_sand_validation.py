@@ -40,6 +40,7 @@ def test_a_column_runs_as_far_as_in_experiments_and_stops() -> None:
     assert trial.failures() == []
 
 
+@pytest.mark.slow
 def test_half_the_friction_runs_too_far() -> None:
     angle = float(np.degrees(np.arctan(0.5 * scenes.WALL_FRICTION)))
     c = sand_collapse.collapse(2.0, 10, length=12.0, angle=angle, floor=0.5 * scenes.WALL_FRICTION)
@@ -74,6 +75,7 @@ def test_a_collapse_keeps_its_invariants() -> None:
     assert trial.findings[-1].passed
 
 
+@pytest.mark.slow
 def test_a_pile_at_rest_hardly_moves_inside() -> None:
     (_, deep), (whole, later) = sand_collapse.rest(10, 2)
     assert max(deep, later) < sand_collapse.DEEP

@@ -26,6 +26,7 @@ from warp_lcp.grid.signed_distance import Box, Placement, Plane, Sphere, Triangl
 from warp_lcp.grid.voxelize import voxelize
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize(
     ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
 )
@@ -55,6 +56,7 @@ def test_fractions_are_exact_for_planes(dimension, direction):
     assert cut.dropped == 0
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize(
     ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
 )
@@ -302,6 +304,7 @@ def line_distribution(normal, offset, points=240):
     return float((weight * (1.0 - below if normal[main] > 0.0 else below)).sum())
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize(
     ("dimension", "direction"), [(d, n) for d in (2, 3) for n in DIRECTIONS[d]]
 )

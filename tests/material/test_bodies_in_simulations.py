@@ -157,6 +157,7 @@ def test_contacts_that_are_not_solved_fail_the_step(
             assert row[name] == pytest.approx(expected[name], rel=1e-4, abs=1e-9), name
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])
 def test_the_log_says_how_well_contacts_are_solved(simulator: str) -> None:
     simulation = make(

@@ -45,6 +45,7 @@ def emitted(rows: list[dict[str, Any]]) -> int:
     return sum(row["emitted"] for row in rows)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
 @pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
 def test_the_rate_is_area_times_velocity(solids: str, surface: str) -> None:
@@ -110,6 +111,7 @@ def pour(
     return simulation
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("cells", [0.25, slow(1.0), 3.0])
 # One cell thick, and four.
 @pytest.mark.parametrize(

@@ -95,6 +95,7 @@ def test_a_body_coupled_to_a_grid(cells, device):
         np.testing.assert_allclose(result.x.numpy().ravel()[fluid], expected, atol=1e-7)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
     """Weights that are symmetric up to rounding.

@@ -77,6 +77,7 @@ def test_a_sliding_particle_is_held_along_the_nearest_vector(directions):
         )
 
 
+@pytest.mark.slow
 def test_the_polyhedral_cone_converges_to_the_circular_one():
     """Convergence of the polyhedral cone to the circular one.
 

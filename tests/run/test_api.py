@@ -45,6 +45,7 @@ def by_command(scene: str, folder: Path) -> None:
     assert outcome.exit_code == 0, outcome.output
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("scene", ["dam-break-2d", "floating-bodies-2d", "column-collapse-2d"])
 def test_frames_log_and_checkpoints_are_those_of_the_command_line(scene, tmp_path):
     by_command(scene, tmp_path / "command")

@@ -65,6 +65,7 @@ def at(step: int, *numbers: signal.Signals) -> Any:
     return before_step
 
 
+@pytest.mark.default_cases(4)
 @EACH
 def test_after_a_step(dots, run, tmp_path, number):
     handlers = [signal.getsignal(each) for each in SIGNALS]
@@ -86,6 +87,7 @@ def test_after_a_step(dots, run, tmp_path, number):
     assert read_record(tmp_path / "out")["resumed_from_step"] == 6
 
 
+@pytest.mark.default_cases(4)
 @EACH
 @pytest.mark.parametrize("frames", [1, 10])
 def test_before_the_first_step_has_ended(dots, run, tmp_path, number, frames):

@@ -167,6 +167,7 @@ def test_a_folder_in_the_place_of_a_file_or_a_file_in_that_of_a_folder(out, scen
     assert f"{path}: is {kind}; move it away" in result.stderr
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(
     "seed",
     [

@@ -30,6 +30,7 @@ def semidefinite(rng, n, zeros):
     return (A + A.T) / 2
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("zeros", [0.0, 0.2, 0.5, 0.8])
 def test_semidefinite_problems(zeros):
     rng = np.random.default_rng(int(700 + 10 * zeros))

@@ -50,6 +50,7 @@ def test_iterations_do_not_depend_on_units(name, family, device):
         np.testing.assert_allclose(result.x.numpy() / x, plain.x.numpy(), atol=1e-4)
 
 
+@pytest.mark.default_cases(len(wl.METHODS))
 @pytest.mark.parametrize(
     ("name", "family", "precision"),
     chosen(

@@ -68,6 +68,7 @@ def operator(family, n, **options):
     )
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_linear_iterations_do_not_grow(family):
     counts = []
@@ -80,6 +81,7 @@ def test_linear_iterations_do_not_grow(family):
     assert counts[1] <= min(counts[0] + 3, 12)
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_obstacles_cost_about_what_linear_solves_do(family):
     n = 128

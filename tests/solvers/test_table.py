@@ -33,29 +33,31 @@ def precisions(cls):
 def cases():
     """Yield each method with its operators, bounds and precisions.
 
-    By default each method and operator has all bounds in its first precision, and one kind of
-    bounds, in turn, in each of the others: row functions are the same for all types. Emulated, what
-    blocks of threads do to each other is the same in each type and for all bounds: one kind of
-    bounds, in turn, in the first precision.
+    By default each method and operator has one kind of bounds, in turn, in its first precision;
+    each method has every kind of bounds, and each further precision with one operator. Row
+    functions are the same for all types. Emulated, what blocks of threads do to each other is the
+    same in each type and for all bounds: one kind of bounds, in turn, in the first precision.
     """
     for number, name in enumerate(METHODS):
         cls = METHODS[name]
         kinds = BOUNDS if getattr(cls, "boxed", True) else BOUNDS[:1]
-        for turn, family in enumerate(FAMILIES, number):
+        taken = [family for family in FAMILIES if family in families(cls)]
+        for turn, family in enumerate(taken, number):
             for bounds in kinds:
                 for later, precision in enumerate(precisions(cls)):
-                    if family in families(cls):
-                        own = bounds == kinds[(turn + later) % len(kinds)]
-                        by_default = own and not later if EMULATED else own or not later
-                        marks = () if by_default else pytest.mark.slow
-                        yield pytest.param(
-                            name,
-                            family,
-                            bounds,
-                            precision,
-                            marks=marks,
-                            id=f"{name}-{family}-{bounds}-{precision}",
-                        )
+                    own = bounds == kinds[(turn + later) % len(kinds)]
+                    if later:
+                        by_default = own and not EMULATED and (turn + later) % len(taken) == 0
+                    else:
+                        by_default = own or (len(taken) < len(kinds) and not EMULATED)
+                    yield pytest.param(
+                        name,
+                        family,
+                        bounds,
+                        precision,
+                        marks=() if by_default else pytest.mark.slow,
+                        id=f"{name}-{family}-{bounds}-{precision}",
+                    )
 
 
 def operator(family, tiny, rng, device):
