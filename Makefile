@@ -41,7 +41,7 @@ EMULATED ?= tests/solvers/test_table.py tests/multigrid/test_fused_levels.py tes
 emulated-cuda: $(VENV)/.dev
 	PYTHONPATH=tests:. $(BIN)/python -m pytest -p emulated_cuda -n $(WORKERS) --dist worksteal $(EMULATED) $(PYTEST_ARGS)
 
-# Longer studies, and the seeds and combinations that tests/default_run.py leaves to this target.
+# What is left out by default: longer studies, and cases that repeat values of arguments (tests/default_run.py).
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 

@@ -7,7 +7,7 @@ cases of one test.
 
 import itertools
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -75,45 +75,56 @@ def by_news(cases: Sequence[tuple[Any, ...]]) -> Iterable[tuple[int, int]]:
 
 
 def mark_repeated_cases(items: Iterable[pytest.Item]) -> None:
-    """Mark the cases of each function that repeat all values of its arguments as `slow`.
+    """Mark the cases of each function that repeat values of its arguments as `slow`.
 
     By default each value of each argument runs at least once on each device, in `FEWEST` cases or
     more; `SAMPLED` arguments need not have all of their values. Functions of which some cases are
     marked `slow` already have made their choice.
 
-    Marks:
+    Marks of functions:
         default_cases(count): as many cases run by default, whatever their number of values.
         every_case: all cases run by default.
     """
-    functions: defaultdict[Any, list[pytest.Function]] = defaultdict(list)
+    functions: defaultdict[Any, list[Any]] = defaultdict(list)
     for item in items:
-        if isinstance(item, pytest.Function) and hasattr(item, "callspec"):
-            device = item.callspec.params.get("device")
-            functions[item.parent, item.originalname, device].append(item)
+        if callspec := getattr(item, "callspec", None):
+            name = getattr(item, "originalname", item.name)
+            functions[item.parent, name, callspec.params.get("device")].append(item)
     for cases in functions.values():
-        marked = cases[0].get_closest_marker("default_cases")
+        limit = cases[0].get_closest_marker("default_cases")
         free = [case for case in cases if not case.get_closest_marker("slow")]
-        if cases[0].get_closest_marker("every_case") or (len(free) < len(cases) and not marked):
+        if cases[0].get_closest_marker("every_case") or (len(free) < len(cases) and not limit):
             continue
-        default = set()
-        for place, new in by_news([tuple(named_values(case)) for case in free]):
-            if len(default) >= (marked.args[0] if marked else FEWEST if not new else len(free)):
-                break  # those that follow have nothing new
-            default.add(place)
+        values = [tuple(named_values(case.callspec.params)) for case in free]
+        default = default_places(values, limit.args[0] if limit else None)
         for place, case in enumerate(free):
             if place not in default:
                 case.add_marker(pytest.mark.slow)
 
 
-def named_values(case: pytest.Function) -> Iterable[tuple[str, Any]]:
-    """Yield names and values of the arguments of a case, by which cases are compared."""
-    for name, value in case.callspec.params.items():
+def default_places(cases: Sequence[tuple[Any, ...]], count: int | None = None) -> set[int]:
+    """Return the places of `count` cases, or of those that have every value once.
+
+    At least `FEWEST` are returned if there are as many.
+    """
+    default: set[int] = set()
+    for place, new in by_news(cases):
+        if len(default) >= (count or (len(cases) if new else FEWEST)):
+            break  # those that follow have nothing new
+        default.add(place)
+    return default
+
+
+def named_values(arguments: Mapping[str, Any]) -> Iterable[tuple[Any, ...]]:
+    """Yield name, type and value of the arguments of a case, by which cases are compared."""
+    for name, value in arguments.items():
         if name not in SAMPLED:
             try:
                 hash(value)
             except TypeError:
-                value = id(value)
-            yield name, type(value), value
+                yield name, type(value), id(value)
+            else:
+                yield name, type(value), value
 
 
 def by_turns(pairs: Sequence[tuple[str, str]]) -> list[Any]:
