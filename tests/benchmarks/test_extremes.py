@@ -51,7 +51,7 @@ def wrong(cases):
     return [f"{v.name}: {v.outcome}" for v in verdicts if v.wrong]
 
 
-@pytest.mark.parametrize("family", chosen(FAST, FAST[1:3] + FAST[4:]), ids=lambda f: f.__name__)
+@pytest.mark.parametrize("family", chosen(FAST, FAST[2:3] + FAST[4:]), ids=lambda f: f.__name__)
 def test_family(family):
     assert wrong(family()) == []
 

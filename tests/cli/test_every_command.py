@@ -117,6 +117,7 @@ def test_every_built_in_scene_is_checked(name: str) -> None:
     assert told in succeed("check", name, "--device", "cpu", "--set", small(name))
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("seed", few((*FEW, *MORE), 4))
 def test_drawn_scenes_are_checked(seed: int, tmp_path: Path) -> None:
     assert "whole run" in succeed("check", written(seed, tmp_path), "--device", "cpu")

@@ -134,6 +134,7 @@ def test_a_run_goes_on_bit_for_bit_after_every_step(more: dict[str, Any]) -> Non
     assert differences_by_step(loaded(tables(JOINTS, **more)), 6, 2) == {}
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("method", few(KINEMATIC))
 def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
     """Reach of an arm within its joint limits.

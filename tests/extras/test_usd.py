@@ -300,6 +300,7 @@ def test_usd_s_own_validators_find_nothing(falls, tmp_path, dimension):
     ] == []
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("name", ["run.usdc", "run.usda", "run.USD"])
 def test_kinds_of_files(dots, tmp_path, name):
     folder = write_run(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from default_run import slow
 from drawn_moving_walls import CROWDED, KINDS, drawn, excess, run
 
 SEEDS = range(6)
@@ -11,7 +12,7 @@ LOST = 0.01  # mean share of the volume that crowded cells lack
 MOST_LOST = 0.03
 
 
-@pytest.mark.parametrize(("seed", "kind"), [(2, "shaken"), (2, "piston"), (2, "blade")])
+@pytest.mark.parametrize(("seed", "kind"), [(2, "shaken"), slow((2, "piston")), (2, "blade")])
 def test_no_particle_passes_and_the_volume_stays(seed: int, kind: str) -> None:
     draw = drawn(seed, kind, 2)
     outcome = run(draw)

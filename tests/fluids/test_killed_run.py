@@ -216,6 +216,7 @@ def kill_and_resume(
     raise AssertionError("the runs end before they can be killed")
 
 
+@pytest.mark.slow
 def test_three_kills(tmp_path):
     steps = kill_and_resume(tmp_path, 3, 4999, ForkedCommand, 0.75)
     assert steps

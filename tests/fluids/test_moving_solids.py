@@ -59,6 +59,7 @@ def piston(*, wall, speed, surface, dimension=2, floor=None):
     return create(scene(size=size, resolution=32 if deep else 64, liquid=liquid, **tables))
 
 
+@pytest.mark.default_cases(4)
 @pytest.mark.parametrize(("dimension", "surface"), covering([2, 3], ["ghost-fluid", "voxel"]))
 @pytest.mark.parametrize(
     ("wall", "speed", "expected"),
@@ -108,6 +109,7 @@ def test_the_corner_between_a_piston_and_a_floor_turns_nothing_upwards(speed, he
     )
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
 def test_a_solid_crosses_the_domain_from_outside_to_outside(surface):
     ball = {

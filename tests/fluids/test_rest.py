@@ -114,6 +114,7 @@ BALLS: dict[str, list[dict[str, Any]]] = {
 }
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("ball", "surface", "wall"),
     covering(list(BALLS), ["ghost-fluid", "voxel"], ["separating", "free-slip"], count=4),

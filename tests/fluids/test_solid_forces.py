@@ -215,6 +215,7 @@ def test_the_force_log_has_the_impulse_of_the_body(dimension: int) -> None:
     assert np.abs(pushes).max() > 0.0
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(("dimension", "viscosity"), covering([2, 3], [0.05, 20.0]))
 def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(
     dimension: int, viscosity: float

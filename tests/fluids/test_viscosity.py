@@ -288,6 +288,7 @@ def test_any_liquid_among_any_solids_is_solved(seed: int, steps: int) -> None:
             assert least_eigenvalue(level) > -1e-4
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("seed", few([43, 74, *range(100, 160)], 2))
 def test_any_liquid_stirred_by_any_solids_is_solved(seed: int) -> None:
     """Solves of any liquid stirred by any solids.
@@ -703,6 +704,7 @@ def test_one_viscosity_of_all_liquids_is_that_of_the_table(own_viscosity: float)
     assert np.abs(first.particles.position.numpy() - second.particles.position.numpy()).max() < 1e-5
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_momenta_are_kept_where_thick_liquid_meets_thin(dimension: int) -> None:
     low, middle, high = (

@@ -247,6 +247,7 @@ def test_functions_have_the_gradients_of_their_values():
 
 
 # With drift and 2.1 a few sweeps are faster.
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(("drift", "center"), [(0.0, 2.1), (0.3, 2.0)])
 def test_matrices_solved_as_grids_have_gradients_of_their_own(drift, center):
     n, rng = 50, np.random.default_rng(4)

@@ -110,6 +110,7 @@ def check_coefficients(stencil, found, x, mu, within):
         )
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("kind", [*KINDS, *OTHERS])
 @pytest.mark.parametrize("seed", few([1, 5], 1))
 def test_gradients_are_those_of_the_matrix(kind, seed):

@@ -330,6 +330,7 @@ def acceleration(simulation: SandSimulation, down: np.ndarray) -> float:
     return (speeds[-1] - speeds[9]) / (20 * 2e-3)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("theta", "mu", "shift"), [(20.0, 0.2, 0.0), (30.0, 0.0, 0.3), (35.0, 0.4, 0.7)]
 )

@@ -153,6 +153,7 @@ def test_the_floor_bears_the_weight(dimension: int) -> None:
     assert floor == pytest.approx(weight, rel=0.02)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("model", "method"),
     [

@@ -14,6 +14,7 @@ def total(rows: list[dict[str, Any]], name: str) -> int:
     return sum(row[name] for row in rows)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_source_lets_in_area_times_velocity(dimension: int) -> None:
     source = box(

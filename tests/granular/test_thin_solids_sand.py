@@ -32,6 +32,7 @@ def simulate(
     return simulation, rows
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(("offset", "thickness"), covering([0.0, 0.3, 0.7], [0.1, 0.5]))
 def test_sand_rests_on_a_plate(thickness: float, offset: float) -> None:
     top = (8.0 + offset) / CELLS

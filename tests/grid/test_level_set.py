@@ -339,6 +339,7 @@ def test_solid_cells_take_the_mean_of_their_neighbors_a_layer_at_a_time(
     assert phi == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.default_cases(1)
 @GRIDS
 def test_the_capacity_of_whole_cells_is_what_a_continuum_in_the_open_ones_weighs(
     grid: StaggeredGrid,

@@ -42,6 +42,7 @@ def compare_meshes(seed: int, dimension: int) -> None:
         np.testing.assert_array_equal(one.numpy(), other.numpy())
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_mesh_has_the_distances_of_the_sampler(dimension: int) -> None:
     for seed in range(3):

@@ -150,6 +150,7 @@ def leaning_plate(rng):
     return PlateOnPath(half, turn, place)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("seed", few(range(6), 2))
 def test_paths_in_wedges_are_those_of_a_loop(seed):
     """Particles beside plates that lean on sides of the domain move toward both."""

@@ -51,6 +51,7 @@ def small(dimension: int, **tables: Any) -> LiquidSimulation:
     return create(model)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_bottle_holds_the_amount_that_its_scene_says(dimension: int) -> None:
     """The amount is right to 1 %; on the lattice alone some are off by more than twice of that."""

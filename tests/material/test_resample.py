@@ -89,6 +89,7 @@ def test_a_finer_grid_is_filled_evenly():
     assert counts[13:].sum() == 0  # at most the share of a particle at the surface
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("cells", "tables"),
     covering(

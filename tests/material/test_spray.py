@@ -62,6 +62,7 @@ def test_energy_equals_that_of_a_run_without_spray(monkeypatch: pytest.MonkeyPat
             assert row[name] == pytest.approx(expected[name], rel=1e-5), (n, name)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("start", "velocity", "solids"),
     [

@@ -106,7 +106,7 @@ def test_an_unknown_in_no_aggregate_is_not_moved_with_one(device):
 
 
 def test_a_matrix_may_change_and_so_may_the_fields():
-    n = 15
+    n = 11
     A, b = convection_diffusion(n, 30.0), load(n)
     operator = wl.SparseOperator(A, device="cpu")
     cycles = MonotoneAggregation(operator)

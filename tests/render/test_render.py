@@ -261,6 +261,7 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
     np.testing.assert_allclose(np.array(areas) / areas[0], np.array(frames) + 1, rtol=0.25)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(
     ("rate", "label"), [(20, "t = 0.05 s"), (100, "t = 0.01 s"), (1000, "t = 0.001 s")]
 )
@@ -328,6 +329,7 @@ def test_flat_walls_hide_what_of_discs_reaches_across_them(pyvista, make_run):
     assert far.max() > 0.4 - 4 * pixel
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("size", ["400x300", "300x400"])
 def test_balls_do_not_reach_beyond_the_outline_of_a_room(pyvista, make_run, size):
     """Balls within the outline of a room.

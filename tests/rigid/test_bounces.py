@@ -122,6 +122,7 @@ def test_elastic_bodies_that_rest_stay_at_rest(lengths):
     np.testing.assert_allclose([body.position for body in bodies.bodies], before, atol=1e-6)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(("lengths", "gain"), [("fine", 1e-4), ("mixed", 5e-3), ("coarse", 1e-2)])
 @pytest.mark.parametrize("restitution", [0.5, 1.0])
 def test_a_column_of_balls_gains_no_energy(restitution, lengths, gain):

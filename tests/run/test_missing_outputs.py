@@ -80,6 +80,7 @@ def test_a_stopped_run_has_no_missing_outputs(out):
     assert resumed(out) == []
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.33, None])
 def test_a_log_that_was_cut_or_deleted(out, share):
     if share is None:
@@ -130,6 +131,7 @@ def test_frames_without_checkpoints_and_log_are_not_thrown_away(out, scene_file)
     assert frames(out, "grid") == [0, 1, 2, 3]
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(
     "record",
     [

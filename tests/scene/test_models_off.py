@@ -122,7 +122,7 @@ def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) 
     )
     with watching(patch) as traces:
         simulation: Any = small_sands.create(model) if sand else small_liquids.create(model)
-        for _ in range(3):
+        for _ in range(2):
             simulation.step(min(simulation.stable_dt(), 0.01))
         simulation.frame()
     traces.columns = simulation.columns()

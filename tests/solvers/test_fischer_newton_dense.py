@@ -50,6 +50,7 @@ def test_boxes_hold_their_answers():
         assert ((result.x.numpy() >= lower) & (result.x.numpy() <= upper)).all()
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("scale", [2.0**-27, 2.0**27])
 def test_contacts_in_other_units(scale):
     """Contacts in other units of mass and time.

@@ -198,6 +198,7 @@ def test_a_full_film(n, eccentricity, method):
     )
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("method", "lower", "dense"),
     covering([None, wl.InteriorPoint()], [0.0, -np.inf], [False, True], count=4),

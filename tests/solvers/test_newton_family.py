@@ -268,6 +268,7 @@ def test_statuses_of_gradient_descent():
     )
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("contacts", [20, 30])
 def test_safeguarded_fischer_solves_frictional_contacts(contacts):
     """Safeguarded Fischer-Newton on frictional contacts.
@@ -303,6 +304,7 @@ def test_plain_fischer_fails_on_some_contacts_and_says_so():
     }
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("zeros", [0.0, 0.4, 0.8])
 def test_semidefinite_matrices(zeros):
     for seed in range(4):

@@ -62,6 +62,7 @@ def test_no_solution_is_proved(b, kind, method):
     assert solved(posed(TURN, np.array(b), kind), method).status is wl.SolveStatus.INFEASIBLE
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_linear_programs(kind, method):

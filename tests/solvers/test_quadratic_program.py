@@ -58,6 +58,7 @@ def test_sparse_problem_larger_than_the_dense_limit(monkeypatch):
     np.testing.assert_allclose(result.x.numpy(), found.x, atol=1e-4)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("zeros", [0.2, 0.5, 0.8])
 def test_semidefinite_problem_is_solved_or_infeasible_as_a_linear_program_says(zeros):
     rng = np.random.default_rng(int(910 + 10 * zeros))

@@ -143,6 +143,7 @@ FAMILY = {
 }
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize("name", FAMILY)
 def test_steps_do_not_grow_with_the_mesh(name, device):
     """Steps that do not grow with the mesh.

@@ -89,6 +89,7 @@ def check_singular(seed, kind):
             assert found <= 1e-5 * np.linalg.norm(right)
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize(("seed", "kind"), covering([2, 18, 23], list(SINGULAR)))
 def test_singular_stencils_are_solved_or_infeasible(seed, kind):
     check_singular(seed, kind)
