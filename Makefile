@@ -47,7 +47,7 @@ slow: $(VENV)/.dev
 
 # Files and arguments that are wrong in ways nobody thought of, FUZZ_EXAMPLES of each kind, other ones every time.
 fuzz: $(VENV)/.dev
-	$(BIN)/python -m pytest tests/fuzz --hypothesis-profile=fuzz --hypothesis-show-statistics $(PYTEST_ARGS)
+	$(BIN)/python -m pytest tests/fuzz -m '' --hypothesis-profile=fuzz --hypothesis-show-statistics $(PYTEST_ARGS)
 
 # Change the code in 50 places, one at a time, and see whether the tests notice; MUTANTS_ARGS="--count 200 --seed 5 --jobs 8" for more.
 mutants: $(VENV)/.dev

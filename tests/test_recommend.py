@@ -104,6 +104,7 @@ def random_matrix(seed):
     return A - 3.0 * np.outer(v := np.eye(n)[0] + np.eye(n)[1], v) if seed % 5 == 0 else A
 
 
+@pytest.mark.default_cases(8)
 @pytest.mark.parametrize("seed", range(17, 37))
 def test_definiteness_is_that_of_the_eigenvalues(seed):
     A = random_matrix(seed)

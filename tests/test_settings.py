@@ -123,6 +123,7 @@ def test_settings_of_every_method_are_checked():
     assert len(RANGED) > 60
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize(
     ("kind", "name", "annotation"),
     RANGED,
@@ -163,6 +164,7 @@ def test_numbers_within_their_range_are_taken_whatever_their_type(data):
         assert dataclasses.replace(made) == made == pickle.loads(pickle.dumps(made))
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize(
     ("kind", "name", "annotation"), [s for s in SETTINGS if get_origin(s[2]) is Literal]
 )

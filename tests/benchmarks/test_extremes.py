@@ -172,6 +172,7 @@ def random_grid(seed):
     return cells, faces, rng.random(shape) if rng.random() < 0.5 else None, periodic, rng
 
 
+@pytest.mark.default_cases(12)
 @pytest.mark.parametrize("seed", range(331, 371))
 def test_the_matrix_is_that_of_the_oracle(seed):
     cells, faces, shift, periodic, rng = random_grid(seed)

@@ -45,6 +45,7 @@ def bits_of(value: float) -> str:
     return hex(struct.unpack("<I", struct.pack("<f", value))[0])
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize(
     ("kind", "holds"),
     [
@@ -167,6 +168,7 @@ def test_starts_of_divisions_and_roots(value: float) -> None:
         assert found == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("a", [1.0, 2.0, float("nan")])
 @pytest.mark.parametrize("b", [1.5, float("nan")])
 @pytest.mark.parametrize(("kind", "of"), [("MAX", np.fmax), ("MIN", np.fmin)])

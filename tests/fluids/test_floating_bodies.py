@@ -155,6 +155,7 @@ def drop_that_meets_a_body(dimension, ratio, wall):
     )
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("wall", ["separating", "free-slip"])
 @pytest.mark.parametrize("ratio", [0.01, 1.0, 100.0])
 @pytest.mark.parametrize("dimension", [2, 3])

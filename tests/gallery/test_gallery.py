@@ -72,6 +72,7 @@ def test_facts_hold(family):
             assert np.isclose(y[~held], 0, atol=1e-12 * np.abs(p.b).max()).all()
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("shape", [(9, 7), (4, 5, 3)])
 def test_planted_shares_and_signs(plant, shape):

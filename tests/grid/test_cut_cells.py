@@ -221,6 +221,7 @@ def in_space(box):
     )
 
 
+@pytest.mark.default_cases(21)
 @pytest.mark.parametrize("name", BOXES)
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("size", [1.0, 1.0 / 7.0, 12.7])

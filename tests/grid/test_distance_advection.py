@@ -149,6 +149,7 @@ def test_third_order_on_a_rotation() -> None:
     assert 6.5 < errors[0] / errors[1] < 9.5
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("cells", [0.5, 2.0, 8.0])
 @pytest.mark.parametrize("normal", [(0.0, 1.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.3, 0.8, 0.5)])
 def test_a_plane_stops_the_normal_part_and_lets_the_tangential_part_go(
@@ -204,6 +205,7 @@ def test_nobody_ends_inside_a_wall(grid: StaggeredGrid, random_seed: int, cells:
     assert (between_nodes(grid, distance, points) >= 0.99 * MARGIN).all()
 
 
+@pytest.mark.default_cases(8)
 @pytest.mark.parametrize("grid", [FLAT, SPACE], ids=["2d", "3d"])
 @pytest.mark.parametrize("thickness", [1.2, 2.5])
 @pytest.mark.parametrize("x0", [9.37, 9.0, 8.61, 9.5])

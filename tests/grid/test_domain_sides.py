@@ -32,6 +32,7 @@ def test_fields_go_on_beyond_the_side_and_nowhere_else(side: str) -> None:
     np.testing.assert_array_equal(field.numpy(), expected)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("beyond", [0.1, 0.0, -0.01])
 @pytest.mark.parametrize("side", SIDES)
 def test_particles_on_the_side_or_beyond_are_gone(side: str, beyond: float) -> None:

@@ -359,6 +359,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("invert", [False, True])
 @pytest.mark.parametrize("name", SHAPES)
 def test_the_distance_to_a_moved_shape_is_that_of_points_moved_back(name, invert):

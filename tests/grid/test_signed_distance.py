@@ -65,6 +65,7 @@ CASES = {
 }
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("invert", [False, True])
 @pytest.mark.parametrize("placement", [Placement(), PLACEMENT], ids=["in place", "placed"])
 @pytest.mark.parametrize("shape", CASES)

@@ -89,6 +89,7 @@ def inside_points(dimension, count, rng, margin=2e-3 * CELL):
     return points, ways
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("kind", [Box, TriangleMesh])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("thickness", [0.05, 0.5, 1.28])

@@ -286,6 +286,7 @@ SPELLINGS = {
 }
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("spelling", SPELLINGS)
 @pytest.mark.parametrize("suffix", TEXTS)
 def test_however_a_text_is_spelled(tmp_path, suffix, spelling):
@@ -302,6 +303,7 @@ def test_wide_text_is_refused_as_such(tmp_path, suffix):
         read_mesh(path)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("head", [b"", b"solid cube", b"  SOLID"])
 @pytest.mark.parametrize("behind", [b"", b"x", bytes(49), bytes(50), b"made by a scanner"])
 def test_binary_stl_with_bytes_behind_its_triangles(tmp_path, head, behind):
@@ -328,6 +330,7 @@ def test_binary_stl_with_a_wrong_count(tmp_path, head, count, message):
         read_mesh(path)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("suffix", TEXTS)
 @pytest.mark.parametrize(
     ("word", "message"),

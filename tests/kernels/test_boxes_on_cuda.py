@@ -60,6 +60,7 @@ def field(values: np.ndarray) -> wp.array:
     return wp.array(values, dtype=wp.float64, device="cpu")
 
 
+@pytest.mark.every_case
 @EMULATED
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("way", ["cells", "planes", "parts", "whole", "segments"])

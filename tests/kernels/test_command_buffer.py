@@ -77,6 +77,7 @@ def counting(left: wp.array, odd: wp.array) -> tuple[CommandBuffer, wp.array, wp
     return program, a, b
 
 
+@pytest.mark.every_case
 @pytest.mark.cpu_form("the team is the CPU's")
 @pytest.mark.parametrize("runs", [0, 1, 2, 9])
 def test_a_loop_runs_while_its_condition_holds(runs, threads, monkeypatch):

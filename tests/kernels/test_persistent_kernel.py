@@ -32,6 +32,7 @@ def passes(tmp_path_factory):
     )
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("threads", [1, 5, 64])
 @pytest.mark.parametrize("cells", [1, 7, 21])
 def test_stages_follow_each_other(passes, cells, threads):

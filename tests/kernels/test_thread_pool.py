@@ -140,6 +140,7 @@ def test_slabs_of_a_fused_kernel_are_one_stream(planes, tmp_path, small_pieces):
         assert scalars.numpy()[0] == expected[1:-1].sum(dtype=np.float64)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("threads", [2, 3, 8, 64])
 @pytest.mark.parametrize("planes", [20, 22, 47, 100, 128, 129, 256, 700])
 def test_slabs_fill_their_threads(planes, threads):
@@ -152,6 +153,7 @@ def test_slabs_fill_their_threads(planes, threads):
     assert share <= 1.3 * max(planes / threads, 14) or planes < 128
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
 @pytest.mark.parametrize(
     ("tasks", "cells"),

@@ -203,6 +203,7 @@ def expected(slope: SlopedWall, velocity: tuple[float, ...], removes: bool) -> n
     return u - (u @ slope.normal) * slope.normal * removes
 
 
+@pytest.mark.default_cases(15)
 @pytest.mark.parametrize(("grid", "normal"), SLOPES, ids=IDS)
 @pytest.mark.parametrize("towards", [-1.0, 1.0])
 @pytest.mark.parametrize(

@@ -180,6 +180,7 @@ def test_clusters_of_blocks_take_larger_levels():
     assert cells(90, one_launch_cluster=0) == 512
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("faces", FACES)
 @pytest.mark.parametrize(
     ("shape", "periodic"),

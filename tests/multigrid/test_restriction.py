@@ -75,6 +75,7 @@ def inner(level, field):
     return padded[1:-1, 1:-1, 1:-1]
 
 
+@pytest.mark.default_cases(9)
 @pytest.mark.parametrize("fused", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", SHAPES)

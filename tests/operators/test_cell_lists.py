@@ -10,6 +10,7 @@ import warp_lcp as wl
 from warp_lcp.operators import cell_lists
 
 
+@pytest.mark.default_cases(12)
 @pytest.mark.parametrize("shape", [(5, 4, 6), (6, 7), (1, 1, 1)])
 @pytest.mark.parametrize("form", [list, np.int16, np.uint64, wp.array])
 @pytest.mark.parametrize("shuffled", [False, True])

@@ -9,6 +9,7 @@ from oracle import assemble
 from warp_lcp.operators.grid_matrix import grid_matrix
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize(
     "periodic",
     [(False, False, False), (True, False, False), (True, True, False), (True, True, True)],

@@ -33,6 +33,7 @@ def faces_of(kind, shape, periodic, rng):
     return faces, None
 
 
+@pytest.mark.default_cases(36)
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 @pytest.mark.parametrize("periodic", PERIODIC)
 @pytest.mark.parametrize("kind", ["unit", "numbers", "arrays", "shift", "mixed"])

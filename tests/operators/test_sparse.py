@@ -29,6 +29,7 @@ def random_matrix(n, seed, density=0.1):
     return scipy.sparse.coo_array((values[keep], (rows[keep], columns[keep])), shape=(n, n))
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 @pytest.mark.parametrize("n", [1, 2, 83])
@@ -257,6 +258,7 @@ def test_blocks_are_found_and_a_pickle_keeps_the_near_null_space():
     assert wl.SparseOperator(blocks, device="cpu").block == 1
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("form", ["csr", "csc", "coo", "bsr"])
 @pytest.mark.parametrize("index", [2_000_000, -1, 50])
 def test_indices_out_of_range_are_refused(form, index):

@@ -124,6 +124,7 @@ def test_the_camera_of_a_scene(scene):
     np.testing.assert_allclose(tilted.axes[0], [0.0, -1.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("aspect", [0.1, 0.5, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize("size", [(2.0, 1.0, 1.0), (0.5, 1.0, 0.4), (2.0, 1.0)])
 def test_the_automatic_camera_shows_the_whole_domain_and_no_more_than_it_must(scene, size, aspect):

@@ -113,6 +113,7 @@ def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, 
     assert way == pytest.approx(0.5 * pull * time * (time + 0.01), rel=1e-6)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("shapes", ["balls", "boxes", "capsule and box"])
 def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes):

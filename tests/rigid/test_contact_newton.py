@@ -83,6 +83,7 @@ def test_fifty_boxes_stand_for_a_second(dimension, ratio):
     assert residual < 1.1e-5
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("method", ["active_set", "interior_point"])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", [611, 87, 9203])

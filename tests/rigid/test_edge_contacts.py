@@ -38,6 +38,7 @@ def to_segment(points, ends):
     return np.linalg.norm(points - ends[0] - share[:, None] * way, axis=1)
 
 
+@pytest.mark.default_cases(12)
 @pytest.mark.parametrize("seed", range(30, 50))
 def test_the_gap_of_two_capsules_is_that_of_their_axes(seed):
     rng = np.random.default_rng(seed)
@@ -55,6 +56,7 @@ def test_the_gap_of_two_capsules_is_that_of_their_axes(seed):
     )
 
 
+@pytest.mark.default_cases(12)
 @pytest.mark.parametrize("seed", range(50, 80))
 def test_the_gap_of_a_capsule_and_a_box_is_that_of_its_axis(seed):
     """Gap of a capsule and a box: that of its axis.

@@ -325,6 +325,7 @@ def check_rows(seed: int) -> None:
             assert np.abs(own.error[own.equations]).max() < 1e-12
 
 
+@pytest.mark.default_cases(8)
 @pytest.mark.parametrize("seed", range(20))
 def test_rows_are_derivatives_of_errors(seed):
     check_rows(seed)

@@ -70,6 +70,7 @@ def drawn_states(rng, flat):
     return states
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("seed", range(12))
 def test_motion_is_that_of_plain_numpy(seed):
     rng = np.random.default_rng([1, seed])

@@ -72,6 +72,7 @@ def compiled(tmp_path_factory):
     increase.module.unload()
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("suffix", [".o", ".meta", ".cpp"])
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_files_are_compiled_again(compiled, damage, suffix):

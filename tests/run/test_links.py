@@ -292,6 +292,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 }
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe", "dangling link"])
 @pytest.mark.parametrize("writer", WRITERS)
 def test_files_in_the_way_are_replaced(tmp_path, writer, kind):

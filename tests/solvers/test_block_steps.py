@@ -61,6 +61,7 @@ def sliding_block(A, b, normal):
     return None
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("direction", list(ORDERS))
 @pytest.mark.parametrize("omega", [1.0, 0.7, 1.4])
 def test_sweeps_over_blocks_are_those_of_the_algorithm(omega, direction, device):

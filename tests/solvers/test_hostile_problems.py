@@ -50,6 +50,7 @@ def test_boxes_on_a_closed_domain_touch_the_bound_that_b_pushes_to(net, method):
     )
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 1e160])
 @pytest.mark.parametrize("lower", [-np.inf, 0.0])
 def test_a_right_hand_side_that_is_not_finite_is_said(value, lower, method):

@@ -223,6 +223,7 @@ def test_steps_are_those_of_the_algorithm(kind, settings, device):
         )
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("mehrotra", [True, False])
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25)])
 @pytest.mark.parametrize(

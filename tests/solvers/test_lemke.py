@@ -213,6 +213,7 @@ def test_large_problems_are_refused(monkeypatch):
         solve(np.eye(4), -np.ones(4))
 
 
+@pytest.mark.default_cases(9)
 @pytest.mark.parametrize("method", [Lemke, IncrementalPivoting, QuadraticProgram])
 @pytest.mark.parametrize("size", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("load", [1e-8, 1e8])

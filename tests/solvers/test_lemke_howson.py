@@ -35,6 +35,7 @@ def problem(E, F):
     return A, -np.ones(len(A))
 
 
+@pytest.mark.default_cases(10)
 @pytest.mark.parametrize("integer", [False, True])
 @pytest.mark.parametrize("seed", range(20))
 def test_equilibria_are_best_answers_to_each_other(seed, integer):

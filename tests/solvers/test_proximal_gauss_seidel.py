@@ -51,6 +51,7 @@ def plain(problem, sweeps, accelerate):
     return found
 
 
+@pytest.mark.default_cases(8)
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize(
     ("accelerate", "check_every"), [(True, 1), (True, 2), (True, 3), (False, 1)]

@@ -53,6 +53,7 @@ def device_map(A, b, lower, upper, x, form, share, kink, device):
     return made, field, problem
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("kink", [Kink.PERTURBATION, Kink.ZERO, Kink.APPROXIMATION])
 def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
@@ -258,6 +259,7 @@ def grid_at_kinks(seed, bounds):
     return cells, fluid, A, y - A @ x, lower, upper, x
 
 
+@pytest.mark.default_cases(6)
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-2.0, 2.0), (-np.inf, 1.0)])
 @pytest.mark.parametrize("kink", ["perturbation", "zero"])
 @pytest.mark.parametrize("share", [1.0, 0.6])

@@ -36,6 +36,7 @@ def matrix(rng, n=12, width=None):
     )
 
 
+@pytest.mark.default_cases(7)
 @pytest.mark.parametrize("lengths", [(1.0,), (1.0, 0.5, 0.25)])
 @pytest.mark.parametrize(
     ("form", "direct", "width"),

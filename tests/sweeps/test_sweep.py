@@ -114,6 +114,7 @@ def test_multicolor_is_red_black_on_a_poisson_matrix(device):
     np.testing.assert_allclose(colored.x.numpy(), grid.x.numpy().ravel()[fluid], atol=1e-10)
 
 
+@pytest.mark.every_case
 @pytest.mark.parametrize("name", SCALAR)
 @pytest.mark.parametrize(("b", "expected"), [(2.0, -1.0), (-2.0, 3.0), (0.0, None)])
 def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, device):
