@@ -103,6 +103,7 @@ def test_costs_are_of_methods():
 HEADER, CLAIMS = table("What A must be")
 
 
+@pytest.mark.default_cases(9)
 @pytest.mark.parametrize("name", [slow(n) if n == "gradient-descent" else n for n in CLAIMS])
 def test_claims_about_matrices_hold(name):
     if name == "quadratic-program":

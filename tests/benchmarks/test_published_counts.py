@@ -32,7 +32,7 @@ ROWS = [
         marks=SLOW if c.slow or (c.method, c.problem) in LONG else (),
         id=f"{c.method}, {c.problem}, {c.printed[0]:g}",
     )
-    for c in counts.COUNTS
+    for c in sorted(counts.COUNTS, key=lambda c: (c.method, c.problem) in LONG)
 ]
 
 

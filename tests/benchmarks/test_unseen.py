@@ -46,6 +46,7 @@ def test_default_method(kind, seed):
     assert faults([UnseenCase(kind, seed)]) == []
 
 
+@pytest.mark.default_cases(3)
 @pytest.mark.parametrize("kind", FEW)
 def test_every_method(kind):
     assert faults([EveryMethodCase(kind, SEEDS[0])]) == []

@@ -248,8 +248,8 @@ def tank_with_a_fin(seed: int, kind: str, path: Path) -> tuple[LiquidSimulation,
     return simulation, np.array([*x, y[1]])
 
 
-@pytest.mark.default_cases(2)
-@pytest.mark.parametrize(("seed", "kind"), covering([0, 4, 10], ["mesh", "box"]))
+@pytest.mark.default_cases(1)
+@pytest.mark.parametrize(("seed", "kind"), covering([4, 0, 10], ["box", "mesh"]))
 def test_a_pool_rests_on_a_block_beside_a_thin_fin(tmp_path: Path, seed: int, kind: str) -> None:
     simulation, ends = tank_with_a_fin(seed, kind, tmp_path)
     rows = advance(simulation, 0.3)

@@ -14,6 +14,7 @@ def test_the_cone_slides_at_the_friction_angle_and_the_box_does_not() -> None:
     assert trial.findings[-1].control
 
 
+@pytest.mark.slow
 def test_a_stiff_slab_rests_and_slides_as_the_walls_friction_says() -> None:
     """Rest and sliding of a stiff slab by the wall friction.
 

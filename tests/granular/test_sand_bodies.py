@@ -123,7 +123,7 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
     assert abs(np.degrees(body.bodies[0].angle)) < 0.5
 
 
-@pytest.mark.parametrize("friction", [slow(0.0), 0.25, 0.7])
+@pytest.mark.parametrize("friction", [0.25, 0.7, slow(0.0)])
 def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float) -> None:
     """Block on a slope of firm sand, by Coulomb's law.
 

@@ -122,7 +122,7 @@ def across(kind, bottom):
         slow(("capsule", "mesh")),
         ("mesh", "capsule"),
         slow(("mesh", "box")),
-        ("mesh", "edge"),
+        slow(("mesh", "edge")),
     ],
 )
 def test_a_capsule_dropped_across_two_others_comes_to_rest(falling, standing):

@@ -104,17 +104,17 @@ def double_pendulum(duration: float, dimension: int) -> np.ndarray:
     ).y[:2, -1]
 
 
-@pytest.mark.parametrize("dimension", [slow(2), 3])
+@pytest.mark.parametrize("dimension", [3, slow(2)])
 def test_a_double_pendulum_goes_as_lagrange_says(dimension):
     """Double pendulum by Lagrange's equations, of second order.
 
     Half the step gives a quarter of the error. The energy is conserved, and anchors stay together.
     """
-    expected, errors = double_pendulum(0.4, dimension), []
+    expected, errors = double_pendulum(0.32, dimension), []
     for dt in (0.016, 0.008):
         bodies = system(chain(2), 2, dimension=dimension)
         energies, apart = [], 0.0
-        for _ in go(bodies, dt, round(0.4 / dt)):
+        for _ in go(bodies, dt, round(0.32 / dt)):
             energies.append(energy(bodies, dt))
             apart = max(apart, bodies.row()["joint_error"])
         angles = np.array([joint.angle(bodies.bodies) for joint in bodies.joints])
@@ -132,14 +132,14 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
 
     It is measured by the zeros of the angle.
     """
-    bodies, dt, tilt = system(chain(1), 1), 0.01, np.pi / 2 - 0.05
+    bodies, dt, tilt = system(chain(1), 1), 0.02, np.pi / 2 - 0.05
     turned = rotation_by(-tilt * Z)
     bodies.bodies[0].position, bodies.bodies[0].rotation = (
         turned @ bodies.bodies[0].position,
         turned,
     )
     zeros, last = [], 0.0
-    for step in go(bodies, dt, 95):
+    for step in go(bodies, dt, 48):
         angle = bodies.joints[0].angle(bodies.bodies) + np.pi / 2
         if last * angle < 0.0:
             zeros.append((step + 1) * dt - dt * angle / (angle - last))
@@ -149,7 +149,7 @@ def test_a_bar_swings_with_the_period_of_its_inertia():
     assert 2 * np.diff(zeros).mean() == pytest.approx(period, rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", [slow("ball"), slow("hinge"), "fixed"])
+@pytest.mark.parametrize("kind", ["fixed", slow("ball"), slow("hinge")])
 def test_joined_bodies_in_flight_keep_both_momenta(kind):
     bodies = system(
         tuple(

@@ -37,7 +37,7 @@ def told(**tables):
 
 @pytest.mark.parametrize(
     "name",
-    [slow("tap-and-drain"), "column-collapse-2d", slow("dam-break-2d"), slow("splash-in-circle")],
+    ["column-collapse-2d", slow("tap-and-drain"), slow("dam-break-2d"), slow("splash-in-circle")],
 )
 def test_steps_and_bytes_are_those_of_the_run(name: str, tmp_path: Path) -> None:
     scene = load_scene(name, ["domain.resolution=32"])
@@ -131,13 +131,13 @@ def test_suspicious_settings_are_reported() -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        slow((lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned")),
         (lambda v, t: (v, [*t[:9, ::-1], *t[9:]]), "turned 9 of 9216 triangles that disagreed"),
         slow((lambda v, t: (v, [*t, *t[:20]]), "dropped 20 repeated triangles")),
         (
             lambda v, t: ([*v, *(0.9 * v + [0.3, 0.0, 0.0])], [*t, *(t + len(v))]),
             "triangles cross others",
         ),
+        slow((lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned")),
     ],
 )
 def test_mesh_defects_are_reported_with_their_repair(spoil, words, tmp_path: Path) -> None:
