@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from warp_lcp.benchmarks.mutants.formulas import FORMULAS
+from warp_lcp.benchmarks.mutants.tests_of import _steps as steps_of
 from warp_lcp.benchmarks.mutants.tests_of import _users as users_of
 from warp_lcp.benchmarks.mutants.tests_of import tests_of as chosen_for
 
@@ -24,6 +25,34 @@ def test_tests_named_after_the_module_run_first():
         chosen_for(ROOT, "warp_lcp/material/sources_kernels.py")[0]
         == "tests/material/test_sources.py"
     )
+
+
+def test_words_that_happen_to_be_the_same_choose_no_test():
+    """Tests of a part of a grid: those that import it, not those of the same word elsewhere.
+
+    `MODULE` is a constant of many modules, and a word of the tests of the log's filter.
+    """
+    module = "warp_lcp/grid/barrier_velocity_kernels.py"
+    chosen = chosen_for(ROOT, module)
+    assert chosen[0] == "tests/grid/test_barrier_faces.py"
+    assert {Path(test).parent.name for test in chosen[:4]} == {"grid"}
+    assert "tests/kernels/test_log_filter.py" not in chosen[:20]
+
+
+def test_tests_import_modules_through_helpers_and_names_of_the_package(tmp_path):
+    files = {
+        "warp_lcp/__init__.py": "from warp_lcp.solvers.newton import Newton\n",
+        "warp_lcp/solvers/newton.py": "from warp_lcp.steps import step\n",
+        "warp_lcp/steps.py": "def step(): ...\n",
+        "tests/problems.py": "import warp_lcp as wl\nwl.Newton\n",
+        "tests/test_a.py": "from warp_lcp.steps import step\n",
+        "tests/test_b.py": "from problems import case\n",
+        "tests/test_c.py": "step = 1\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert steps_of(tmp_path, {"warp_lcp/steps.py"}) == {"tests/test_a.py": 0, "tests/test_b.py": 1}
 
 
 def test_a_mutant_is_one_change_that_still_is_python():
@@ -85,7 +114,7 @@ def test_headers_have_the_tests_of_modules_that_name_them():
     )
     assert (
         "tests/kernels/test_persistent_kernel.py"
-        in chosen_for(ROOT, "warp_lcp/kernels/headers/piece.h")[:2]
+        in chosen_for(ROOT, "warp_lcp/kernels/headers/piece.h")[:4]
     )
 
 

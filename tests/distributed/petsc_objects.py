@@ -3,6 +3,7 @@
 Usage: petsc_objects.py CHECK... with names of functions here. Fails by an assertion.
 """
 
+import gc
 import sys
 
 import numpy as np
@@ -279,6 +280,20 @@ def cycles_of_pcmg():
         pc.apply(r, expected)
         z.axpy(-1.0, expected)
         assert z.norm() < 1e-12 * expected.norm()
+
+
+def released():
+    """Make operators one after another, each after the last reference to the one before is gone.
+
+    PETSc prints the objects that wait for all ranks to release them.
+    """
+    comm = Ranks.world().comm
+    problem = shared_problem(small("brick", "walls"), Ranks.world())[1]
+    for _ in range(3):
+        grid = PetscGrid(problem.A)
+        del grid
+        gc.collect()
+        petsc().garbage_view(comm)
 
 
 if __name__ == "__main__":

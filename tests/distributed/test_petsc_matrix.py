@@ -1,5 +1,6 @@
 """Operator and multigrid as PETSc objects."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -18,3 +19,9 @@ CHECKS = ("products", "preconditioner", "linear_solves", "bounded_methods")
 )
 def test_petsc_objects_match_their_definition_and_work_in_petsc_solvers(mpi, ranks, checks):
     assert sorted(mpi(ranks, PROGRAM, *checks).stdout.split()) == sorted(checks * ranks)
+
+
+def test_operators_that_all_ranks_have_released_are_destroyed(mpi):
+    """Objects that wait for their end, after each of three operators: that operator's matrix."""
+    text = mpi(2, PROGRAM, "released").stdout
+    assert re.findall(r"Total entries: *(\d+)", text) == ["1"] * 6

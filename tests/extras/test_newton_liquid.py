@@ -1,6 +1,7 @@
 """Liquid in worlds of newton: bodies float, sink, and exchange momentum."""
 
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -119,6 +120,24 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio, alone):
     *_, state = steps(solver, 3, dt)
     acceleration = state.body_qd.numpy()[0, 2] / (3.0 * dt)
     assert acceleration == pytest.approx((1.0 - ratio) * GRAVITY / (ratio + added), rel=0.1)
+
+
+def test_a_repeated_step_does_not_run_the_liquid_again_if_bodies_move_as_before():
+    """Steps of the liquid under a coupler of three iterations, which is asked three times a step.
+
+    A ball in the air gets no impulse, so each iteration asks for the same motion of it.
+    """
+    calls = {
+        name: mock.patch.object(
+            SolverLiquid, name, autospec=True, side_effect=getattr(SolverLiquid, name)
+        )
+        for name in ("step", "_advance")
+    }
+    model = world(((0.0, 0.0, 0.85), 0.2 * WATER, "sphere", {"radius": 0.1}))
+    solver = together(model, pool(), iterations=3)
+    with calls["step"] as asked, calls["_advance"] as run:
+        list(steps(solver, 2, 2e-3))
+    assert (asked.call_count, run.call_count) == (6, 2)
 
 
 @pytest.mark.parametrize("iterations", [1, 2])

@@ -417,7 +417,9 @@ def test_a_full_disk_is_reported(dots, tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-        with pytest.raises(RenderError, match=r"run\.usdc: cannot be written: .*File too large"):
+        # The first error has the cause; the next ones, of USD's callers, repeat it in their own.
+        cause = r"run\.usdc: cannot be written: ([^:]*: )?File too large$"
+        with pytest.raises(RenderError, match=cause):
             list(export_run(folder, tmp_path / "run.usdc"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -66,6 +66,11 @@ def test_a_box_is_part_of_the_array(path, name):
         assert archive.read_box("scalar", box) == 2.5
 
 
+def test_a_box_of_an_array_that_is_not_there_is_an_error_of_the_archive(path):
+    with Archive(path) as archive, pytest.raises(ArchiveError, match="absent"):
+        archive.read_box("absent", (slice(0, 1),))
+
+
 def test_other_versions_of_the_format_are_read(tmp_path):
     for version in ((1, 0), (2, 0), (3, 0)):
         np.testing.assert_array_equal(

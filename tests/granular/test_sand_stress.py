@@ -513,3 +513,26 @@ def test_a_stress_free_fall_has_no_residual(dimension: int) -> None:
     stress = Stress(packing, SandWalls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]))
     stress.begin(YieldSet(0.5), GRAVITY, DT, DT)
     assert stress.residual() == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells_without_sand_bear_no_pressure_whatever_flows_into_them(dimension: int) -> None:
+    """Pressure and residual of a full block that is thrown up by 40 cells in a time step: 0.
+
+    The block moves as a whole, so its cells are not compressed. 16 cells flow through half a face
+    into each empty cell above it, which has room for one.
+    """
+    grid = StaggeredGrid((6, 6, 6 if dimension == 3 else 1), 0.1, dimension)
+    base, one = grid.field(wp.int8), wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
+    packing = Packing(grid, base, one)
+    fraction = np.where(np.arange(grid.shape[1]) < 4, 0.8, 0.0)[None, :, None]
+    speed = 40.0 * grid.spacing / DT
+    u = [wp.full(grid.shape, speed * (a == 1), dtype=wp.float32) for a in range(dimension)]
+    sand = np.broadcast_to(fraction, grid.shape).astype(np.float32)
+    packing.update(wp.array(sand, dtype=wp.float32, device=grid.device), u, DT)
+    stress = Stress(packing, SandWalls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]))
+    stress.begin(YieldSet(0.5), np.zeros(3), DT, DT)
+    stress.restart(pressure_step=0.5, shear_step=0.2, lookahead=0.0, momentum=0.0)
+    stress.advance(1)
+    assert stress.residual() == (0.0, 0.0)
+    assert not stress.now.numpy()[0].any()

@@ -122,11 +122,12 @@ def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
 
 
 @pytest.mark.cpu_form("how many cells a thread takes")
-def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
+@pytest.mark.parametrize("chunks", [2, 37])
+def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch, chunks):
     """Slabs, chunks and spans that share the same cells.
 
-    As on CUDA: a thread per cell, and one place for the sums of several planes; cells outside the
-    spans are not visited.
+    Two chunks a row, or as on CUDA a thread per cell; one place for the sums of several planes;
+    cells outside the spans are not visited.
     """
     A, _, x, _ = scene(wp.float64, {})
     whole, y = wp.zeros_like(x), wp.zeros_like(x)
@@ -136,12 +137,12 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     total = out.numpy().sum()
     monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 2)
     rows = Rows.of(s.padding, s.device)
-    rows.summed.grain, rows.summed.chunks = 1, 37
+    rows.summed.grain, rows.summed.chunks = -(-37 // chunks), chunks
     monkeypatch.undo()
     out.zero_()
     product.bind(rows, stencil=s, x=x, y=y, out=out).launch()
     np.testing.assert_array_equal(y.numpy(), whole.numpy())
-    assert rows.places == 3 * 6 * 37
+    assert rows.places == 3 * 6 * chunks
     assert out.numpy()[: rows.places].sum() == pytest.approx(total, rel=1e-12)
     spans = np.zeros((5, 6, 2), dtype=np.int32)
     spans[2, 3] = (16, 32)
@@ -157,6 +158,21 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     np.testing.assert_array_equal(stored[3, 4, 17:33], all_[3, 4, 17:33])
     stored[3, 4, 17:33] = 7.0
     assert (stored == 7.0).all()
+
+
+def test_quads_are_for_kernels_whose_cells_do_not_depend_on_each_other(product, tmp_path):
+    """Kernels that a thread on CUDA runs for four cells of a row at a time.
+
+    A product can, a kernel in whose order of cells later ones read earlier ones cannot.
+    """
+    A, _, x, _ = scene(wp.float64, {})
+    rows = A.stencil.rows
+    out = wp.zeros(rows.places, dtype=wp.float64, device="cpu")
+    form = product.bind(rows, stencil=A.stencil, x=x, y=wp.zeros_like(x), out=out).form
+    assert form.by_quads is not None and form.by_quads.quads and not form.quads
+    assert form.by_quads.by_cells.words == form.words
+    ordered = row_pass(tmp_path, "ordered", ";", writes={"y": "S"}, ordered=True)
+    assert ordered.bind(rows, y=x).form.by_quads is None
 
 
 def test_a_fused_kernel_equals_its_kernels_in_sequence(product, tmp_path):

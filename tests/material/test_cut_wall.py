@@ -244,6 +244,44 @@ def test_closed_faces_along_a_slope(
         assert (field[slope.open[axis] > 0] == np.float32(velocity[axis])).all()
 
 
+class RoundWall(SlopedWall):
+    """Liquid around a disc of a radius [cells] about a point, which the domain's walls may cut."""
+
+    def __init__(self, center: tuple[float, float, float], radius: float) -> None:
+        self.center, self.radius = np.array(center), radius
+        super().__init__(FLAT, (1.0, 0.0, 0.0))
+        self.distance = self.signed(points(FLAT, (0, 0, 0)))
+
+    def signed(self, x: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(x - self.center, axis=-1) - self.radius
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_normal_of_a_curved_wall_is_of_second_order_beside_the_domain_s_walls(
+    axis: int,
+) -> None:
+    """Velocity on the last closed faces before the domain's upper wall, of a disc that it cuts.
+
+    The distance of a face's center to a disc has the gradient (x - c)/|x - c|. Differences between
+    the nodes on both sides of the face differ from it by less than h^2/(8 r^2) = 0.02; one-sided
+    differences would differ by h/(2 r) = 0.2.
+    """
+    last = FLAT.counts[axis] - 1  # coordinate of the last faces before the domain's wall [cells]
+    center = 0.5 * np.array(FLAT.counts) * [1, 1, 0]
+    center[axis] = last - 1.0
+    wall, velocity = RoundWall(tuple(center), 5.0), np.zeros(3)
+    velocity[1 - axis] = -1.0
+    field = wall.extend(tuple(velocity[:2]))[axis]
+    x = face_centers(FLAT, axis)
+    judged = (x[..., axis] == last) & (np.abs(wall.signed(x) + 1.0) < 0.7)
+    judged[[0, 2]] = False
+    judged &= wall.open[axis] == 0
+    assert judged.sum() == 2
+    normal = (x - wall.center)[judged] / np.linalg.norm(x - wall.center, axis=-1)[judged][:, None]
+    expected = velocity[axis] - (normal @ velocity) * normal[:, axis]
+    np.testing.assert_allclose(field[judged], expected, atol=0.02)
+
+
 @pytest.mark.parametrize("towards", [-1.0, 1.0])
 def test_closed_faces_take_the_normal_velocity_of_a_wall_that_moves(towards: float) -> None:
     """Closed faces with a moving wall: its normal velocity.

@@ -12,9 +12,10 @@ from default_run import chosen
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.grid import active_rows as vicinity
+from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material import domain_window as module
-from warp_lcp.material.domain_window import DomainWindow, carry_over
+from warp_lcp.material.domain_window import DomainWindow, carry_over, pace_of
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.scene import MOST_CELLS
 from warp_lcp.scene.table import SceneError
@@ -190,6 +191,19 @@ def test_grids_are_rebuilt_where_the_material_leaves_them() -> None:
     assert laid.at(None) is DOMAIN
     with pytest.raises(ValueError, match=r"not in this scene's \(200, 96, 64\)"):
         laid.at(np.array([[0, 0, 0], [201, 9, 9]]))
+
+
+@pytest.mark.parametrize(("max_speed", "apart"), [(2.0, 0.0), (3.0, 2.0)])
+def test_a_box_grows_where_its_particles_go(max_speed: float, apart: float) -> None:
+    """Growth of a box in cells of 5 cm per step of 0.1 s.
+
+    A mean velocity of 2 m/s down crosses 4 cells at the lower side alone. A particle may be faster
+    than the mean in any direction.
+    """
+    totals = ParticleTotals(count=9, velocity=np.array([0.0, -2.0, 0.0]), max_speed=max_speed)
+    low, high = pace_of(totals, 0.1, 0.05)
+    np.testing.assert_allclose(low, [apart, 4.0 + apart, apart])
+    np.testing.assert_allclose(high, apart)
 
 
 def test_fields_are_copied_where_old_and_new_grid_overlap() -> None:

@@ -137,6 +137,21 @@ def test_liquid_at_rest_at_a_wall_does_not_follow_liquid_that_leaves(
     assert u[0, 1] == pytest.approx(u[1, 1])  # inside the corner it follows
 
 
+def test_liquid_that_leaves_a_wall_stops_before_liquid_that_flows_to_it() -> None:
+    """Velocity of a closed face against the mean of the faces around it: 0.
+
+    The product of both speeds is -0.06 m^2/s^2. A particle at the wall moves away from it, the
+    liquid beside it toward the wall; the face must not move against the liquid.
+    """
+    air = AirAndFluidBox(cells((0, 0)), (-1.0, 0.0))
+    air.contact.fill_(RELEASED)
+    air.velocity[0][1, 1, 1:2].fill_(0.06)
+    air.weights[0][1, 1, 1:2].fill_(4.6)
+    u, _ = air.extend()
+    assert u[1, 2] == -1.0
+    assert u[1, 1] == 0.0
+
+
 def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
     """Velocity of spray beyond one layer: its own.
 

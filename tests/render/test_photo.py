@@ -4,6 +4,7 @@ Tests that need Mitsuba are skipped where it is missing.
 """
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -330,6 +331,45 @@ def test_water_and_a_body_are_rendered(dots, tmp_path):
     assert np.ptp(corner) < 0.15 * corner.mean()  # the ground is gray
     np.testing.assert_array_equal(image, shot(folder))
     assert np.abs(image - shot(folder, seed=2)).max() > 0.0
+
+
+def test_the_shutter_blurs_only_what_moves(dots, tmp_path, monkeypatch):
+    """Pixels that a ball covers while the shutter is open.
+
+    In 0.02 s a ball of 0.4 m moves by its radius. It is seen at two instants, 0.1 m before and
+    behind its middle.
+    """
+    from warp_lcp.render.photo import mitsuba_renderer
+
+    pytest.importorskip("mitsuba", reason="pictures need Mitsuba, the extra `photo`")
+    monkeypatch.setattr(mitsuba_renderer, "denoised", lambda layers: layers[..., 3:6])  # albedo
+    folder = write_run(
+        tmp_path / "run", [[water(), ball([0.5, 0.6, 0.4], 0.2, "bodies", body=0)]], BODY, size=ROOM
+    )
+    frame = PhotoScenes(Recording(folder, show=None), 16 / 9).frame(0)
+    still = replace(
+        frame,
+        meshes=[
+            replace(mesh, velocity=None)
+            for mesh in frame.meshes
+            if mesh.finish is not SurfaceFinish.LIQUID
+        ],
+    )
+    assert len(still.meshes) == 1
+    moving = replace(
+        still,
+        meshes=[
+            replace(mesh, velocity=np.full_like(mesh.points, [10.0, 0.0, 0.0]))
+            for mesh in still.meshes
+        ],
+    )
+    covered = []
+    for scene, shutter in ((still, 0.0), (still, 0.02), (moving, 0.0), (moving, 0.02)):
+        image = render_radiance(scene, Quality((32, 18), 2, shutter=shutter), 1)
+        covered.append(int((image[..., 0] > 1.5 * image[..., 2]).sum()))
+    assert covered[0] > 10
+    assert covered[1:3] == [covered[0]] * 2
+    assert covered[3] > 1.15 * covered[0]
 
 
 def test_sand_is_rendered(dots, tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from warp_lcp.cli import commands as cli
 from warp_lcp.files.size_limits import one_line, visible
 from warp_lcp.run import folder as run_folder
 from warp_lcp.run.progress import ProgressLines
-from warp_lcp.run.terminal import Terminal, print_text
+from warp_lcp.run.terminal import Terminal, print_text, table_lines
 from warp_lcp.scene.scene_file import load_scene
 
 FORGED = "finished: frame 4 of 4 reached"
@@ -213,6 +213,17 @@ def test_a_terminal_that_is_gone_ends_no_run(dots, scene_file, tmp_path, code):
     watcher = ProgressLines(Terminal(file=ClosedTerminal()))
     record = run_into(load_scene(scene_file), tmp_path / "out", observer=watcher, last_frame=2)
     assert record.status == "finished"
+
+
+def test_numbers_of_a_table_are_right_aligned_and_names_left():
+    lines = table_lines(
+        ("name", "ms", "unit"), [("a", "5.0", "s"), ("longer", "12.5", "m")], left=(0, 2)
+    )
+    assert [line.rstrip() for line in lines.splitlines()] == [
+        "name      ms  unit",
+        "a        5.0  s",
+        "longer  12.5  m",
+    ]
 
 
 def test_printable_text_is_unchanged():

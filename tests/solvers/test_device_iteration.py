@@ -382,6 +382,27 @@ def test_non_finite_values_are_detected_on_host_and_device(wrong: float, both: A
     assert one[2] is other[2] is wl.SolveStatus.NON_FINITE
 
 
+@pytest.mark.parametrize("exponent", [-480, -525])
+def test_values_whose_squares_underflow_are_refused_with_a_guess_as_without(
+    exponent: int, both: Any
+) -> None:
+    """Solves of a problem whose residual's squares underflow: refused.
+
+    At 2^-525 the squares of the last residuals are 0, so that any x would count as converged.
+    """
+    problem, alone, ahead = both(4400)
+    b = problem.b.numpy().copy()
+    for work in (alone, ahead):
+        problem.b.assign(b)
+        x = wl.solve(problem, SOLVER, workspace=work).x.numpy().ravel()
+        problem.b.assign(np.ldexp(b, exponent))
+        guess = problem.layout.zeros(wp.float64)
+        for start in (0.0, 1.01):
+            guess.assign(np.ldexp(start * x, exponent))
+            with pytest.raises(ValueError, match="whose square underflows in float64"):
+                wl.solve(problem, SOLVER, workspace=work, x0=guess)
+
+
 def liquid_below_air(least: float) -> tuple[wl.LCP, DeviceArray]:
     """Return a problem of cells with air above and one lower bound.
 

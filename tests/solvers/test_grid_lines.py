@@ -8,7 +8,9 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from oracle import assemble, lemke, natural_residual
+from drawn_stencils import assembled
+from method_steps import iterates
+from oracle import assemble, boxed, lemke, natural_residual
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=3000, patience=1000)
 SHAPES = {wl.GridLines.X: (1, 1, 30), wl.GridLines.Y: (1, 30, 1), wl.GridLines.Z: (30, 1, 1)}
@@ -105,6 +107,41 @@ def test_directions_precisions_and_periodic_sides(direction, device):
         )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy().ravel()[inside], expected, atol=100 * rtol)
+
+
+@pytest.mark.parametrize("axis", [wl.GridLines.X, wl.GridLines.Y])
+def test_sweeps_over_lines_of_a_stencil_are_those_of_the_algorithm(axis, device):
+    """Two sweeps over the lines of a stencil of nine points, against exact solves of each line.
+
+    No two coefficients are equal, so each must stand at its own offset. Even lines come first; lines
+    of one color are not coupled.
+    """
+    rng = np.random.default_rng(1703)
+    shape = (5, 6)
+    cells = np.where(rng.random(shape) < 0.1, wl.AIR, wl.FLUID)
+    coefficients = {
+        (j, i): -1.0 - 0.1 * n
+        for n, (j, i) in enumerate((j, i) for j in (-1, 0, 1) for i in (-1, 0, 1))
+    }
+    coefficients[0, 0] = 14.0
+    A = wl.Stencil(cells, coefficients, device=device, dtype=wp.float64)
+    inside = cells.ravel() == wl.FLUID
+    dense = np.zeros((cells.size, cells.size))
+    dense[np.ix_(inside, inside)] = assembled(cells, coefficients, None, (False,) * 3, wl.SOLID)
+    b, x = np.where(inside, 5 * rng.standard_normal(cells.size), 0.0), np.zeros(cells.size)
+    problem = wl.LCP(A, b.reshape(shape), 0.0, 0.5)
+    along = np.arange(cells.size).reshape(shape)
+    lines = list(along if axis is wl.GridLines.X else along.T)
+    for got in iterates(problem, wl.BlockedGaussSeidel(blocks=axis, precision="double"), 2):
+        for line in (*lines[::2], *lines[1::2]):
+            block = line[inside[line]]
+            held = b[block] + dense[block] @ x - dense[np.ix_(block, block)] @ x[block]
+            x[block] = boxed(
+                dense[np.ix_(block, block)], held, np.zeros(len(block)), np.full(len(block), 0.5)
+            )
+        stored = got.reshape(problem.layout.stored_shape)[1, 1:-1, 1:-1]
+        np.testing.assert_allclose(stored.ravel()[inside], x[inside], atol=1e-12)
+    assert min(np.count_nonzero(x[inside] == v) for v in (0.0, 0.5)) > 3
 
 
 def test_lines_that_are_none_are_refused():

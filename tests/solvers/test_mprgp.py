@@ -7,6 +7,7 @@ import warp as wp
 
 import warp_lcp as wl
 from default_run import covering
+from matrices import spd
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.gallery import (
     PlantedSolution,
@@ -21,6 +22,19 @@ from warp_lcp.gallery import (
 from warp_lcp.solvers.mprgp import MPRGP
 
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=2000, patience=200)
+
+
+def test_a_solve_ends_where_rounding_hides_the_fall_of_the_energy():
+    """Status of a solve to a residual of 0, which rounding does not allow: at the floor.
+
+    A step may raise the residual while the energy falls. At the floor the energy's changes are
+    rounding, so that steps do not count as successful and the solve is not continued for ever.
+    """
+    matrix = scipy.sparse.csr_array(spd(60, seed=3, shift=0.01))
+    problem = wl.LCP(matrix, np.random.default_rng(5).standard_normal(60), 0.0)
+    result = wl.solve(problem, MPRGP(), stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=3000))
+    assert result.status is wl.SolveStatus.FLOOR
+    assert result.iterations < 300
 
 
 @pytest.mark.parametrize(
