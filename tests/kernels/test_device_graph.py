@@ -12,7 +12,7 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, cell_kernel, list_kernel
 from warp_lcp.grid.staggered import CLEAR, Window, _RangeMemory
 from warp_lcp.kernels import Rows
-from warp_lcp.kernels.device_graph import DeviceGraph, NotRecordableError, host_view
+from warp_lcp.kernels.device_graph import DeviceGraph, NotRecordableError
 from warp_lcp.kernels.launch_graph import DeviceCopy
 from warp_lcp.kernels.recorded_arguments import DeviceRows, Scalar, Slot
 
@@ -131,11 +131,3 @@ def test_unsupported_launches_are_refused_in_a_graph():
         program.record(DeviceCopy(array, None))
     with pytest.raises(NotRecordableError, match="host"):
         program.record(lambda: None)
-
-
-def test_a_view_of_host_memory_reads_and_writes_it():
-    memory = wp.array(np.arange(24), dtype=wp.uint8, device="cpu")
-    view = host_view(memory)
-    np.testing.assert_array_equal(view, np.arange(24))
-    view[3:5] = 200
-    np.testing.assert_array_equal(memory.numpy()[2:6], [2, 200, 200, 5])

@@ -7,8 +7,8 @@ import pytest
 
 from command_line import invoke
 from small_runs import ball, sphere, write_run
-from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
-from warp_lcp.render.render import INSTALL_MATPLOTLIB, ImageStyle, expected_seconds, render_run
+from warp_lcp.render.recording import Color, RenderError, VisiblePart
+from warp_lcp.render.render import INSTALL_MATPLOTLIB, ImageStyle, render_run
 from warp_lcp.render.section import cut
 from warp_lcp.simulation import Cells, Points, Surface
 
@@ -75,16 +75,6 @@ def test_pressure_fills_the_cells(dots, tmp_path, dimension):
     )
     assert top[1] > 180  # yellow: the pressure of these cells grows upward
     assert bottom[1] < 60  # violet
-
-
-def test_a_section_takes_less_time_than_a_room(dots, tmp_path):
-    """Estimated seconds of a picture: of a section in space less than of all that is behind it."""
-    folder = write_run(tmp_path / "run", [material(3)], size=(1.0,) * 3)
-    section, room = (
-        expected_seconds(Recording(folder), [0], ImageStyle(size=SIZE, cut=cut))
-        for cut in (True, False)
-    )
-    assert 0.0 < section < room
 
 
 def test_particles_near_the_cut_and_no_others(dots, tmp_path):
