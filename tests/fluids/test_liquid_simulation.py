@@ -71,15 +71,6 @@ def test_cells_of_a_frame_are_those_of_the_last_solve(dimension: int) -> None:
     assert cells.fields["pressure"][order[0]] > cells.fields["pressure"][order[-1]] > 0.0
 
 
-@pytest.mark.parametrize(("solids", "columns"), [("voxel", 0), ("cut-cell", 2)])
-def test_solids_that_cannot_move_push_no_particles(solids: str, columns: int) -> None:
-    """Columns of pushed and stuck particles: of a moving solid that cuts cells."""
-    moves = {"motion": {"kind": "translation", "velocity": [0.1, 0.0]}} if columns else {}
-    block = box([0.6, 0.0], [0.7, 0.2]) | moves
-    names = dam(solids=solids, solid=[block]).columns()
-    assert len({"pushed", "stuck"} & set(names)) == columns
-
-
 def test_the_log_holds_what_the_particles_have() -> None:
     simulation = dam()
     row, before = advance(simulation, 0.1)[-1], simulation._velocity_before[1]
