@@ -391,6 +391,20 @@ def test_a_recommendation_prints_the_chain_its_reasons_and_what_comes_else():
     ]
 
 
+def test_sparse_matrices_with_half_of_the_diagonal_negative_are_swept():
+    """Box whose matrix is sparse with negative diagonal entries: sweeps, which solve it.
+
+    A sweep sets each unknown with a negative entry to a bound.
+    """
+    rng, n = np.random.default_rng(673), 40
+    A = scipy.sparse.diags_array(np.tile([4.0, -4.0], n // 2)) + scipy.sparse.eye_array(n, k=1)
+    problem = wl.LCP(scipy.sparse.csr_array(A), rng.standard_normal(n), -1.0, 1.0)
+    assert wl.recommend(problem).name == "psor"
+    result = wl.solve(problem, wl.ProjectedSOR())
+    assert result
+    np.testing.assert_allclose(np.abs(result.x.numpy()[1::2]), 1.0)
+
+
 def test_few_negative_diagonal_entries_are_newtons_then_fischers():
     rng = np.random.default_rng(5)
     A = rng.standard_normal((12, 12)) + np.diag(np.where(np.arange(12) < 3, -1.0, 3.0) * 12**0.5)

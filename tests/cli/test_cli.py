@@ -3,6 +3,7 @@
 import json
 import re
 import signal
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from command_line import invoke
 from warp_lcp.cli import commands as cli
+from warp_lcp.cli import view_commands
 from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.scene import simulator
 from warp_lcp.simulation import SimulationFailed
@@ -30,6 +32,24 @@ def test_run(scene_file, out):
     assert "frame 4/4" in result.stderr
     assert "finished: frame 4 of 4 reached" in result.stdout
     assert json.loads((out / "run.json").read_text())["status"] == "finished"
+
+
+@pytest.mark.parametrize(("page", "window"), [(True, False), (False, True), (False, False)])
+def test_a_run_is_shown_from_its_start(page, window, tmp_path, monkeypatch):
+    """Page and window of a run in progress: opened at its start, each on request only."""
+    notes, events, opened = [], [], []
+    observer = SimpleNamespace(note=notes.append, start=lambda *times: events.append(times))
+    monkeypatch.setattr(view_commands, "served", lambda folder: nullcontext("http://here"))
+    monkeypatch.setattr(
+        view_commands.subprocess, "Popen", lambda command, **options: opened.append(command[-2:])
+    )
+    with view_commands.show_while_running(observer, tmp_path, page=page, window=window) as shown:
+        assert not notes
+        assert not opened
+        shown.start(0.0, 2.0)
+    assert events == [(0.0, 2.0)]
+    assert notes == ["page: http://here"] * page
+    assert opened == [["view", str(tmp_path.resolve())]] * window
 
 
 def test_a_profile_is_shown_and_written(scene_file, out):

@@ -7,6 +7,7 @@ import pytest
 from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from warp_lcp.grid.particles import Particles
+from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.scene.simulator import Simulator, simulators
 from warp_lcp.simulation import Cells, HasStages, Points, SimulationFailed, StepFailed
 
@@ -50,6 +51,24 @@ def test_a_dam_breaks(dimension: int) -> None:
     assert position[:, 0].max() > 0.8
     assert (position >= 0).all()
     assert (position[:, :dimension] < [1.0, 0.5, 0.25][:dimension]).all()
+
+
+@pytest.mark.parametrize("dimension", DIMENSIONS)
+def test_cells_of_a_frame_are_those_of_the_last_solve(dimension: int) -> None:
+    """Liquid cells of a frame: places with liquid at the start of the step, and their pressure.
+
+    The dam is 6 of the 16 cells wide and high. Its pressure grows downward, and is 0 at its top.
+    """
+    simulation = dam(dimension)
+    simulation.step(1e-4)
+    cells = next(part for part in simulation.frame() if isinstance(part, Cells))
+    expected = np.argwhere(simulation.projection.cells.numpy() == FLUID)
+    np.testing.assert_array_equal(simulation.projection.fluid_cells(), expected)
+    low, high = cells.index.min(axis=0), cells.index.max(axis=0)
+    assert low.tolist() == [0, 0, 0]
+    assert high.tolist()[:2] == [5, 5]
+    order = np.argsort(cells.index[:, 1], kind="stable")
+    assert cells.fields["pressure"][order[0]] > cells.fields["pressure"][order[-1]] > 0.0
 
 
 def test_the_log_holds_what_the_particles_have() -> None:

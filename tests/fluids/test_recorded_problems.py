@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_lcp as wl
 from command_line import invoke
@@ -186,6 +187,20 @@ def test_a_folder_takes_one_run(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="--record-problems"):
         ProblemFolder(tmp_path / "file" / "below")
+
+
+def test_the_solution_that_the_command_writes_solves_the_problem(tmp_path):
+    record(dam(), tmp_path / "problems", steps=1)
+    (path,) = files(tmp_path / "problems")
+    done = invoke("solve", path, "--out", tmp_path / "x.npy", "--tolerance", 1e-9)
+    assert done.exit_code == 0, done.stderr
+    problem, x = load(path).lcp(), np.load(tmp_path / "x.npy")
+    assert x.shape == problem.layout.shape
+    residual = wl.NaturalResidual(problem)
+    norm, first = (
+        residual.evaluate(problem.layout.load(v, wp.float64)) for v in (x, np.zeros(x.shape))
+    )
+    assert norm < 1e-6 * first
 
 
 def test_record_and_replay_by_the_command_line(tmp_path):

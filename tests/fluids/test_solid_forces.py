@@ -16,6 +16,7 @@ from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from small_runs import run_into
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.fluids.forces_kernels import pressure_kernel
+from warp_lcp.fluids.wall_kernels import WallKernelFields, wall_way
 from warp_lcp.scene.scene_file import load_scene
 
 WATER = 1000.0 * GRAVITY
@@ -30,6 +31,29 @@ def tank(dimension: int, **tables: Any) -> LiquidSimulation:
             size=size, resolution=20, liquid=[box([0.0] * dimension, top)], output=FORCES, **tables
         )
     )
+
+
+@wp.kernel(enable_backward=False, module="tests.wall_way")
+def way_kernel(S: WallKernelFields, way: wp.array3d(dtype=wp.vec3)):  # type: ignore[valid-type]
+    k, j, i = wp.tid()
+    way[k, j, i] = wall_way(S, k, j, i)
+
+
+@pytest.mark.parametrize("normal", [(0.6, 0.8, 0.0), (-0.28, 0.96, 0.0), (0.48, -0.6, 0.64)])
+def test_the_way_to_a_plane_wall_is_its_distance_along_its_normal(
+    normal: tuple[float, float, float],
+) -> None:
+    """Vector from cell centers to the wall n . x = 2: exact, for walls in the plane and in space."""
+    planes, n = (2 if normal[2] else 1), np.array(normal)
+    corners = np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij")[::-1], axis=-1)
+    S = WallKernelFields()
+    S.planes = planes
+    S.distance = wp.array(corners @ n - 2.0, dtype=wp.float32, device="cpu")
+    way = wp.zeros((5, 5, 5), dtype=wp.vec3, device="cpu")
+    wp.launch(way_kernel, way.shape, [S, way], device="cpu")
+    centers = corners[:5, :5, :5] + [0.5, 0.5, 0.5 * (planes - 1)]
+    expected = -(centers @ n - 2.0)[..., None] * n
+    np.testing.assert_allclose(way.numpy(), expected, atol=1e-5)
 
 
 def forces(simulation: LiquidSimulation, until: float) -> dict[str, np.ndarray]:

@@ -13,6 +13,9 @@ import warp_lcp as wl
 from default_run import few
 from small_liquids import GRAVITY, box, create, scene
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.fluids.stokes_kernels import stokes_kernels
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.operators.grid_poisson import FLUID
 
 ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
@@ -267,3 +270,27 @@ def test_a_rod_sinks_at_the_speed_of_faxen_and_carries_its_weight() -> None:
     speed = sinking * walls / (4.0 * np.pi * 10.0)
     assert abs(-row["body0_vy"] / speed - 1.0) < 0.09
     assert abs(simulation.measured["forces"]["solid0_fy"] / weight - 1.0) < 0.02
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_energies_are_sums_over_the_cells_of_the_window(dimension: int) -> None:
+    """Sum of V u^2 and of u f; with no diagonal, a face's force is V u. Ghost cells do not count.
+
+    Fields are random in all stored cells; a quarter of the faces has no volume.
+    """
+    grid = StaggeredGrid((9, 6, 5 if dimension == 3 else 1), 0.1, dimension, "cpu")
+    rng = np.random.default_rng(641)
+    u, force, volume, diagonal = rng.uniform(0.5, 1.0, (4, *grid.shape)).astype(np.float32)
+    volume[rng.random(grid.shape) < 0.25] = 0.0
+    diagonal[rng.random(grid.shape) < 0.5] = 0.0
+    fields = {"u": u, "force": force, "volume": volume, "diagonal": diagonal}
+    kernels = stokes_kernels(cut=True, moving=False, ghost=True, varies=False, bounded=True)
+    reduction = WindowReduction(kernels.energy, grid)
+    reduction.take(
+        grid.domain, **{name: wp.array(field, device="cpu") for name, field in fields.items()}
+    )
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[tuple(map(slice, grid.domain.low, grid.domain.high))] = True
+    kinetic = np.where(inside, volume * u.astype(np.float64) ** 2, 0.0)
+    power = np.where(diagonal > 0.0, np.where(inside & (volume > 0.0), u * force, 0.0), kinetic)
+    np.testing.assert_allclose(reduction.read(), [kinetic.sum(), power.sum()], rtol=1e-5)

@@ -96,3 +96,25 @@ def test_small_bodies_cut_cells_as_before() -> None:
             solid=[solid | {"density": 500.0}],
         )
         assert create(model).grid.barriers is None
+
+
+def test_a_fixed_thin_wall_carries_no_liquid() -> None:
+    """Added mass of a plate before a fixed thin wall, in the list of solids: that without the wall.
+
+    The wall's number is larger than those of all bodies.
+    """
+    plate = box([LOW, 0.2], [HIGH, 0.2 + WALL], density=500.0)
+    wall = box([0.9, 0.0], [0.9 + WALL, 1.0])
+    masses = []
+    for solids in ([plate], [plate, wall]):
+        simulation = create(
+            scene(
+                size=[1.0, 1.0], resolution=16, liquid=[box([0.0, 0.0], [1.0, LEVEL])], solid=solids
+            )
+        )
+        simulation.step(1e-3)
+        coupling = simulation.projection.coupling
+        assert coupling is not None and coupling.carried is not None
+        masses.append(coupling.carried.mass)
+    assert masses[0][0, 1, 1] > 0.0
+    np.testing.assert_array_equal(masses[0], masses[1])

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 from default_run import covering, slow
 from small_liquids import GRAVITY, advance, box, create, scene
@@ -337,3 +338,26 @@ def test_a_bottle_shaken_hard_keeps_its_volume(thickness: float, period: float) 
     assert np.mean(volumes[half:]) == pytest.approx(0.6 * (high - low) ** 2, rel=0.05)
     # 0.88 for bottles that are shaken gently; 0.52 to 0.78 where only gravity spreads the liquid.
     assert np.mean(filled_cells[half:]) > 0.82
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_linear_velocities_beside_a_sheet_are_interpolated_exactly(dimension: int) -> None:
+    """Value and gradient at particles that see all faces around them, a cell above a sheet."""
+    count, rng = 8, np.random.default_rng(659)
+    plate = box([-0.1, 0.51, -0.1][:dimension], [1.1, 0.52, 1.1][:dimension])
+    pool = box([0.0] * dimension, [1.0, 0.2, 1.0][:dimension])
+    model = scene(size=[1.0] * dimension, resolution=count, liquid=[pool], solid=[plate])
+    grid = create(model).grid
+    assert grid.barriers is not None
+    slope = np.array([2.0, 3.0, -4.0]) * (np.arange(3) < dimension)
+    k, j, i = np.indices(grid.shape)
+    faces = np.stack([i - 1.0, j - 0.5, k - 0.5], axis=-1) / count
+    x = rng.uniform(0.2, 0.8, (40, 3))
+    x[:, 1] = rng.uniform(0.58, 0.67, 40)
+    x[:, dimension:] = 0.0
+    places = wp.array(x, dtype=wp.vec3, device="cpu")
+    velocity, gradient = (wp.zeros(40, dtype=wp.vec3, device="cpu") for _ in range(2))
+    field = wp.array(1.0 + faces @ slope, dtype=wp.float32, device="cpu")
+    grid.barriers.faces_to_particles(0, field, None, 0.0, velocity, places, velocity, gradient)
+    np.testing.assert_allclose(velocity.numpy()[:, 0], 1.0 + x @ slope, atol=1e-5)
+    np.testing.assert_allclose(gradient.numpy(), np.tile(slope, (40, 1)), atol=1e-4)

@@ -16,6 +16,8 @@ from default_run import covering, few, slow
 from small_liquids import GRAVITY, advance, box, create, scene
 from viscous_scenes import stirred_scene, viscous_scene
 from warp_lcp.fluids.viscosity import Viscosity
+from warp_lcp.fluids.viscosity_passes import CORE, viscous_passes
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.simulation import StepFailed
@@ -833,3 +835,45 @@ def test_without_the_table_there_is_no_viscosity() -> None:
 def test_invalid_settings_are_refused(tables, error: str) -> None:
     with pytest.raises(ValidationError, match=error):
         scene(size=[1.0, 1.0], resolution=8, **{"liquid": [box([0.0, 0.0], [0.5, 0.5])], **tables})
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_core_of_a_row_is_its_longest_run_of_equal_equations(dimension: int) -> None:
+    """First and last unknown of each row and its core, against a search cell by cell.
+
+    A cell is in a run if the diagonals of all components are positive there, and equal to those of
+    the neighbors along all axes. A row without a run has its core behind its end.
+    """
+    grid = StaggeredGrid((24, 7, 4 if dimension == 3 else 1), 0.1, dimension, "cpu")
+    rng, axes = np.random.default_rng(647), range(dimension)
+    diagonals = np.full((dimension, *grid.shape), 4.0, dtype=np.float32)
+    diagonals[rng.random(diagonals.shape) < 0.01] = 5.0
+    diagonals[:, rng.random(grid.shape) < 0.01] = 0.0
+    span = wp.zeros(4 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device="cpu")
+    fields = [wp.array(d, device="cpu") for d in diagonals] + [None] * (3 - dimension)
+    named = dict(zip(("dx", "dy", "dz"), fields, strict=True))
+    grid.domain.run(viscous_passes(dimension).span, whole=True, span=span, ends=None, **named)
+    found = span.numpy().reshape(*grid.shape[:2], 4)
+    lengths = set()
+    for k, j in itertools.product(
+        *(range(*ends) for ends in zip(grid.domain.low[:2], grid.domain.high[:2], strict=True))
+    ):
+        unknowns, runs, length = [], [], 0
+        for i in range(grid.domain.low[2], grid.domain.high[2]):
+            here = diagonals[:, k, j, i]
+            if (here > 0.0).any():
+                unknowns.append(i)
+            alike = (here > 0.0).all()
+            for axis in axes:
+                for side in (-1, 1):
+                    at = np.array([k, j, i])
+                    at[2 - axis] += side
+                    alike = alike and (np.abs(diagonals[:, *at] - here) <= CORE * here).all()
+            length = length + 1 if alike else 0
+            runs.append((length, -i))
+        longest, last = max(runs)
+        end = unknowns[-1] + 1
+        core = (1 - last - longest, 1 - last) if longest else (end, end)
+        np.testing.assert_array_equal(found[k, j], [unknowns[0], end, *core])
+        lengths.add(longest)
+    assert len(lengths) > 2

@@ -57,12 +57,10 @@ def test_dissipation_is_the_power_of_friction(dimension: int, seed: int) -> None
     assert found == pytest.approx(power, rel=1e-4)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
-    """Damped checkerboard without motion.
+def checkered(dimension: int) -> tuple[Stress, np.ndarray, np.ndarray, tuple[slice, ...]]:
+    """Return the stress of a full box, an impulse with a checkerboard, the latter, deep cells.
 
-    Moving the pattern from the pressure to the shears leaves the velocity of inner faces unchanged;
-    other signs would not.
+    The pressure is 5 with a checkerboard of height 1/2; there are no shears.
     """
     grid = StaggeredGrid((10, 10, 10 if dimension == 3 else 1), 0.1, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)
@@ -78,21 +76,43 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     checkers = (-1.0) ** (i + j + (k if dimension == 3 else 0))
     start = np.zeros(stress.now.shape, dtype=np.float32)
     start[0] = (index < 0) * (5.0 + 0.5 * checkers)
+    deep = (slice(5, 7) if dimension == 3 else slice(1, 2), slice(5, 7), slice(5, 7))
     stress.begin(YieldSet(0.5), np.zeros(3), 0.01, 0.01)
+    return stress, start, checkers, deep
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
+    """Damped checkerboard without motion.
+
+    Moving the pattern from the pressure to the shears leaves the velocity of inner faces unchanged;
+    other signs would not.
+    """
+    stress, start, checkers, deep = checkered(dimension)
+    packing = stress.packing
     stress.now.assign(start)
     stress.residual()
     before = [field.numpy().copy() for field in stress.checked.u]
-    grid.domain.run(
+    packing.grid.domain.run(
         stress.velocity.passes.damp, packing.fields, source=wp.clone(stress.now), now=stress.now
     )
     stress.residual()
-    deep = (slice(5, 7) if dimension == 3 else slice(1, 2), slice(5, 7), slice(5, 7))
     taken = start[0][deep] - stress.now.numpy()[0][deep]
     np.testing.assert_allclose(taken, DAMPED * 0.5 * checkers[deep], rtol=1e-4)
     for old, field in zip(before, stress.checked.u, strict=True):
         # The checkerboard pushes each face by twice its height.
         assert np.abs(old[deep]).max() > 0.9
         np.testing.assert_allclose(field.numpy()[deep], old[deep], atol=1e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_each_step_begins_with_a_lower_checkerboard(dimension: int) -> None:
+    """Height of the checkerboard at the beginning of a step: DAMPED less than at the last end."""
+    stress, start, checkers, deep = checkered(dimension)
+    stress.now.assign(start)
+    stress.begin(YieldSet(0.5), np.zeros(3), 0.01, 0.01)  # of equal length: no other change
+    height = stress.now.numpy()[0][deep] - 5.0
+    np.testing.assert_allclose(height, (1.0 - DAMPED) * 0.5 * checkers[deep], rtol=1e-4)
 
 
 @pytest.mark.parametrize("until", [5e-3, 0.2])

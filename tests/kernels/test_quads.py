@@ -164,3 +164,33 @@ def test_sums_of_whole_numbers_are_equal(seed, tmp_path, checked):
                 )
             )
         assert found[0] == found[1], f"SEED={seed}"
+
+
+PLAIN = """// Kernels of a test.
+
+// kernel quads.doubled: Twice the values of the cells
+//   compute    float64
+//   reads      float64 x
+//   writes     float64 z
+for (int k = 0; k < n; ++k) z[k] = 2 * x[k];
+"""
+
+
+@EMULATED
+@pytest.mark.parametrize("first", range(4))
+def test_rows_at_any_place_of_a_block_are_written_whole(first, checked, device, tmp_path):
+    """Fields whose rows begin `first` elements after a multiple of four."""
+    (tmp_path / "doubled.h").write_text(PLAIN)
+    rng, counts, (plane, row) = np.random.default_rng(661), (3, 4, 19), (96, 24)
+    x = rng.integers(-9, 10, 3 * plane).astype(float)
+    rows = Rows.strided(x.size, wp.get_device(device), (first, plane, row), counts, quads=True)
+    assert rows.quads is not None
+    z = wp.full(x.size, -7.0, dtype=wp.float64, device=device)
+    KernelFile(tmp_path / "doubled.h")["quads.doubled"].bind(
+        rows, x=wp.array(x, device=device), z=z
+    ).launch()
+    k, j, i = np.indices(counts)
+    inside = (first + k * plane + j * row + i).ravel()
+    expected = np.full(x.size, -7.0)
+    expected[inside] = 2.0 * x[inside]
+    np.testing.assert_array_equal(z.numpy(), expected)

@@ -3,6 +3,7 @@
 Row segments, chunks and spans, sums, transfers, waves; messages about wrong launches.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -334,3 +335,20 @@ def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(
             module_dir=tmp_path,
             use_ptx=True,
         )
+
+
+def test_rows_beside_those_of_another_level_have_its_alignment():
+    """Alignments of a pair: of both levels, so that threads may read blocks of both.
+
+    With negative factors a thread takes the cells of one of the other level's threads, which begin
+    anywhere.
+    """
+    own, coarse = layout.Alignment(2), layout.Alignment(1, either=True)
+    rows, other = (
+        replace(
+            Rows.of(Padding(shape), wp.get_device("cpu")), alignments=(alignment, layout.ANYWHERE)
+        )
+        for shape, alignment in (((4, 6, 8), own), ((2, 3, 4), coarse))
+    )
+    assert rows.beside(other, (2, 2, 2)).alignments == (own, coarse)
+    assert rows.beside(other, (-2, -2, -2)).alignments == (own, layout.ANYWHERE)

@@ -3,6 +3,8 @@
 The tests cover symmetry, definiteness, bounds and conjugate gradients.
 """
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -76,6 +78,40 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
         p, p
     )
     for fine, coarse in zip(hierarchy.levels, hierarchy.levels[1:], strict=False):
+        P = aggregation(fine.stencil.padding.counts)
+        expected = P.T @ expected @ P
+        np.testing.assert_allclose(level_matrix(coarse.stencil), expected, atol=1e-12)
+
+
+def test_periodic_levels_of_compact_stencils_are_galerkin_products(device):
+    """Coarse matrices of a nine-point stencil on a torus with odd numbers of cells.
+
+    The last aggregate of an odd row has one cell, beside the first aggregate.
+    """
+    rng = np.random.default_rng(53)
+    cells = rng.choice([wl.AIR, wl.FLUID], (7, 9), p=[0.1, 0.9])
+    offsets = [o for o in itertools.product((-1, 0, 1), repeat=2) if any(o)]
+    weights = {o: -1.0 / (1 + np.abs(o).sum()) for o in offsets}
+    A = wl.Stencil(
+        cells,
+        weights | {(0, 0): 0.2 - sum(weights.values())},
+        periodic=(True, True),
+        device=device,
+        dtype=wp.float64,
+    )
+    settings = CycleSettings(
+        coarsest_cpu=1,
+        coarsest_cuda=1,
+        dirichlet_scaling=1.0,
+        over_correction=1.0,
+        semicoarsening_threshold=0.0,
+    )
+    hierarchy = Hierarchy(A.stencil, wp.float64, bounded=False, settings=settings)
+    hierarchy.hold(A.stencil.d, A.layout.load(cells == wl.FLUID, wp.uint8))
+    hierarchy.rebuild()
+    expected = level_matrix(A.stencil)
+    assert len(hierarchy.levels) > 2
+    for fine, coarse in itertools.pairwise(hierarchy.levels):
         P = aggregation(fine.stencil.padding.counts)
         expected = P.T @ expected @ P
         np.testing.assert_allclose(level_matrix(coarse.stencil), expected, atol=1e-12)

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 import warp_lcp as wl
 from oracle import assemble
-from warp_lcp.operators.components import ComponentFinder
+from warp_lcp.operators.components import ComponentFinder, FloatingComponents
 
 
 def expected_labels(cells, faces, shift, periodic):
@@ -66,6 +66,25 @@ def test_same_components_as_scipy(seed, shape, kind, periodic, share):
         got = {frozenset(np.flatnonzero(label == c)) for c in range(found.count)}
         assert sorted(map(len, got)) == sorted(found.sizes.astype(int))
     assert got == expected_labels(cells, faces, shift, periodic)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_mean_is_taken_from_components_that_are_free_as_a_whole(dtype, device):
+    """Projection of a right-hand side: of three components one has an unknown that is not free.
+
+    Cells of no component keep their values.
+    """
+    rng = np.random.default_rng(653)
+    label = rng.permutation(np.repeat([-1, 0, 1, 2], [7, 5, 8, 6])).astype(np.int32)
+    r, free = rng.standard_normal(label.size).astype(dtype), np.ones(label.size, dtype=np.uint8)
+    free[np.flatnonzero(label == 1)[2]] = 0
+    free[label == -1] = 0
+    expected = r.copy()
+    for c in (0, 2):
+        expected[label == c] -= r[label == c].mean()
+    field = wp.array(r, device=device)
+    FloatingComponents(label, wp.get_device(device)).project(field, wp.array(free, device=device))
+    np.testing.assert_allclose(field.numpy(), expected, atol=1e-6)
 
 
 def test_found_again_after_the_cells_changed():

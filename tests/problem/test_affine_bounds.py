@@ -174,6 +174,14 @@ def test_grid_fields_take_affine_bounds(device):
         np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-9)
 
 
+def test_bounds_begin_at_the_projection_of_zero(device):
+    """Bounds before the first evaluation: at x = clip(0, l, u), here x_0 = 2."""
+    low, high = wl.AffineBounds.friction([-1, 0], 0.3, lower=2.0, upper=5.0)
+    problem = wl.LCP(wl.DenseOperator(np.eye(2), device=device), [-1.0, -1.0], low, high)
+    np.testing.assert_allclose(problem.lower.numpy(), [2.0, -0.6])
+    np.testing.assert_allclose(problem.upper.numpy(), [5.0, 0.6])
+
+
 def test_the_residual_uses_bounds_at_x(device):
     A, b = np.eye(2), np.array([-1.0, -5.0])
     problem = wl.LCP(wl.DenseOperator(A, device=device), b, *wl.AffineBounds.friction([-1, 0], 0.5))

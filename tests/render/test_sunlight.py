@@ -8,12 +8,17 @@ import pytest
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.grains import A_PARTICLE, GRAINS, grains
 from warp_lcp.render.solid_meshes import apart
-from warp_lcp.render.sunlight import BEHIND, LIGHT, Sunlight, scattered
+from warp_lcp.render.sunlight import ACROSS, BEHIND, LIGHT, Sunlight, scattered
 from warp_lcp.scene.shapes import BoxTable
 from warp_lcp.simulation import Surface
 
 RNG = np.random.default_rng(5519)
 WIDTH = 0.01
+
+
+def test_the_light_and_the_axes_of_its_map_are_orthonormal():
+    axes = np.stack([LIGHT, *ACROSS])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-14)
 
 
 def test_points_behind_an_object_are_in_its_shadow():

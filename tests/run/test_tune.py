@@ -9,7 +9,15 @@ import pytest
 
 from command_line import invoke
 from warp_lcp.run import tune as tuning
-from warp_lcp.run.trial import MaterialSnapshot, RunDifferences, Trial, look_times, spread, trial
+from warp_lcp.run.trial import (
+    MaterialSnapshot,
+    RunDifferences,
+    Trial,
+    _TrialRun,
+    look_times,
+    spread,
+    trial,
+)
 from warp_lcp.scene.presets import price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
@@ -82,6 +90,16 @@ def test_a_trial_is_the_run() -> None:
     assert first.looks[-1].front > first.looks[0].front
     assert first.volume_drift == pytest.approx(0.0, abs=0.1)
     assert first.penetration == 0.0
+
+
+def test_a_lone_drop_is_not_the_front(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Front of 200 particles up to 0.4 m, and one at 0.9 m: among the 200."""
+    x = np.append(np.linspace(0.0, 0.4, 200), 0.9)
+    points = np.stack([x, np.full_like(x, 0.1), np.zeros_like(x)], axis=1)
+    monkeypatch.setattr(_TrialRun, "_points", lambda self: points)
+    scene = load_scene("dam-break-2d", [*SMALL[:1], "time.duration=0.02"])
+    front = trial(scene, device="cpu", frames=1).looks[-1].front
+    assert 0.38 < front < 0.4
 
 
 class ModeledTrials:

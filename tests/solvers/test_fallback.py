@@ -313,6 +313,19 @@ def test_a_slow_interior_point_path_triggers_the_fallback():
         assert not CentralPathStalls(steps=30)(progress)
 
 
+def test_a_path_that_reaches_a_new_minimum_goes_on():
+    """Steps without progress count from the last residual below 0.9 of all before.
+
+    One step in the middle halves the residual; the others fall back to where they were.
+    """
+    for low, stalls in ((1.0, True), (0.95, True), (0.5, False)):
+        progress = Progress(None, 0.0)
+        for k in range(14):
+            progress.record(low if k == 7 else 1.0)
+        assert CentralPathStalls()(progress) is stalls
+        assert CentralPathStalls(steps=6)(progress)
+
+
 def test_a_workspace_is_used_again():
     """Reused workspace: the second solve begins with the first method.
 

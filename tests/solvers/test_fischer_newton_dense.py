@@ -6,6 +6,7 @@ import pytest
 import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp.gallery.contact_scenes import contact
+from warp_lcp.solvers import fischer_newton
 
 
 def dense(problem, scale=1.0):
@@ -82,3 +83,19 @@ def test_a_hundred_contacts_of_120_and_180_variables(contacts, scale):
         assert result.x.numpy().min() >= 0
         steps.append(result.iterations)
     assert np.mean(steps) <= 20
+
+
+def test_a_regularized_direction_that_climbs_is_replaced_by_the_gradient(monkeypatch):
+    """Linear solve of the wrong sign: the step takes the negative gradient, and the merit falls."""
+    A = np.array([[3.0, 1.0], [-1.0, 2.0]])
+    problem = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-40.0, 30.0]))
+    work = wl.FischerNewton(safeguard=True).init(problem)
+    work.start(warm=False, tolerance=0.0)
+    values = []
+    monkeypatch.setattr(fischer_newton, "_solve", lambda J, r: -np.linalg.solve(J, r))
+    for _ in range(2):
+        x = work._iterate
+        values.append(float(np.linalg.norm(work.map.value(x, work.map.data.affine(x)))))
+        work.newton_step(work.x)
+    assert work.stage == 0  # no search has failed
+    assert values[1] < values[0]

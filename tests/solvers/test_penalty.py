@@ -108,6 +108,16 @@ def test_steps_are_those_of_the_method(kind, device):
     assert compared == 20
 
 
+@pytest.mark.parametrize("kind", ["dense", "grid"])
+def test_iterates_in_single_precision_are_float32_numbers(kind, device):
+    problem, *_ = as_problem(kind, np.random.default_rng(7104), device)
+    method = wl.Penalty(precision="single", monotone_cycles=0)
+    for work, _ in steps_of(problem, method, 3):
+        x = work.x.numpy()
+        assert np.abs(x).max() > 0.1
+        np.testing.assert_array_equal(x, x.astype(np.float32))
+
+
 def test_bounds_that_are_equal_and_infinite_ones(device):
     """Equal and infinite bounds.
 

@@ -128,6 +128,19 @@ def test_an_unsuitable_preconditioner_causes_no_false_success(kind, operator):
     assert bool(found) or kind != "negative"  # GMRES works with that
 
 
+def test_definite_preconditioners_are_recognized():
+    """Preconditioners that conjugate gradients can use: symmetric and positive definite."""
+    definite = {
+        "identity": scipy.sparse.eye_array(M * M),
+        "matrix": A,
+        "multigrid": pyamg.smoothed_aggregation_solver(A).aspreconditioner(),
+    }
+    for name, given in definite.items():
+        assert wl.LCP(A, B, preconditioner=given).preconditioner.definite, name
+    for name in ("negative", "unsymmetric", "zero"):
+        assert not wl.LCP(A, B, preconditioner=WRONG[name]()).preconditioner.definite, name
+
+
 def test_recommendations_take_it():
     advice = wl.recommend(wl.LCP(A, B, preconditioner=scipy.sparse.eye_array(M * M)))
     assert advice.name == "minimum-map-newton"
