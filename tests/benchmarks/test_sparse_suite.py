@@ -29,6 +29,7 @@ def test_problems_of_a_kind(kind):
     assert np.linalg.norm(d * (x - np.maximum(x - y / d, problem.lower))) <= 1.01e-6 * first
 
 
+@pytest.mark.slow
 def test_the_suite_compares_with_the_best_of_pyamg(monkeypatch, tmp_path):
     monkeypatch.setattr(sparse, "FAMILY", dict.fromkeys(("triangles", "elastic")))
     results = sparse.measure(Options("cpu", (22,), 1, lambda text: None), tmp_path)

@@ -267,7 +267,7 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     assert (tmp_path / "run" / "images" / "frame_000001.png").stat().st_size > 1000
 
 
-@pytest.mark.default_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [2.0, 60.0])
 def test_an_arch_is_held_up_by_the_limits_of_its_hinges(limit: float) -> None:
     """Arch held up by the limits of its hinges.

@@ -22,6 +22,7 @@ TANK = ["domain.resolution=24", "time.duration=0.12", "output.checkpoint_every=5
 OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_every=5"]
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [

@@ -79,7 +79,8 @@ class ForkedCommand:
         with open(self.printed, "w") as file:
             for stream in (1, 2):
                 os.dup2(file.fileno(), stream)
-        cli.app(arguments)
+            sys.stdout = sys.stderr = file  # not pytest's
+            cli.app(arguments)
 
     def poll(self) -> int | None:
         return self.process.exitcode

@@ -343,6 +343,7 @@ MODELS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(
     "tables", chosen(MODELS, MODELS[:3:2]), ids=["apic", "flip", "pic", "moving", "sources"]
 )

@@ -707,7 +707,7 @@ def test_a_meniscus_rises_along_separating_walls(width: float, angle: float) -> 
     assert fastest["separating"] < 1.1 * fastest["free-slip"]
 
 
-@pytest.mark.default_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [60.0, 30.0])
 def test_liquid_rises_between_plates(angle: float) -> None:
     """Rise of liquid between plates.

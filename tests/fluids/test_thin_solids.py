@@ -307,6 +307,7 @@ def test_a_surface_mesh_ends_at_both_sides_of_a_sheet(thickness: float, angle: f
     assert volume == pytest.approx(0.25 - taken, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("thickness", "period"), [(4.0, 0.1), *map(slow, [(0.5, 0.3), (0.5, 0.04)])]
 )

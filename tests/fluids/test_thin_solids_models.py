@@ -106,7 +106,7 @@ def flow(width: float, tables: dict[str, Any]) -> tuple[np.ndarray, float]:
     return np.array(layers), simulation.measured["forces"]["solid0_fx"]
 
 
-@pytest.mark.default_cases(2)
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize(
     "tables",
     [

@@ -445,7 +445,7 @@ def test_couette_flow_between_cut_walls() -> None:
     assert errors[0] / errors[1] > 2.8
 
 
-@pytest.mark.default_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("slip", [0.0, 0.1])
 def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
     """Front of a thin layer on a no-slip floor.

@@ -188,7 +188,7 @@ def test_wrong_scenes_are_named():
         World("", [Sphere(center=[0, 0, 1], radius=1.0)], [1.0], friction=-1)
 
 
-@pytest.mark.default_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "world", [box_stack(10), heavy_on_light(2, ratio=1000.0)], ids=lambda w: w.name
 )

@@ -148,6 +148,7 @@ def test_a_box_slides_down_a_slope_with_the_acceleration_of_coulombs_law(method,
     )
 
 
+@pytest.mark.slow
 def test_a_box_rests_on_a_gentle_slope():
     world = incline(1, angle=0.28, friction=0.3)  # tan 0.28 = 0.288
     start = positions(world)
@@ -157,6 +158,7 @@ def test_a_box_rests_on_a_gentle_slope():
     np.testing.assert_allclose(positions(world), start, atol=1e-6)
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize("stabilization", ["baumgarte", "split", "none"])
 def test_overlaps_are_removed_as_asked(stabilization):
     world = World("sunk", [box([0, 0, 0.23], (0.25, 0.25, 0.25))], [1.0])  # 2 cm into the ground
@@ -227,6 +229,7 @@ BLOCKED = {
 }
 
 
+@pytest.mark.default_cases(2)
 @pytest.mark.parametrize(
     "method", [None, slow(wl.NNCG()), DIRECT, BLOCKED["blocked"], slow(BLOCKED["staggering"])]
 )

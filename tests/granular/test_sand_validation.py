@@ -47,6 +47,7 @@ def test_half_the_friction_runs_too_far() -> None:
     assert c.runout > sand_collapse.envelope(2.0)[1]
 
 
+@pytest.mark.slow
 def test_sand_runs_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Even discharge of sand.
 

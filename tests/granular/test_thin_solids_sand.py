@@ -73,6 +73,7 @@ def test_no_grain_passes_the_sides_of_a_funnel() -> None:
     assert not ((y > 0.4) & ((x + y < 0.8) | (x - y > 0.2))).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thickness", [0.25, slow(1.28)])
 def test_a_shaken_box_keeps_its_sand(thickness: float) -> None:
     low, high = 0.23, 0.77

@@ -153,6 +153,7 @@ def test_active_rows_leave_the_same_bits(name: str, monkeypatch: pytest.MonkeyPa
         assert part.window(part.particles.totals()).near is not None
 
 
+@pytest.mark.slow
 def test_cost_scales_with_the_material() -> None:
     """Number of cells of the same liquid in 512 times the domain: equal."""
     sizes = []

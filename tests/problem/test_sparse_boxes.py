@@ -147,6 +147,7 @@ for grid_operator.LARGE in (1 << 20, 1 << 40):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     resident_bytes() == 0, reason="the system does not tell how much memory is resident"
 )

@@ -171,6 +171,7 @@ def test_kinds_and_rates(tmp_path):
             check_rate(rate)
 
 
+@pytest.mark.default_cases(1)
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
 def test_the_command_films_a_run(encoder, dots, tmp_path, suffix):
     pytest.importorskip("pyvista")

@@ -303,6 +303,7 @@ def test_discs_lie_where_the_particles_are(pyvista, make_run):
     np.testing.assert_allclose(center, expected, atol=1.0)
 
 
+@pytest.mark.slow
 def test_flat_walls_hide_what_of_discs_reaches_across_them(pyvista, make_run):
     """Discs cut by flat walls.
 

@@ -189,6 +189,7 @@ def test_round_bodies_are_recognized():
     assert not is_round(points, corner.ravel()[cube.corners])
 
 
+@pytest.mark.slow
 def test_solids_with_mass_do_not_stand_where_they_began(pyvista, dots, tmp_path):
     disc = '[[solid]]\nshape = "sphere"\ncenter = [0.25, 0.5]\nradius = 0.1\n'
     wall = '[[solid]]\nshape = "box"\nmin = [0.9, 0.0]\nmax = [1.0, 0.2]\n'

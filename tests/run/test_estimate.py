@@ -133,9 +133,11 @@ def test_suspicious_settings_are_reported() -> None:
     [
         (lambda v, t: (v, [*t[:9, ::-1], *t[9:]]), "turned 9 of 9216 triangles that disagreed"),
         slow((lambda v, t: (v, [*t, *t[:20]]), "dropped 20 repeated triangles")),
-        (
-            lambda v, t: ([*v, *(0.9 * v + [0.3, 0.0, 0.0])], [*t, *(t + len(v))]),
-            "triangles cross others",
+        slow(
+            (
+                lambda v, t: ([*v, *(0.9 * v + [0.3, 0.0, 0.0])], [*t, *(t + len(v))]),
+                "triangles cross others",
+            )
         ),
         slow((lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned")),
     ],
