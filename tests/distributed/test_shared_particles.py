@@ -3,6 +3,7 @@
 The ranks take turns in one process.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,47 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
             expected = where[near], how[near], where[own], how[own]
             for array, wanted in zip(found[rank][step], expected, strict=True):
                 np.testing.assert_array_equal(array, wanted)
+
+
+DENSITY = """
+    import numpy as np
+    from test_shared_particles import LAYERS, SPACING, cells_of, scattered
+    from warp_lcp.distributed.decomposition import Decomposition
+    from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.distributed.subdomain import Subdomain
+    from warp_lcp.grid.level_set import particle_density
+    from warp_lcp.grid.particles import Particles
+    from warp_lcp.grid.staggered import StaggeredGrid
+    from warp_lcp.material.density_correction import density_of_all
+
+    counts, full = (24, 12, 1), 4  # particles in a full cell
+    position, velocity = scattered(counts, 900)
+    grid = StaggeredGrid(counts, SPACING, 2, "cpu")
+    alone, expected = Particles(grid, position, velocity, affine=False), grid.field()
+    alone.sort()
+    particle_density(grid, alone, grid.everywhere, full, expected)
+
+    ranks = Ranks.world()
+    part = Subdomain(
+        Decomposition(counts, ranks), spacing=SPACING, dimension=2, device="cpu", layers=LAYERS
+    )
+    mine = part.owners(cells_of(position)) == ranks.rank
+    particles = Particles(part.grid, position[mine], velocity[mine], affine=False)
+    density, x = part.grid.field(), part.grid.origin[0]
+    particles.sort()
+    density_of_all(part.grid, particles, part.grid.everywhere, full, density)
+    ours, whole = density.numpy()[1, 1:-1, 1:-1], expected.numpy()[1, 1:-1, 1:-1]
+    assert ours.shape[1] > whole.shape[1] // 2
+    np.testing.assert_allclose(ours, whole[:, x : x + ours.shape[1]], atol=1e-6)
+    print(f"alike{ranks.rank} ", end="")
+"""
+
+
+def test_densities_of_ranks_are_those_of_one_process_also_in_ghost_cells(mpi):
+    """Density in all cells that a rank of two has, those of the other rank included."""
+    tests = Path(__file__).parent
+    done = mpi(2, DENSITY, environment={"PYTHONPATH": f"{tests}:{tests.parent}:{tests.parents[1]}"})
+    assert sorted(done.stdout.split()) == ["alike0", "alike1"]
 
 
 @pytest.mark.parametrize(

@@ -113,8 +113,8 @@ def test_directions_precisions_and_periodic_sides(direction, device):
 def test_sweeps_over_lines_of_a_stencil_are_those_of_the_algorithm(axis, device):
     """Two sweeps over the lines of a stencil of nine points, against exact solves of each line.
 
-    No two coefficients are equal, so each must stand at its own offset. Even lines come first; lines
-    of one color are not coupled.
+    No two coefficients are equal, so each must stand at its own offset. Even lines come first;
+    lines of one color are not coupled.
     """
     rng = np.random.default_rng(1703)
     shape = (5, 6)
