@@ -43,7 +43,7 @@ def way_kernel(S: WallKernelFields, way: wp.array3d(dtype=wp.vec3)):  # type: ig
 def test_the_way_to_a_plane_wall_is_its_distance_along_its_normal(
     normal: tuple[float, float, float],
 ) -> None:
-    """Vector from cell centers to the wall n . x = 2: exact, for walls in the plane and in space."""
+    """Vector from cell centers to the wall n . x = 2: exact, in the plane and in space."""
     planes, n = (2 if normal[2] else 1), np.array(normal)
     corners = np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij")[::-1], axis=-1)
     S = WallKernelFields()

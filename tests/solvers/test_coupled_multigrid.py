@@ -11,7 +11,8 @@ import warp_lcp as wl
 from default_run import covering, slow
 from method_steps import begun
 from oracle import assemble, lemke, natural_residual
-from warp_lcp.subproblems.low_rank_correction import WoodburyCorrection
+from warp_lcp.subproblems.grid_step_kernels import SLOTS, ZAP, ZAZ
+from warp_lcp.subproblems.low_rank_correction import WoodburyCorrection, add_products_kernel
 from warp_lcp.subproblems.multigrid_coupled import CoupledWorkspace
 
 TIGHT = wl.StoppingCriteria(rtol=1e-9, max_iterations=400)
@@ -345,3 +346,18 @@ def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, de
     assert corrections[0] == (cycles, True)
     assert len(corrections) > 1
     assert not any(begins for _, begins in corrections[1:])
+
+
+def test_products_of_the_low_rank_term_are_added_to_those_of_the_matrix():
+    """z'Kz and z'Kp of K = A + U W U', from those of A and from U'z and U'p."""
+    rng, n, m = np.random.default_rng(683), 12, 4
+    A, U, W = rng.standard_normal((n, n)), rng.standard_normal((n, m)), rng.standard_normal((m, m))
+    z, p = rng.standard_normal((2, n))
+    sums = np.zeros(SLOTS)
+    sums[ZAZ], sums[ZAP] = z @ A @ z, z @ A @ p
+    scalars, *given = (
+        wp.array(v, dtype=wp.float64, device="cpu") for v in (sums, W.ravel(), U.T @ z, U.T @ p)
+    )
+    wp.launch(add_products_kernel, 1, [*given, m, scalars], device="cpu")
+    K, found = A + U @ W @ U.T, scalars.numpy()
+    np.testing.assert_allclose([found[ZAZ], found[ZAP]], [z @ K @ z, z @ K @ p], rtol=1e-12)

@@ -4,12 +4,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
 from matrices import solve_matrix
 from oracle import boxed, lemke, natural_residual
+from warp_lcp.operators.banded_matrix import BandedFactors
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.lemke import Basis, Lemke
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
@@ -277,3 +279,24 @@ def test_the_default_solves_flipped_matrices_in_boxes():
         A, b, lower, upper = flipped(seed)
         result = wl.solve(wl.LCP(A, b, lower, upper))
         assert result, (seed, result.status)
+
+
+def test_a_path_begins_again_with_a_dense_inverse_where_banded_factors_fail(monkeypatch):
+    """Banded factors that are singular at the fifth pivot: the dense basis finds the solution."""
+    rng, n, calls = np.random.default_rng(677), 120, []
+    A = scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
+    problem = wl.LCP(wl.SparseOperator(A, device="cpu"), rng.standard_normal(n))
+    factor = BandedFactors.factor
+
+    def failing(self, basic, row):
+        calls.append(row)
+        return len(calls) != 5 and factor(self, basic, row)
+
+    monkeypatch.setattr(BandedFactors, "factor", failing)
+    work = wl.Lemke().init(problem)
+    result = wl.solve(problem, wl.Lemke(), workspace=work)
+    assert result
+    assert len(calls) == 5
+    assert type(work.basis) is Basis
+    x = result.x.numpy()
+    np.testing.assert_allclose(np.minimum(x, A @ x + problem.b.numpy()), 0.0, atol=1e-10)
