@@ -40,6 +40,9 @@ STEP = 0.05  # sites: step of the differences that give the direction away from 
 # Factors of a normal's components, by which it belongs to an axis. They differ, since at 45 degrees
 # rounding must not decide.
 PREFERRED = np.array([1.02, 1.01, 1.0])
+# Steps of the place where a particle's region is looked up, along x, y and z: square roots of
+# primes, which have no common period.
+SHIFTS = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23]).reshape(3, 3) % 1.0
 Region = Callable[[np.ndarray], np.ndarray]
 
 
@@ -210,8 +213,13 @@ class PartialSites:
         mine = self._owned(places)
         points.append(self._admitted(places[mine], spare[mine]))
         position = np.concatenate(points)
-        owner = self._regions_of(position)
-        return position[owner >= 0], owner[owner >= 0]
+        owner = self._regions_of(position, self.size)
+        # Of regions thinner than a site each gets its share: the region is that of another place in
+        # the particle's site.
+        shift = (self._sites_of(position) @ SHIFTS) % 1.0 - 0.5
+        shift[:, grid.dimension :] = 0.0
+        other = self._regions_of(position + shift * self.size, 0.0)
+        return position[owner >= 0], np.where(other >= 0, other, owner)[owner >= 0]
 
     def _open_sites(self, plane: int, open_cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return this process's sites near surfaces in a plane of cells, and their points.
@@ -249,15 +257,15 @@ class PartialSites:
         result[result] = own[k, j, i]
         return result
 
-    def _regions_of(self, points: np.ndarray) -> np.ndarray:
+    def _regions_of(self, points: np.ndarray, reach: float) -> np.ndarray:
         """Return the region of points [m], shape (n,): the first that has it, or the nearest.
 
-        It is -1 where no region is within a site.
+        It is -1 where no region is at most `reach` away [m].
         """
-        owner, nearest = np.full(len(points), -1), np.full(len(points), self.size)
+        owner, nearest = np.full(len(points), -1), np.full(len(points), reach)
         for number, geometry in enumerate(self.geometries):
-            at = np.flatnonzero(nearest > 0.0)
-            at = at[_near(geometry, points[at], self.size)]
+            at = np.flatnonzero((nearest > 0.0) | (owner < 0))
+            at = at[_near(geometry, points[at], reach)]
             distance = signed_distance(geometry, points[at], self.grid.device)
             better = distance < nearest[at]
             nearest[at[better]] = np.where(distance < 0.0, 0.0, distance)[better]
@@ -295,7 +303,8 @@ class PartialSites:
         admitted = self.boundary.admits(flat[at])
         room[at] = np.abs(walls.room(flat[at], self.size)) * np.where(admitted, 1.0, -1.0)
         open_ = np.clip(0.5 + room / block, 0.0, 1.0)
-        weight = (filled * open_).reshape(-1, count)
+        # Regions often end at walls: their surfaces then cut the same part off.
+        weight = np.minimum(filled, open_).reshape(-1, count)
         crossed = ((open_ < 1.0) & (filled > 0.0)).reshape(-1, count).any(axis=1)
         second = np.zeros(weight.shape, dtype=bool)
         at = np.flatnonzero(crossed)
@@ -303,6 +312,7 @@ class PartialSites:
         second[at] = side
         normal = np.zeros((len(sites), 3))
         normal[at] = away
+        crossed &= normal.any(axis=1)
         pieces = [
             self._parts_of_side(sites, weight * ~second, normal, crossed),
             self._parts_of_side(sites[at], (weight * second)[at], -away, crossed[at]),
@@ -328,7 +338,8 @@ class PartialSites:
             room: distance of each from thin solids [m], negative in these.
 
         Returns:
-            Bool of shape (n, blocks); direction away from the solid on the first side, (n, 3).
+            Bool of shape (n, blocks); direction away from the solid on the first side, (n, 3), 0
+            where all blocks with material have their centers in solids.
         """
         step, axes = STEP * self.size, range(self.grid.dimension)
         away = np.zeros(points.shape)
@@ -340,8 +351,11 @@ class PartialSites:
             ahead, behind = (np.abs(self._walls.room(x, 2.0 * self.size)) for x in moved)
             away[at, axis] = (ahead - behind) * np.sign(room[at])
         first = np.where(at, room, -np.inf).argmax(axis=1)
-        reference = away[np.arange(len(away)), first] if len(away) else np.zeros((0, 3))
-        return at & ((away * reference[:, None]).sum(axis=2) < 0.0), reference
+        reference = away[np.arange(len(away)), first]
+        # Within a solid the nearest side may be the other one.
+        reference[room[np.arange(len(away)), first] <= 0.0] = 0.0
+        opposed = (away * reference[:, None]).sum(axis=2) < 0.0
+        return at & opposed & (room > 0.0), reference
 
     def _parts_of_side(
         self, sites: np.ndarray, weight: np.ndarray, away: np.ndarray, beside: np.ndarray
@@ -407,8 +421,8 @@ class PartialSites:
         return self._admitted(points, centers)
 
     def _admitted(self, points: np.ndarray, spare: np.ndarray) -> np.ndarray:
-        """Return points where a particle may start, else spare ones, if it may start there."""
-        good = self.boundary.admits(points)
+        """Return points [m] of regions where a particle may start, or else spare points."""
+        good = self.boundary.admits(points) & (self._regions_of(points, 0.0) >= 0)
         points = np.where(good[:, None], points, spare)
         good[~good] = self.boundary.admits(points[~good])
         return np.asarray(points[good])
@@ -455,7 +469,9 @@ class PartialSites:
         starts = np.flatnonzero(np.diff(member, prepend=-1) | np.diff(layer, prepend=-1))
         amount = np.add.reduceat(weight, starts)
         middle = np.add.reduceat(weight[:, None] * center, starts) / amount[:, None]
-        spare = center[np.append(starts[1:], len(weight)) - 1]  # the fullest block of each layer
+        # The fullest block of each member.
+        ends = np.flatnonzero(np.diff(member, append=len(rows)))
+        spare = center[np.lexsort((weight, member))[ends]]
         member, layer = member[starts], layer[starts]
         width = amount / SAMPLES[self.grid.dimension] ** (self.grid.dimension - 1)
         amount = amount / len(self._blocks)
@@ -464,7 +480,7 @@ class PartialSites:
         total = np.bincount(line, weights=amount)
         number = np.diff(np.floor(np.cumsum(total) + 0.5), prepend=0.0).astype(np.int64)
         # At free surfaces, mostly above, amounts are exact, and what is left over is below.
-        exact = (np.bincount(line, weights=down[member]) < 0.0) & (number <= total + 0.5)
+        exact = (np.bincount(line, weights=down[member]) < 0.0) & (number <= total + 0.25)
         factor = np.where(exact, 1.0, number / total)
         sums, ends = np.cumsum(amount * factor[line]), np.cumsum(total * factor)
         start = np.repeat(ends - total * factor, number)
@@ -478,7 +494,7 @@ class PartialSites:
         turn = (np.floor(wanted - start) + line[at]) % 2
         shift = np.where(width[at] > WIDE, 0.25 * width[at] * (1.0 - 2.0 * turn), 0.0)
         points[each, axis[member[at]]] += shift * self.size
-        return self._clipped(points), self._clipped(spare[at])
+        return self._clipped(points), self._clipped(spare[member[at]])
 
     def _blocks_of(
         self, parts: SiteParts, place: np.ndarray
