@@ -37,8 +37,8 @@ from warp_lcp.operators.grid_poisson import FLUID
 # cells; in thinner solids these layers would overlap those of the other side.
 BARRIER = 3.0
 SAMPLES = {2: 96, 3: 12}  # lines per axis of a face, for the part that a solid's edge leaves open
-# Rays per edge of a density kernel's support, for the share of the kernel that a cell's center sees.
-# In 2-D the share of a half space is right to 0.004, in 3-D to 0.03.
+# Rays per edge of a density kernel's support, for the share of it that a cell's center sees. In 2-D
+# the share of a half space is right to 0.004, in 3-D to 0.03.
 RAYS = {2: 24, 3: 6}
 COST = 256  # work of a particle, in cells of a usual pass
 Faces = Sequence[wp.array]

@@ -47,7 +47,7 @@ Region = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass
-class SiteParts:
+class SiteFractions:
     """Parts of sites: of a site that a thin solid divides, one on each side.
 
     Attributes:
@@ -70,27 +70,30 @@ class SiteParts:
     weight: np.ndarray
 
     @classmethod
-    def joined(cls, pieces: Sequence[SiteParts]) -> SiteParts:
+    def joined(cls, pieces: Sequence[SiteFractions]) -> SiteFractions:
         """Return the parts of several objects, ordered by their sites."""
-        one = cls(
-            *(
-                np.concatenate([getattr(piece, name.name) for piece in pieces])
-                for name in fields(cls)
-            )
-        )
-        order = np.lexsort(one.site.T)
-        first = np.cumsum(one.number) - one.number
-        blocks = _ranges(first[order], one.number[order])
-        sorted_columns = (one.site, one.share, one.normal, one.beside, one.number)
+        columns = [
+            np.concatenate([getattr(piece, name.name) for piece in pieces]) for name in fields(cls)
+        ]
+        site, share, normal, beside, number, block, weight = columns
+        order = np.lexsort(site.T)
+        blocks = _ranges((np.cumsum(number) - number)[order], number[order])
         return cls(
-            *(column[order] for column in sorted_columns), one.block[blocks], one.weight[blocks]
+            site[order],
+            share[order],
+            normal[order],
+            beside[order],
+            number[order],
+            block[blocks],
+            weight[blocks],
         )
 
 
 def _ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Return the numbers first, first + 1, ..., first + count - 1 of each pair, in a row."""
     ends = np.cumsum(count)
-    return np.arange(ends[-1] if len(ends) else 0) + np.repeat(first - (ends - count), count)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.asarray(np.arange(total) + np.repeat(first - (ends - count), count))
 
 
 class PartialSites:
@@ -202,8 +205,8 @@ class PartialSites:
         planes = range(grid.origin[2], grid.origin[2] + grid.counts[2])
         found = [self._open_sites(plane, open_cells) for plane in planes]
         sites, usual = (np.concatenate(column) for column in zip(*found, strict=True))
-        own = SiteParts.joined([self._parts(sites)])
-        parts = SiteParts.joined(grid.part.ranks.collect(own))
+        own = SiteFractions.joined([self._parts(sites)])
+        parts = SiteFractions.joined(grid.part.ranks.collect(own))
         target, normal = self._gathered(parts)
         in_lane = np.zeros(len(parts.site), dtype=bool)
         in_lane[target[parts.share < FULL]] = True
@@ -252,7 +255,7 @@ class PartialSites:
         cells = np.floor(points.astype(np.float64) / grid.spacing).astype(np.int64)
         cells = np.minimum(cells, np.array(grid.domain_counts) - 1) - np.array(grid.origin)
         cells[:, grid.dimension :] = 0
-        result = ((cells >= 0) & (cells < np.array(grid.counts))).all(axis=1)
+        result = np.asarray(((cells >= 0) & (cells < np.array(grid.counts))).all(axis=1))
         i, j, k = cells[result].T
         result[result] = own[k, j, i]
         return result
@@ -289,7 +292,7 @@ class PartialSites:
             result[at] += np.clip(0.5 - distance / block, 0.0, 1.0)
         return np.minimum(result, 1.0)
 
-    def _parts(self, sites: np.ndarray) -> SiteParts:
+    def _parts(self, sites: np.ndarray) -> SiteFractions:
         """Return the parts of sites of shape (n, 3); empty ones have none."""
         grid, count = self.grid, len(self._blocks)
         block = self.size / SAMPLES[grid.dimension]
@@ -305,19 +308,20 @@ class PartialSites:
         open_ = np.clip(0.5 + room / block, 0.0, 1.0)
         # Regions often end at walls: their surfaces then cut the same part off.
         weight = np.minimum(filled, open_).reshape(-1, count)
-        crossed = ((open_ < 1.0) & (filled > 0.0)).reshape(-1, count).any(axis=1)
+        cut = ((open_ < 1.0) & (filled > 0.0)).reshape(-1, count)
+        crossed: np.ndarray = cut.any(axis=1)
         second = np.zeros(weight.shape, dtype=bool)
         at = np.flatnonzero(crossed)
         side, away = self._sides(points[at], weight[at], room.reshape(-1, count)[at])
         second[at] = side
         normal = np.zeros((len(sites), 3))
         normal[at] = away
-        crossed &= normal.any(axis=1)
+        crossed = np.asarray(crossed & normal.any(axis=1), dtype=bool)
         pieces = [
             self._parts_of_side(sites, weight * ~second, normal, crossed),
             self._parts_of_side(sites[at], (weight * second)[at], -away, crossed[at]),
         ]
-        return SiteParts.joined(pieces)
+        return SiteFractions.joined(pieces)
 
     @property
     def _walls(self) -> ThinWalls:
@@ -359,7 +363,7 @@ class PartialSites:
 
     def _parts_of_side(
         self, sites: np.ndarray, weight: np.ndarray, away: np.ndarray, beside: np.ndarray
-    ) -> SiteParts:
+    ) -> SiteFractions:
         """Return the parts of sites on one side of thin solids.
 
         Args:
@@ -377,9 +381,9 @@ class PartialSites:
         part, block = np.nonzero((weight > 0.0) & ~full[:, None])
         number = np.bincount(part, minlength=len(sites))
         filled = weight[part, block].astype(np.float32)
-        return SiteParts(sites, share, normal, beside & ~full, number, block, filled)
+        return SiteFractions(sites, share, normal, beside & ~full, number, block, filled)
 
-    def _gathered(self, parts: SiteParts) -> tuple[np.ndarray, np.ndarray]:
+    def _gathered(self, parts: SiteFractions) -> tuple[np.ndarray, np.ndarray]:
         """Return the part that each part is added to, often itself, and the parts' normals.
 
         A full site gets the normal of the largest part that is added to it.
@@ -428,7 +432,7 @@ class PartialSites:
         return np.asarray(points[good])
 
     def _lanes(
-        self, parts: SiteParts, target: np.ndarray, normal: np.ndarray, in_lane: np.ndarray
+        self, parts: SiteFractions, target: np.ndarray, normal: np.ndarray, in_lane: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the particles of the lanes [m], float32, and for each the center of a block.
 
@@ -497,7 +501,7 @@ class PartialSites:
         return self._clipped(points), self._clipped(spare[member[at]])
 
     def _blocks_of(
-        self, parts: SiteParts, place: np.ndarray
+        self, parts: SiteFractions, place: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the blocks of the parts in lanes.
 
