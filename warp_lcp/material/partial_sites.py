@@ -309,7 +309,7 @@ class PartialSites:
         # Regions often end at walls: their surfaces then cut the same part off.
         weight = np.minimum(filled, open_).reshape(-1, count)
         cut = ((open_ < 1.0) & (filled > 0.0)).reshape(-1, count)
-        crossed: np.ndarray = cut.any(axis=1)
+        crossed = np.asarray(cut.any(axis=1), dtype=bool)
         second = np.zeros(weight.shape, dtype=bool)
         at = np.flatnonzero(crossed)
         side, away = self._sides(points[at], weight[at], room.reshape(-1, count)[at])
