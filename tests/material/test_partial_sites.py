@@ -101,6 +101,37 @@ def test_pools_on_two_sides_of_a_plate_have_their_amounts(thickness: float) -> N
         assert np.count_nonzero(away > 0.0) * each == pytest.approx(height - left - wall, rel=0.015)
 
 
+@pytest.mark.parametrize("width", [7.1, 7.25, 7.425])
+def test_particles_beside_a_sheet_are_in_even_columns(width: float) -> None:
+    """A column beside a sheet: as many particles as it has room, at equal distances up to the top.
+
+    A remainder below 0.37 sites, of two per cell, widens the last column, whose particles lie on
+    its two sides by turns.
+    """
+    dx, depth = 1.0 / CELLS[2], 12
+    sheet = box([width * dx, -1.0], [(width + 0.3) * dx, 2.0])
+    pool = box([0.0, 0.0], [width * dx, depth * dx])
+    simulation = small(2, liquid=[pool], solid=[sheet], particles={"jitter": 0.0})
+    x = simulation.particles.position.numpy().astype(np.float64)[:, :2] / dx
+    share = PER_AXIS * (width - 7.0)
+    wide = share < 0.37
+    end = 6.5 if wide else 7.0
+    assert np.count_nonzero(x[:, 0] < end) == PER_AXIS**2 * end * depth
+    column = x[x[:, 0] > end]
+    column = column[np.argsort(-column[:, 1])]
+    amount = share + wide
+    number = round(amount * PER_AXIS * depth)
+    height = depth - (np.arange(number) + 0.5) / amount / PER_AXIS
+    np.testing.assert_allclose(column[:, 1], height, atol=0.02)
+    middle = 0.5 * (end + width)
+    side = 0.25 * (width - end) * (1.0 - 2.0 * (np.arange(number) % 2)) if wide else 0.0
+    np.testing.assert_allclose(
+        np.abs(column[:, 0] - middle), np.abs(side) * np.ones(number), atol=0.02
+    )
+    if wide:
+        assert (np.diff(np.sign(column[:, 0] - middle)) != 0).all()
+
+
 def test_liquid_in_several_boxes_is_that_of_one() -> None:
     """Boxes thinner than the distance of particles fill a region without voids or heaps."""
     dx = 1.0 / CELLS[2]

@@ -16,9 +16,7 @@ from warp_lcp.grid.barrier_geometry import (
     Barrier,
     nearest_wall,
     place_of,
-    room_at,
     sees,
-    sees_from,
     sight_code,
     sight_of,
     wall_between,
@@ -444,38 +442,6 @@ def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INT
                             found = 1
         if found > 0:
             wp.atomic_add(gaps, int(number[k, j, i]), 1)
-
-
-@cell_kernel(MODULE)
-def share_kernel(k, j, i, B: Barrier, parts: int, share: F32):
-    """Find the share of a cell's density kernel that its center sees.
-
-    The kernel is sampled at points of equal distance, `parts` per cell and axis.
-    """
-    result = float(1.0)
-    if B.near[k, j, i] != wp.uint8(0):
-        x = place_of(B, CENTERS, k, j, i)
-        room = room_at(B, x, REACH * B.dx)
-        seen = float(0.0)
-        all = float(0.0)
-        step = 1.0 / float(parts)
-        layers = wp.where(B.planes == 2, 3 * parts, 1)
-        for c in range(layers):
-            z = float(0.0)
-            if B.planes == 2:
-                z = (float(c) + 0.5) * step - 1.5
-            for b in range(3 * parts):
-                y = (float(b) + 0.5) * step - 1.5
-                for a in range(3 * parts):
-                    way = wp.vec3((float(a) + 0.5) * step - 1.5, y, z)
-                    w = spline(way[0]) * spline(y)
-                    if B.planes == 2:
-                        w *= spline(z)
-                    all += w
-                    if sees_from(B, x, x + B.dx * way, room):
-                        seen += w
-        result = seen / all
-    share[k, j, i] = result
 
 
 @wp.func
