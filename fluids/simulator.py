@@ -163,7 +163,7 @@ class LiquidSimulation(ParticleSimulation):
             )
 
     def particles_to_grid(self, window: Window) -> None:
-        """Transfer velocity, and viscosities that differ, of particles to the grid; apply gravity."""
+        """Transfer velocity and viscosity of particles to the grid; apply gravity."""
         super().particles_to_grid(window)
         if self.viscosity is not None and self.viscosity.mixed is not None:
             self.viscosity.mixed.transfer(self.particles, window)

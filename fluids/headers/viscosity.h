@@ -176,8 +176,8 @@ for (int i = first; i < last; ++i) {
             factor =
                 !(h[axis][q] < INFINITY) ? 0.0f : (length * factor > 1.0f ? 1.0f / length : factor);
         }
-        edge[e][i] =
-            wall && (released || !held) ? 0.0f : factor * scale * viscosity(on_edges[e], i) * filled(cells, 4);
+        const float thickness = factor * scale * viscosity(on_edges[e], i);
+        edge[e][i] = wall && (released || !held) ? 0.0f : thickness * filled(cells, 4);
     }
 }
 

@@ -110,9 +110,7 @@ def test_the_equations_minimize_the_energy(dimension: int, varies: bool) -> None
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
     nonzero = [field.numpy() > 0.0 for field in viscosity.multigrid.levels[0].diagonal]
     u = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in nonzero]
-    expected, _ = force_of_energy(
-        simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, mixed
-    )
+    expected, _ = force_of_energy(simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, mixed)
     p, q = (wp.zeros(dimension * grid.size, dtype=wp.float32, device="cpu") for _ in range(2))
     p.assign(np.concatenate([field.ravel() for field in u]).astype(np.float32))
     viscosity.multigrid.product(p, q)
