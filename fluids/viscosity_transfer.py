@@ -58,9 +58,12 @@ def edges_kernel(
     viscosity: POINTS,
     origin: wp.vec3i,
     dx: float,
+    in_cells: F32,
     mean: F32,
 ):
-    """Average the viscosities around an edge harmonically: over its cube, or the cells around it.
+    """Average the viscosities in the cube of an edge harmonically.
+
+    Without particles there, those in the cells around it, then the means of these cells.
 
     Args:
         k: plane of the edge.
@@ -73,6 +76,7 @@ def edges_kernel(
         viscosity: viscosity of each particle in all components, relative to that of the scene.
         origin: cells of the larger grid before the first cell of this one.
         dx: edge of a cell [m].
+        in_cells: mean viscosity of cells, 0 without particles near.
         mean: harmonic mean, 0 without particles (written).
     """
     x = float(i + origin[0] - 1)
@@ -105,7 +109,13 @@ def edges_kernel(
     elif count_around > 0:
         mean[k, j, i] = float(count_around) / inverse_around
     else:
-        mean[k, j, i] = 0.0
+        for c in range(low_k, k + 1):
+            for b in range(low_j, j + 1):
+                for a in range(low_i, i + 1):
+                    if in_cells[c, b, a] > 0.0:
+                        inverse += 1.0 / in_cells[c, b, a]
+                        count += 1
+        mean[k, j, i] = wp.where(count > 0, float(count) / wp.max(inverse, 1.0e-30), 0.0)
 
 
 class MixedViscosity:
@@ -130,9 +140,8 @@ class MixedViscosity:
         order = [particles.offsets, particles.position, particles.kept]
         window.launch(cells_kernel, [*order, grid.planes, self.cells])
         for (one, other), mean in self.edges.items():
-            window.launch(
-                edges_kernel, [one, other, *order, wp.vec3i(*grid.origin), grid.spacing, mean]
-            )
+            place = [wp.vec3i(*grid.origin), grid.spacing]
+            window.launch(edges_kernel, [one, other, *order, *place, self.cells, mean])
         # Ghost particles near the outer edge lack neighbors, so ghost values come from their
         # owners.
         grid.part.fill(self.cells, *self.edges.values())

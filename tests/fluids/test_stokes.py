@@ -246,6 +246,18 @@ def test_a_channel_has_the_gradient_and_the_profile_of_poiseuille() -> None:
     assert abs(found["u_vx"] / (1.5 * speed) - 1.0) < 0.02
 
 
+@pytest.mark.parametrize("viscosity", [1.0, 1e5])
+def test_a_block_falls_freely_from_a_ceiling_that_separates(viscosity: float) -> None:
+    liquid = [box([0.3, 0.6], [0.7, 1.0])]
+    settings = {"value": viscosity, "splitting_tolerance": 0.05}
+    simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=liquid, viscosity=settings))
+    start = np.sort(simulation.particles.position.numpy()[:, 1])
+    while simulation.time < 0.15 - 1e-9:
+        simulation.step(min(0.02, 0.15 - simulation.time))
+    fallen = start - np.sort(simulation.particles.position.numpy()[:, 1])
+    assert np.abs(fallen - 0.5 * GRAVITY * 0.15**2).max() < 0.01 / 32
+
+
 def two_layers(height: float, thick: float, thin: float) -> tuple[np.ndarray, np.ndarray]:
     """Return fluxes of two equal layers per pressure gradient, and speeds at 16 places across.
 
