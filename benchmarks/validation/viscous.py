@@ -232,8 +232,8 @@ def ball(findings: Findings, cells: int) -> None:
 
 CHECK = ValidationCheck(
     about="Thick liquid that walls hold: Poiseuille flow in a pipe and of two layers, a rod "
-    "between walls and a ball in a square duct. Velocity and pressure are solved at once; one after the "
-    f"other, at steps of {DT_MAX} s, liquid slips along walls.",
+    "between walls and a ball in a square duct. Velocity and pressure are solved at once; one "
+    f"after the other, at steps of {DT_MAX} s, liquid slips along walls.",
     trials=[
         (pipe, [(cells, viscosity) for cells in (8, 16) for viscosity in VISCOSITIES]),
         (layers, (16, 32)),
