@@ -25,6 +25,8 @@ TENSION_BYTES = 21
 UNILATERAL_BYTES = 1
 # Its fields, those of coarse levels, and the velocity before the pressure solve.
 VISCOUS_BYTES = {2: 140, 3: 220}
+# Viscosities of cells and edges, and the first particle of each cell, where viscosities differ.
+MIXED_BYTES = {2: 12, 3: 20}
 # Fields of the coupled solve, its Krylov vectors, and the levels of its pressure cycle.
 STOKES_BYTES = {2: 750, 3: 1000}
 # Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
@@ -441,7 +443,10 @@ class LiquidScene(ParticleScene):
             ),
             "viscosity": cells
             * (self.viscosity is not None)
-            * (VISCOUS_BYTES[self.dimension] + 4 * self.dimension * (self.kept(()) is not None)),
+            * (
+                VISCOUS_BYTES[self.dimension]
+                + MIXED_BYTES[self.dimension] * (self.kept(()) is not None)
+            ),
             "coupled solve": cells * self.couples * STOKES_BYTES[self.dimension],
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "drag along walls": cells * 4 * self.dimension * (self.drags is not None),

@@ -29,7 +29,6 @@ from warp_lcp.fluids.wall_drag import WallDrag
 from warp_lcp.grid.grid_part import ONE_PROCESS
 from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.transfer import particles_to_faces
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.joined_graphs import joined
 from warp_lcp.kernels.launch_graph import LaunchGraph
@@ -164,24 +163,10 @@ class LiquidSimulation(ParticleSimulation):
             )
 
     def particles_to_grid(self, window: Window) -> None:
-        """Transfer velocity (and viscosity) of particles to the faces; apply gravity."""
+        """Transfer velocity and viscosity of particles to the grid; apply gravity."""
         super().particles_to_grid(window)
-        if self.viscosity is not None and self.viscosity.relative:
-            # The particles' viscosities do not change.
-            p, fields = self.particles, (self.viscosity.relative, self.weights)
-            particles_to_faces(
-                self.grid,
-                p.position,
-                p.kept,
-                [],
-                *fields,
-                window=window,
-                offsets=p.offsets,
-                runs=p.runs,
-            )
-            # Ghost particles near the outer edge lack neighbors, so ghost values come from their
-            # owners.
-            self.grid.part.fill(*self.viscosity.relative, *self.weights)
+        if self.viscosity is not None and self.viscosity.mixed is not None:
+            self.viscosity.mixed.transfer(self.particles, window)
 
     def stable_dt(self) -> float:
         """Return the longest stable time step for advection and surface tension [s]."""

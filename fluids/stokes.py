@@ -12,9 +12,8 @@ in units of the mass of a cell, rho dx^d.
 
 - M_f = a_f theta_f, with open fraction and distance of the surface as in `fluids.pressure`, so that
   K = 0 is the pressure projection of the step.
-- K is the matrix of `fluids.viscosity` with its walls and slip lengths, and the harmonic mean of
-  viscosities that differ on edges; tau = nu kick_dt / dx^2. It is symmetric and positive
-  semi-definite, and K u = 0 for rigid motions.
+- K is the matrix of `fluids.viscosity` with its walls and slip lengths; tau = nu kick_dt / dx^2. It
+  is symmetric and positive semi-definite, and K u = 0 for rigid motions.
 - D u is the outflow of cells through the open parts of their faces, d that of moving solids. The
   force of the pressure on a face is D'x = a (x_below - x_here).
 - Faces in a wall that are partly open are no unknowns. A film of half of the open part holds them,
@@ -179,7 +178,7 @@ class StokesSolve:
             cut=bool(boundary.open),
             moving=bool(boundary.velocity),
             ghost=phi is not None,
-            varies=bool(viscosity.relative),
+            varies=viscosity.mixed is not None,
             bounded=projection.lower is not None,
         )
         deep, none = grid.dimension == 3, [None] * grid.dimension
@@ -277,7 +276,7 @@ class StokesSolve:
     def _launch_set_up(self, kind: wp.array, contact: wp.array) -> None:
         """Launch the kernels that change the viscous equations to those of the coupled solve."""
         kernels, grid, b = self._kernels, self.grid, self.boundary
-        relative: list[wp.array | None] = [*self.viscosity.relative] or [None] * grid.dimension
+        thick = None if self.viscosity.mixed is None else self.viscosity.mixed.cells
         equations = self._equations
         level, window = equations.level, equations.window
         for axis in range(grid.dimension):
@@ -291,7 +290,7 @@ class StokesSolve:
                 h=equations.slip[axis],
                 open=self._open[axis],
                 phi=self._phi,
-                relative=relative[axis],
+                thick=thick,
                 kind=kind,
                 contact=contact,
                 axis=axis,
@@ -326,8 +325,6 @@ class StokesSolve:
                 db=equations.distance[other],
                 va=level.volume[one],
                 vb=level.volume[other],
-                ma=relative[one],
-                mb=relative[other],
                 a=one,
                 b=other,
             )

@@ -73,7 +73,7 @@ def stokes_kernels(
     return StokesKernels(
         masses=kernel("masses", CUT=cut, GHOST=ghost, VARIES=varies),
         cells=kernel("cells", CUT=cut),
-        edges=kernel("edges", VARIES=varies),
+        edges=kernel("edges"),
         scale=kernel("scale", CUT=cut),
         weights=kernel("weights"),
         gradient=kernel("gradient", CUT=cut),

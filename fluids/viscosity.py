@@ -44,6 +44,7 @@ from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWallCoupling, Visc
 from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
+from warp_lcp.fluids.viscosity_transfer import MixedViscosity
 from warp_lcp.grid.domain_sides import open_sides_of
 from warp_lcp.grid.staggered import (
     ActiveWindow,
@@ -169,8 +170,7 @@ class Viscosity:
     Attributes:
         change: change of each component in the last step [m/s].
         before: saved velocity, see `store_velocity` and `undo`.
-        relative: viscosity on the faces of each component, in units of `viscosity`, 0 without
-            liquid; empty if all viscosities are equal.
+        mixed: viscosities of cells and edges, in units of `viscosity`; None if all are equal.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class Viscosity:
         self._thin: list[wp.array | None] = grid.faces() if held_apart else [*none]
         self._thin_speed: list[wp.array | None] = grid.faces() if held_apart else [*none]
         self._thin_owner = grid.faces(wp.int16) if held_apart else []
-        self.relative = [] if thickest is None else grid.faces()
+        self.mixed = None if thickest is None else MixedViscosity(grid)
         self.change = self.multigrid.components(self._change)
         self._pull: ViscousWallCoupling | None = None  # built at the first use
         self._bodies: BodyDrag | None = None
@@ -546,7 +546,8 @@ class Viscosity:
             for axis, number in enumerate(self.grid.barriers.number):
                 near.launch(thin.crossed_kernel, [number, self._slips, distance[axis], slip[axis]])
         (vx, vy, vz), (dx, dy, dz) = three_components(fine.volume), three_components(distance)
-        (hx, hy, hz), (mx, my, mz) = three_components(slip), three_components(self.relative)
+        (hx, hy, hz), mixed = three_components(slip), self.mixed
+        thick_edges = {} if mixed is None else mixed.edges
         self._above.run(
             passes.weights,
             cell=fine.cell,
@@ -564,9 +565,10 @@ class Viscosity:
             hy=hy,
             hz=hz,
             phi=self._phi,
-            mx=mx,
-            my=my,
-            mz=mz,
+            thick=None if mixed is None else mixed.cells,
+            thick_xy=thick_edges.get((0, 1)),
+            thick_xz=thick_edges.get((0, 2)),
+            thick_yz=thick_edges.get((1, 2)),
             kind=kind,
             contact=contact,
             planes=planes,
@@ -601,11 +603,11 @@ class Viscosity:
         cells, solids = [kind, contact, self._tau], [self._slips, cut.turn, cut.shift]
         placement = [wp.vec3i(*grid.origin), grid.planes, grid.spacing]
         for axis in range(grid.dimension):
-            own, relative = barriers.apart[axis], self.relative[axis] if self.relative else None
+            own, thick = barriers.apart[axis], None if self.mixed is None else self.mixed.cells
             pulls = [self._thin[axis], self._thin_speed[axis], self._thin_owner[axis]]
             for turn, other in enumerate(n for n in range(grid.dimension) if n != axis):
                 number = barriers.number[other]
-                links = [axis, other, own, number, fine.volume[axis], relative, *cells]
+                links = [axis, other, own, number, fine.volume[axis], thick, *cells]
                 given = [*links, *solids, *placement, int(turn == 0)]
                 self._above.launch(thin.pull_kernel, [*given, *pulls])
         for (a, b), edge in fine.edges.items():

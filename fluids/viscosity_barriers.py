@@ -39,7 +39,7 @@ def pull_kernel(
     apart: U8,
     number: I16,
     volume: F32,
-    relative: F32,
+    thick: F32,
     kind: I8,
     contact: U8,
     tau: float,
@@ -69,7 +69,7 @@ def pull_kernel(
         number: numbers of the solids that cross the faces of the component along `other`, 0 for
             none.
         volume: liquid fraction of each face's cube.
-        relative: relative viscosity on faces, see `fluids.viscosity`; null if all are equal.
+        thick: viscosity of cells, see `fluids.viscosity_transfer`; null if all are equal.
         kind: kind of cells.
         contact: contact of cells; RELEASED cells have no link to walls.
         tau: weight of a link.
@@ -107,8 +107,13 @@ def pull_kernel(
     link = float(0.0)
     if held and not released:
         link = tau * volume[k, j, i]
-        if relative:
-            link *= relative[k, j, i]
+        if thick:
+            here = thick[k, j, i]
+            below = thick[back_k, back_j, back_i]
+            if here > 0.0 and below > 0.0:
+                link *= 0.5 * (here + below)
+            else:
+                link *= here + below
     for side in range(2):
         c = k + wp.where(other == 2, side, 0)
         b = j + wp.where(other == 1, side, 0)

@@ -156,3 +156,15 @@ def stirred_scene(seed: int) -> LiquidScene:
         cfl=float(rng.uniform(0.5, 4.0)),
         **tables,
     )
+
+
+def coupled_scene(seed: int) -> LiquidScene:
+    """Return a scene of `viscous_scene` or `stirred_scene` with coupled solves.
+
+    Steps with splitting errors above 5 %, or 0.1 %, are solved at once.
+    """
+    drawn = stirred_scene(seed) if seed % 2 else viscous_scene(seed)
+    assert drawn.viscosity is not None
+    share = 0.05 if seed % 4 < 2 else 1e-3
+    viscosity = drawn.viscosity.model_copy(update={"splitting_tolerance": share})
+    return drawn.model_copy(update={"viscosity": viscosity})

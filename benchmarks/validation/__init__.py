@@ -26,6 +26,7 @@ from warp_lcp.benchmarks.validation import (
     sand_silo,
     time_steps,
     transfers,
+    viscous,
     walls,
 )
 from warp_lcp.benchmarks.validation.finding import ValidationTrial, table
@@ -43,6 +44,7 @@ CHECKS = {
     "rest": rest.RESTING,
     "volume": dam_break.VOLUME,
     "floating": floating.CHECK,
+    "viscous": viscous.CHECK,
     "inclined layer": inclined.LAYERS,
     "sand collapse": sand_collapse.COLLAPSES,
     "sand hourglass": sand_hourglass.CHECK,

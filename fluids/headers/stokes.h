@@ -24,7 +24,7 @@ const int edge =
 // difference of pressures, `share` = drag / (m + drag) the wall's part of their velocity;
 // `free_part` = a (1 - share).
 //   compute    float32
-//   box        float32 volume, leak, share, free_part?, d, h, open?, phi?, relative?; int8 kind;
+//   box        float32 volume, leak, share, free_part?, d, h, open?, phi?, thick?; int8 kind;
 //              uint8 contact
 //   numbers    int axis, planes; float32 tau
 //   constants  FLUID, SOLID, AIR, RELEASED, CLOSE, THETA_MIN, CUT, GHOST, VARIES
@@ -34,6 +34,13 @@ const auto inverse_theta = [&](long long liquid, long long air) {
     const float inverse = GHOST ? 1.0f - phi[GHOST ? air : 0] / phi[GHOST ? liquid : 0] : 1.0f;
     const float least = inverse > 1.0f ? inverse : 1.0f;
     return least < (float)(1.0 / THETA_MIN) ? least : (float)(1.0 / THETA_MIN);
+};
+// viscosity of the liquid on both sides of a face, the mean of two cells
+const auto viscosity = [&](long long i) {
+    if (!VARIES) return 1.0f;
+    const float here = thick[VARIES ? i : 0], below = thick[VARIES ? i - step : 0],
+                sum = here + below;
+    return sum > 0.0f ? (here > 0.0f && below > 0.0f ? 0.5f * sum : sum) : 1.0f;
 };
 for (int i = first; i < edge; ++i) volume[i] = leak[i] = share[i] = 0.0f;
 for (int i = edge; i < last; ++i) {
@@ -48,9 +55,7 @@ for (int i = edge; i < last; ++i) {
                       ((below == FLUID) & (contact[i - step] != RELEASED));
     float drag = 0.0f;
     if (wall && part > 0.0f && held && h[i] < INFINITY) {
-        const float thick =
-            VARIES && relative[VARIES ? i : 0] > 0.0f ? relative[VARIES ? i : 0] : 1.0f;
-        drag = tau * thick / (0.5f * part + h[i]);
+        drag = tau * viscosity(i) / (0.5f * part + h[i]);
     }
     volume[i] = wall ? 0.0f : mass;
     leak[i] = wall && part > 0.0f ? part * part / (mass + drag) : 0.0f;
@@ -116,12 +121,11 @@ for (int i = first; i < last; ++i) {
 }
 
 // kernel fluids.stokes.edges: Cut the shear stress at edges that touch a face without mass: there
-// this face moves such that the stress vanishes. Viscosities that differ count by their harmonic
-// mean, as of layers along the edge
+// this face moves such that the stress vanishes
 //   compute    float32
-//   box        float32 weight, da, db, va, vb, ma?, mb?
+//   box        float32 weight, da, db, va, vb
 //   numbers    int a, b
-//   constants  CLOSE, VARIES
+//   constants  CLOSE
 const long long steps[3] = {1, s2, s1}, A = steps[a], B = steps[b];
 const auto light = [&](const float* d, const float* v, long long f) {
     return !(d[f] <= (float)CLOSE) && !(v[f] > 0.0f);
@@ -129,23 +133,7 @@ const auto light = [&](const float* d, const float* v, long long f) {
 for (int i = first; i < last; ++i) {
     const bool cut =
         light(da, va, i) || light(da, va, i - B) || light(db, vb, i) || light(db, vb, i - A);
-    float factor = 1.0f;
-    if (VARIES) {
-        float sum = 0.0f, inverse = 0.0f;
-        int count = 0;
-        const auto add = [&](float m) {
-            if (!(m > 0.0f)) return;
-            sum += m;
-            inverse += 1.0f / m;
-            ++count;
-        };
-        add(ma[VARIES ? i : 0]);
-        add(ma[VARIES ? i - B : 0]);
-        add(mb[VARIES ? i : 0]);
-        add(mb[VARIES ? i - A : 0]);
-        factor = count ? (float)(count * count) / (sum * inverse) : 1.0f;
-    }
-    weight[i] = cut ? 0.0f : factor * weight[i];
+    weight[i] = cut ? 0.0f : weight[i];
 }
 
 // kernel fluids.stokes.scale: Correction c of the pressure by an outflow, which approximates

@@ -82,8 +82,8 @@ for (int i = first; i < last; ++i) {
 // kernel fluids.viscosity.weights: Share of cells, edges and faces that the liquid fills, times
 // `scale` for cells and edges; see fluids.viscosity
 //   compute    float32
-//   box        float32 cell, mixed, xy, xz?, yz?, vx, vy, vz?, dx, dy, dz?, hx, hy, hz?, phi?, mx?,
-//              my?, mz?; int8 kind; uint8 contact
+//   box        float32 cell, mixed, xy, xz?, yz?, vx, vy, vz?, dx, dy, dz?, hx, hy, hz?, phi?,
+//              thick?, thick_xy?, thick_xz?, thick_yz?; int8 kind; uint8 contact
 //   numbers    int planes; float32 scale
 //   constants  AIR, FLUID, SOLID, RELEASED, CLOSE, ALIKE, GHOST, VARIES
 const int nx = given.cell.shape[2] - 2, ny = given.cell.shape[1] - 2, nz = given.cell.shape[0] - 2;
@@ -106,23 +106,12 @@ const auto filled = [&](const long long* cells, int n) {  // mean over some cell
     }
     return open ? (float)wet / (float)open : 0.0f;
 };
-// Viscosity of the liquid, in units of that in `scale`: the mean over the faces that have a
-// viscosity, or the least of them where it differs.
-const float* m[3] = {VARIES ? mx : dx, VARIES ? my : dx, VARIES && deep ? mz : dx};
-struct Thick {
-    float sum, least, most;
-    int n;
+// Viscosity of the liquid in a cell and on its edges, in units of that in `scale`.
+const float* on_edges[3] = {VARIES ? thick_xy : dx, VARIES && deep ? thick_xz : dx,
+                            VARIES && deep ? thick_yz : dx};
+const auto viscosity = [&](const float* of, long long at) {
+    return VARIES && of[VARIES ? at : 0] > 0.0f ? of[VARIES ? at : 0] : 1.0f;
 };
-const auto add = [&](Thick& t, int axis, long long f) {
-    const float v = m[axis][f];
-    if (v > 0.0f) {
-        t.sum += v;
-        t.least = v < t.least ? v : t.least;
-        t.most = v > t.most ? v : t.most;
-        ++t.n;
-    }
-};
-const auto mean = [](const Thick& t) { return t.n ? t.sum / (float)t.n : 1.0f; };
 const auto let_go = [&](long long c) { return (kind[c] == FLUID) & (contact[c] == RELEASED); };
 const auto holds = [&](long long c) { return (kind[c] == FLUID) & (contact[c] != RELEASED); };
 for (int i = first; i < last; ++i) {
@@ -130,11 +119,7 @@ for (int i = first; i < last; ++i) {
     const long long here[1] = {i};
     float share = inside ? filled(here, 1) : 0.0f, walled = 0.0f;
     bool solid = false, sticks = share == 1.0f && holds(i);
-    Thick own = {0.0f, 1e30f, 0.0f, 0};
-    if (VARIES && inside)
-        for (int axis = 0; axis <= planes; ++axis)
-            for (int side = 0; side < 2; ++side) add(own, axis, i + side * step[axis]);
-    const float thick = mean(own);
+    const float own = viscosity(VARIES ? thick : dx, i);
     if (inside)
         for (int axis = 0; axis <= planes; ++axis)
             for (int side = 0; side < 2; ++side) {
@@ -145,22 +130,21 @@ for (int i = first; i < last; ++i) {
                 }
             }
     if (solid && sticks) {  // and no edge reaches the surface
-        walled = 1.0f;
+        walled = own;
+        float least = own, most = own;
         for (int e = 0; e < 2 * planes - 1; ++e)
             for (int corner = 0; corner < 4; ++corner) {
                 const long long A = step[e < 2 ? 0 : 1], B = step[e < 1 ? 1 : 2],
                                 o = i + (corner & 1) * A + (corner >> 1) * B;
                 const long long cells[4] = {o - A - B, o - A, o - B, o};
                 if (filled(cells, 4) < 1.0f) walled = 0.0f;
-                if (VARIES)
-                    for (int f = 0; f < 4; ++f)
-                        add(own, f < 2 ? (e < 2 ? 0 : 1) : (e < 1 ? 1 : 2),
-                            f < 2 ? o - (f & 1) * B : o - (f & 1) * A);
+                const float beside = viscosity(on_edges[e], o);
+                least = beside < least ? beside : least;
+                most = beside > most ? beside : most;
             }
-        if (VARIES && own.n)
-            walled = own.most > (float)ALIKE * own.least ? 0.0f : walled * own.least;
+        if (VARIES) walled = most > (float)ALIKE * least || walled == 0.0f ? 0.0f : least;
     }
-    cell[i] = scale * (2.0f * share * thick - walled);
+    cell[i] = scale * (2.0f * share * own - walled);
     mixed[i] = scale * walled;
     for (int axis = 0; axis <= planes; ++axis) {
         const long long cells[2] = {i - step[axis], i};
@@ -173,9 +157,6 @@ for (int i = first; i < last; ++i) {
         const int a = e < 2 ? 0 : 1, b = e < 1 ? 1 : 2;
         const long long A = step[a], B = step[b], cells[4] = {i - A - B, i - A, i - B, i};
         const long long faces[4] = {i, i - B, i, i - A};  // two of a, two of b
-        Thick around = {0.0f, 1e30f, 0.0f, 0};
-        if (VARIES)
-            for (int f = 0; f < 4; ++f) add(around, f < 2 ? a : b, faces[f]);
         float factor = 1.0f;
         bool wall = false, released = false, held = false;
         for (int c = 0; c < 4; ++c) {
@@ -195,8 +176,8 @@ for (int i = first; i < last; ++i) {
             factor =
                 !(h[axis][q] < INFINITY) ? 0.0f : (length * factor > 1.0f ? 1.0f / length : factor);
         }
-        edge[e][i] =
-            wall && (released || !held) ? 0.0f : factor * scale * mean(around) * filled(cells, 4);
+        const float thickness = factor * scale * viscosity(on_edges[e], i);
+        edge[e][i] = wall && (released || !held) ? 0.0f : thickness * filled(cells, 4);
     }
 }
 

@@ -250,6 +250,75 @@ def test_a_channel_has_the_gradient_and_the_profile_of_poiseuille() -> None:
     assert abs(found["u_vx"] / (1.5 * speed) - 1.0) < 0.02
 
 
+@pytest.mark.parametrize("viscosity", [1.0, 1e5])
+def test_a_block_falls_freely_from_a_ceiling_that_separates(viscosity: float) -> None:
+    liquid = [box([0.3, 0.6], [0.7, 1.0])]
+    settings = {"value": viscosity, "splitting_tolerance": 0.05}
+    simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=liquid, viscosity=settings))
+    start = np.sort(simulation.particles.position.numpy()[:, 1])
+    while simulation.time < 0.15 - 1e-9:
+        simulation.step(min(0.02, 0.15 - simulation.time))
+    fallen = start - np.sort(simulation.particles.position.numpy()[:, 1])
+    assert np.abs(fallen - 0.5 * GRAVITY * 0.15**2).max() < 0.01 / 32
+
+
+def two_layers(height: float, thick: float, thin: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return fluxes of two equal layers per pressure gradient, and speeds at 16 places across.
+
+    Poiseuille flow, the thick layer below: the shear stress s - y is continuous, and the velocity
+    is 0 at both walls. Shapes (2,) and (16,).
+    """
+    half = 0.5 * height
+    stress = (half**2 / thick + (height**2 - half**2) / thin) / (2 * half / thick + 2 * half / thin)
+    y = np.linspace(0.0, height, 16001)
+    below = (stress * y - 0.5 * y**2) / thick
+    above = -(stress * (height - y) - 0.5 * (height**2 - y**2)) / thin
+    speed = np.where(y <= half, below, above)
+    fluxes = [np.trapezoid(speed[part], y[part]) for part in (y <= half, y >= half)]
+    return np.array(fluxes), np.interp((np.arange(16) + 0.5) / 16 * height, y, speed)
+
+
+def test_two_layers_have_the_gradient_and_the_profile_of_poiseuille() -> None:
+    """Layers of 500,000 and 500 Pa s in a channel of 16 cells, with the fluxes of one gradient.
+
+    The means of viscosities on edges and in cells decide: with arithmetic ones on faces the
+    gradient in the thick layer is 1.65 of theory.
+    """
+    height, thick, thin, speed = 0.25, 500000.0, 500.0, 0.05
+    fluxes, profile = two_layers(height, thick, thin)
+    gradient = speed * height / fluxes.sum()
+    low, middle, high = 0.03125, 0.15625, 0.28125
+    lower, upper = {"viscosity": thick}, {"viscosity": thin}
+    inflow = [[gradient * flux / (0.5 * height), 0.0] for flux in fluxes]
+    data = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [1.0, 0.3125], "resolution": 64, "wall": "sticky", "open": ["right"]},
+        "liquid": [box([0.0, low], [1.0, middle], **lower), box([0.0, middle], [1.0, high])],
+        "solid": [box([-1.0, -1.0], [5.0, low]), box([-1.0, high], [5.0, 2.0])],
+        "source": [
+            box([0.0, low], [low, middle], velocity=inflow[0], **lower),
+            box([0.0, middle], [low, high], velocity=inflow[1], **upper),
+        ],
+        "viscosity": {"value": thin, "splitting_tolerance": 0.05},
+        "physics": {"gravity": [0.0, -1e-6]},
+        "probe": [
+            {"name": "a", "position": [0.4, 0.09375], "quantity": "pressure"},
+            {"name": "b", "position": [0.7, 0.09375], "quantity": "pressure"},
+        ],
+    }
+    simulation = create(LiquidScene.model_validate(data))
+    for _ in range(4):
+        row = simulation.step(0.02)
+    assert row["stokes_iterations"] <= 60
+    found = simulation.measured["probes"]
+    assert abs((found["a_pressure"] - found["b_pressure"]) / 0.3 / gradient - 1.0) < 0.05
+    along = simulation.velocity[0].numpy()[1, 3:19, 36]
+    error = np.abs(along - gradient * profile)
+    assert error.max() < 0.03 * gradient * profile.max()
+    assert error[:8].max() < 0.05 * gradient * profile[:8].max()
+
+
 def test_a_rod_sinks_at_the_speed_of_faxen_and_carries_its_weight() -> None:
     rod = {"shape": "sphere", "center": [0.02, 0.04], "radius": 0.005, "density": 7800.0}
     simulation = create(

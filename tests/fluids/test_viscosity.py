@@ -58,10 +58,10 @@ def prepared(simulation, velocity, dt: float = 0.01):
     )
 
 
-def force_of_energy(simulation, u, tau: float, relative=None):
+def force_of_energy(simulation, u, tau: float, mixed=None):
     """Return V u + tau K u from the energy's definition, and V of each component.
 
-    For liquid that touches no wall. `relative`: viscosity on faces.
+    For liquid that touches no wall. `mixed`: viscosities of cells, and of edges by pairs of axes.
     """
     phi, d = simulation.surface.phi.numpy().astype(float), simulation.grid.dimension
     axis_of = {a: 2 - a for a in range(d)}
@@ -76,14 +76,7 @@ def force_of_energy(simulation, u, tau: float, relative=None):
         return np.clip(0.5 - field, 0.0, 1.0)
 
     def thick(*axes):
-        if relative is None:
-            return 1.0
-        if len(axes) == 2:
-            a, b = axes
-            return 0.25 * (
-                relative[a] + below(relative[a], b) + relative[b] + below(relative[b], a)
-            )
-        return sum(m + above(m, a) for a, m in enumerate(relative)) / (2 * d)
+        return 1.0 if mixed is None else mixed[axes]
 
     # Between two cells of air velocities are extrapolated: no mass.
     fluid = simulation.projection.kind.numpy() == FLUID
@@ -110,15 +103,16 @@ def test_the_equations_minimize_the_energy(dimension: int, varies: bool) -> None
         np.random.default_rng(3),
     )
     grid, viscosity = simulation.grid, simulation.viscosity
-    relative = [rng.uniform(0.1, 5.0, grid.shape).astype(np.float32) for _ in viscosity.relative]
-    for field, values in zip(viscosity.relative, relative, strict=True):
-        field.assign(values)
+    mixed = None
+    if viscosity.mixed is not None:
+        fields = {(): viscosity.mixed.cells, **viscosity.mixed.edges}
+        mixed = {key: rng.uniform(0.1, 5.0, grid.shape).astype(np.float32) for key in fields}
+        for key, values in mixed.items():
+            fields[key].assign(values)
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
     nonzero = [field.numpy() > 0.0 for field in viscosity.multigrid.levels[0].diagonal]
     u = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in nonzero]
-    expected, _ = force_of_energy(
-        simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, relative or None
-    )
+    expected, _ = force_of_energy(simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2, mixed)
     p, q = (wp.zeros(dimension * grid.size, dtype=wp.float32, device="cpu") for _ in range(2))
     p.assign(np.concatenate([field.ravel() for field in u]).astype(np.float32))
     viscosity.multigrid.product(p, q)
@@ -752,7 +746,7 @@ def test_differing_viscosities_lose_energy_beside_walls(dimension: int, spread: 
     tables = {"viscosity": {"value": 100.0}, "wall": "sticky", "solid": [ball]}
     simulation = create(scene(size=[1.0] * dimension, resolution=12, liquid=liquid, **tables))
     grid, viscosity, rng = simulation.grid, simulation.viscosity, np.random.default_rng(5)
-    for field in viscosity.relative:
+    for field in (viscosity.mixed.cells, *viscosity.mixed.edges.values()):
         field.assign(spread ** rng.uniform(0.0, 1.0, grid.shape).astype(np.float32))
     prepared(simulation, [np.zeros(grid.shape)] * dimension)
     nonzero = np.concatenate(
@@ -783,6 +777,47 @@ def test_differing_viscosities_lose_energy_beside_walls(dimension: int, spread: 
         worst /= np.linalg.norm(worst)
         worst = worst.astype(np.float32)
         assert worst @ product(worst) > -1e-5
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells_and_edges_of_two_layers_have_the_viscosity_of_the_mixture(dimension: int) -> None:
+    """Means of 1 and 1000 where an interface halves a cell, or lies between two.
+
+    Stretching along it sees the arithmetic mean in cells, shear across it the harmonic mean of the
+    cube of an edge.
+    """
+    thin, thick = 1.0, 1000.0
+    for cells, mixed_cells in (6.0, False), (6.5, True):
+        height = cells / 16
+        layers = [
+            box([0.0] * dimension, [1.0, height, 1.0][:dimension], viscosity=thick),
+            box([0.0, height, 0.0][:dimension], [1.0] * dimension, viscosity=thin),
+        ]
+        simulation = create(
+            scene(
+                size=[1.0] * dimension,
+                resolution=16,
+                liquid=layers,
+                viscosity={"value": thin},
+                particles={"jitter": 0.0},
+            )
+        )
+        simulation.step(1e-4)
+        mixed = simulation.viscosity.mixed
+        in_cells = mixed.cells.numpy()[1, 1:-1, 8]
+        on_edges = mixed.edges[0, 1].numpy()[1, 1:-1, 8]
+        expected = np.where(np.arange(16) < 6, thick, thin)
+        expected_edges = np.where(np.arange(16) < 7, thick, thin)
+        if mixed_cells:
+            expected[6] = 0.5 * (thick + thin)
+        else:
+            expected_edges[6] = 2.0 / (1.0 / thick + 1.0 / thin)
+        np.testing.assert_allclose(in_cells, expected, rtol=1e-5)
+        np.testing.assert_allclose(on_edges[1:], expected_edges[1:], rtol=1e-5)
+        if dimension == 3:  # edges along the height see both layers side by side
+            along = mixed.edges[0, 2].numpy()[8, 1:-1, 8]
+            assert along[0] == pytest.approx(thick)
+            assert along[-2] == pytest.approx(thin)
 
 
 def test_thick_liquid_from_a_source_stays_thick() -> None:

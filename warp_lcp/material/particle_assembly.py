@@ -416,8 +416,9 @@ def make_particles(
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    indexed = True if grid.barriers is not None else None  # transfers near barriers gather
     affine, kept = scene.particles.transfer == "apic", kept_by(scene, owner)
+    # Transfers near barriers, and of what particles carry, gather the particles of cells.
+    indexed = True if grid.barriers is not None or kept is not None else None
     return Particles(grid, position, velocity, affine=affine, kept=kept, indexed=indexed), notes
 
 
