@@ -8,7 +8,7 @@ from the fields included.
 
 import ctypes
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,7 +93,7 @@ class ListMemory:
 
 def list_of(array: object) -> ListMemory | None:
     """Return the list whose memory an array is part of; None if it is of none."""
-    listed: ListMemory | None = getattr(array, "listed", None)
+    listed: ListMemory | None = vars(array).get("listed") if isinstance(array, wp.array) else None
     return listed
 
 
@@ -210,9 +210,9 @@ def launch(
     """
     rows, listed = chunks(count, grid.device), None
     if is_recording():
-        members = [getattr(s, f.name) for s in structs for f in fields(s)]
-        found = (list_of(a) for a in (*kernel_args.values(), *members))
-        listed = next((one for one in found if one is not None), None)
+        members = [member for s in structs for member in vars(s).values()]
+        memories = (list_of(a) for a in (*kernel_args.values(), *members))
+        listed = next((memory for memory in memories if memory is not None), None)
     if listed is not None:
         rows = replace(rows, memory=listed.rows)
     if count or listed is not None:
