@@ -12,7 +12,7 @@ of steps are counted in another way (`benchmarks/gpu_launches.py`).
 from typing import TYPE_CHECKING
 
 from benchmarks import emulated_cuda  # must precede the package
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.kernel_variant import KernelVariant
 from warp_lcp.kernels.layout import BoundOperands

@@ -19,7 +19,7 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.book import appendix_c
 from warp_lcp.benchmarks.book import problems as book
 from warp_lcp.benchmarks.book.outcome import outcome
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.gallery import Problem, ball_obstacle, journal_bearing
 from warp_lcp.gallery.obstacle import membrane_height
 from warp_lcp.host_problem import Matrix

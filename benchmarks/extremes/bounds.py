@@ -23,7 +23,7 @@ from warp_lcp.benchmarks.extremes.case import (
 )
 from warp_lcp.benchmarks.extremes.problem import GridFields, GridProblem, with_solution
 from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, chance, given, noise, pool
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 SHAPE = (40, 44)
 EXACT_OR_FLOOR = ExpectedOutcome(OutcomeKind.EITHER, frozenset({"FLOOR"}))

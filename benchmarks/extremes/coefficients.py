@@ -11,7 +11,7 @@ import numpy as np
 from warp_lcp.benchmarks.extremes.case import EITHER, SOLVED, ExtremeCase
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of
 from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full, given, noise, pool
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 SHAPES = ((48, 53), (17, 18, 19))
 Y, X = np.indices((48, 50))

@@ -17,7 +17,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.exact import ExactEquations, stencil
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 from warp_lcp.host_problem import Matrix
 
 BALANCED = 1e-10  # share of sum |b|: a sum of b below it is 0 up to rounding

@@ -18,7 +18,7 @@ from warp_lcp.benchmarks.extremes.case import (
     SolveCase,
 )
 from warp_lcp.benchmarks.extremes.problem import GridFields, GridProblem, Problem, solvable
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SEED = 7919

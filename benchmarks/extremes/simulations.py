@@ -25,7 +25,7 @@ from warp_lcp.benchmarks.extremes.case import (
     stopped,
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem
-from warp_lcp.files.tables import Tables, TableValue, TableView
+from warp_lcp.files import Tables, TableValue, TableView
 from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.granular import SIMULATOR as GRANULAR

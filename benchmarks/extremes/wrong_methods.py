@@ -12,7 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import ExpectedOutcome, ExtremeCase, OutcomeKind, SolveCase
 from warp_lcp.benchmarks.extremes.shapes import grounded, pool
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.solve_loop import Solver, Workspace
 

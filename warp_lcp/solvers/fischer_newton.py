@@ -39,7 +39,7 @@ from warp_lcp.subproblems.nonsmooth_map import (
     NonsmoothMap,
 )
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # limit of the regularized stage: the solves that succeed need 5 to 27 steps

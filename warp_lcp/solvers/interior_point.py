@@ -35,7 +35,7 @@ from warp_lcp.subproblems.equilibration import EquilibratedWorkspace
 from warp_lcp.subproblems.grid_system import GridSystem
 from warp_lcp.subproblems.multigrid_workspace import ColdStart
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 LARGEST_START = 1e6  # times the residual's norm: largest ||b|| that sets the size of the start
 

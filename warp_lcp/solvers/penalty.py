@@ -24,7 +24,7 @@ from warp_lcp.settings import Positive, Share
 from warp_lcp.subproblems.active_set_kernels import ON_FREE
 from warp_lcp.subproblems.multigrid_workspace import ColdStart
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]

@@ -26,7 +26,7 @@ from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspac
 from warp_lcp.subproblems.active_set_kernels import projected_move
 from warp_lcp.subproblems.correction_system import CorrectionSystem
 from warp_lcp.subproblems.dense_problem import DenseProblem, pivots_of
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 LOWER, FREE, UPPER = -1, 0, 1  # places of an unknown in least-index pivoting
 STUCK = 2  # steps on one set that do not reduce the residual: its free block is singular

@@ -8,7 +8,7 @@ import scipy.ndimage
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of, with_solution
 from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, SeededGenerator, framed
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 
 
 def some_bounds(draw: SeededGenerator, shape: tuple[int, ...]) -> Tables:
