@@ -187,12 +187,12 @@ def dam(draw: SeededGenerator) -> GridProblem:
     ny = max(5, int(nx * draw.between(0.6, 2)))
     width, high = draw.between(8, 32), draw.between(16, 32)
     flat = high * (nx - 1) / width / (ny - 1)
-    made = gallery.dam(
+    problem = gallery.dam(
         nx, ny, width=width, high=high, low=high * draw.between(0, 0.6), device="cpu"
     )
     return GridProblem(
         cells=framed(np.ones((ny - 2, nx - 2))),
-        b=made.b,
+        b=problem.b,
         faces={"face_x": flat, "face_y": 1 / flat},
     )
 
