@@ -88,17 +88,20 @@ class VectorCopies:
         ).launch()
 
     def leave(
-        self, field: DeviceArray, others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
+        self, field: DeviceArray, outside: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
     ) -> None:
         """Set v to scale times the field on the unknowns.
 
-        On the other cells v becomes `others`, or 0 if that is None.
+        On the other cells v becomes `outside`, or 0 if that is None.
         """
-        given = None if others is None else others.getArray(readonly=True)
+        outside_values = None if outside is None else outside.getArray(readonly=True)
         values = v.getArray()
-        seen, target = None if given is None else self._view(given, 0), self._view(values, 1)
+        outside_view, target = (
+            None if outside_values is None else self._view(outside_values, 0),
+            self._view(values, 1),
+        )
         LEAVE.bind(
-            self._rows, x=field, d=self.stencil.d, others=seen, v=target, scale=scale
+            self._rows, x=field, d=self.stencil.d, others=outside_view, v=target, scale=scale
         ).launch()
         if self._staging:
             values[:] = target.numpy()

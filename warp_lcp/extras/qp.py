@@ -200,7 +200,7 @@ class _Solve:
     def _box(self) -> None:
         """Solve the boxed LCP of P and q in the caller's units."""
         p = self.program
-        self.result = found = linear_complementarity(
+        self.result = result = linear_complementarity(
             p.Q,
             p.c,
             bounds=(p.lower, p.upper),
@@ -210,7 +210,7 @@ class _Solve:
             maxiter=self.maxiter,
         )
         x = np.where(
-            found.active_mask < 0, p.lower, np.where(found.active_mask > 0, p.upper, found.x)
+            result.active_mask < 0, p.lower, np.where(result.active_mask > 0, p.upper, result.x)
         )
         self._judge(with_rows(p), ProgramPoint(x, np.zeros(0), np.zeros(0)), None)
 

@@ -356,13 +356,13 @@ class Particles:
             )
             return
         columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
-        given: dict[str, object] = {
+        kernel_args: dict[str, object] = {
             "removed": self._removed.array,
             "marks": marks,
             "count": self._memory.count,
             **columns,
         }
-        kernels.CLOSE_RANKS.bind_arguments(Rows.entries(1, device), (), given).launch()
+        kernels.CLOSE_RANKS.bind_arguments(Rows.entries(1, device), (), kernel_args).launch()
 
     def finish_removal(self, marks: wp.array) -> tuple[int, int]:
         """End the removal that has been launched.
@@ -374,8 +374,8 @@ class Particles:
             How many particles with the mark 1 were removed, and how many with another.
         """
         self._removed.changed()
-        first, others = self._removed.numpy().tolist()
-        if first + others:
+        first, other_marks = self._removed.numpy().tolist()
+        if first + other_marks:
             if self.grid.device.is_cuda:
                 stay = self._order[: self.count]
                 wp.utils.array_scan(stay, stay, inclusive=True)
@@ -386,8 +386,8 @@ class Particles:
                     )
                     self._columns[name], self._spare = self._spare, column
             self.exchange.register_removal(marks)
-            self.resize(self.count - first - others)
-        return first, others
+            self.resize(self.count - first - other_marks)
+        return first, other_marks
 
     def gather_rows(self, order: np.ndarray) -> None:
         """Keep the particles with these numbers, in this order."""

@@ -86,15 +86,15 @@ def pass_from_memory(form: KernelVariant) -> tuple[DataType, wp.Kernel]:
 
     if form.quads:
 
-        def from_memory(given: pieces):
-            P = given[0]
+        def from_memory(args: pieces):
+            P = args[0]
             q = task_of(P.L, wp.tid())
             run(P.L, P.F, q[0], q[1], q[2], 1)
     else:
 
-        def from_memory(given: pieces):
+        def from_memory(args: pieces):
             i, j, c = wp.tid()
-            P = given[0]
+            P = args[0]
             if i < (P.L.planes + P.L.slab - 1) // P.L.slab and j < P.L.rows and c < P.L.chunks:
                 run(P.L, P.F, i, j, c, 1)
 

@@ -388,13 +388,19 @@ class KernelVariant:
         whole = [
             line
             for half in self._halves()
-            for line in (*half, *self._fields_of_quad(type_of, kept=True), *function, "}", "else")
+            for line in (
+                *half,
+                *self._fields_of_quad(type_of, in_registers=True),
+                *function,
+                "}",
+                "else",
+            )
         ][:-1]
         rest = [
             "else if (FOUND || P.n > 0) {",
             "const int n = P.n;",
             POINTERS,
-            *self._fields_of_quad(type_of, kept=False),
+            *self._fields_of_quad(type_of, in_registers=False),
             *function,
             "}",
         ]
@@ -429,18 +435,18 @@ class KernelVariant:
             halves.append([*lines, f"const auto out_ = writing_({ours});"])
         return halves
 
-    def _fields_of_quad(self, type_of: Resolver, *, kept: bool) -> list[str]:
+    def _fields_of_quad(self, type_of: Resolver, *, in_registers: bool) -> list[str]:
         """Return C++ that declares the fields at a quad's first cell, by name.
 
-        `keep_alive`: they are held in registers, as `quad.h` does.
+        `in_registers`: hold them in registers, as `quad.h` does.
         """
         d = self.declared
         declarations = []
-        of_other = "in_other_" if kept else "in_"
+        of_other = "in_other_" if in_registers else "in_"
         reading = lambda other, data: f"{of_other}({data}, q)" if other else f"in_({data}, p)"  # noqa: E731
         for n in (n for n in d.arrays if not (d.found and n == "out")):
             if (
-                kept
+                in_registers
                 and self.types[n] in LOADED
                 and (n in d.reads or n in d.writes or (d.finer and n in d.other))
             ):

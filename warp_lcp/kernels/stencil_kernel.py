@@ -494,20 +494,21 @@ class StencilKernel:
         for name, kind, value in pairs:
             if value is None and name in self.optional:
                 continue
-            found = value.dtype if isinstance(value, wp.array) else type(value)
-            expected = letters.setdefault(kind, found) if isinstance(kind, str) else kind
-            if not isinstance(value, wp.array) or found is not expected:
+            dtype = value.dtype if isinstance(value, wp.array) else type(value)
+            expected = letters.setdefault(kind, dtype) if isinstance(kind, str) else kind
+            if not isinstance(value, wp.array) or dtype is not expected:
                 why = f", as {seen[kind]}" if isinstance(kind, str) and kind in seen else ""
                 raise TypeError(
-                    f"{self.label}: {name} is {found.__name__}, not an array of "
+                    f"{self.label}: {name} is {dtype.__name__}, not an array of "
                     f"{expected.__name__}{why}"
                 )
             seen.setdefault(kind, name)
-        if others := [
-            f"{seen[kind]} is {found.__name__}" for kind, found in letters.items() if found not in C
+        if unsupported := [
+            f"{seen[kind]} is {dtype.__name__}" for kind, dtype in letters.items() if dtype not in C
         ]:
             raise TypeError(
-                f"{self.label}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}"
+                f"{self.label}: {unsupported[0]}: a letter stands for "
+                f"{', '.join(t.__name__ for t in C)}"
             )
         # Letters of absent arrays.
         return letters | dict.fromkeys(self.letters - letters.keys(), wp.float32)

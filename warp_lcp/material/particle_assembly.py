@@ -129,7 +129,7 @@ def make_bodies(
             )
     shapes = [placed[number - 1].geometry for number in motions]
     joints = scene.joints()
-    made = make(
+    rigid_bodies = make(
         bodies,
         shapes,
         list(motions),
@@ -137,8 +137,8 @@ def make_bodies(
         scene.dimension,
         **({"joints": joints} if joints else {}),
     )
-    made.exits = (scene.domain.size, side_bits(scene.domain.open))
-    return made
+    rigid_bodies.exits = (scene.domain.size, side_bits(scene.domain.open))
+    return rigid_bodies
 
 
 def make_boundary(
@@ -451,7 +451,7 @@ def make_sources(
     """
     if not scene.source:
         return None
-    kept = scene.kept(scene.source)
+    carried = scene.kept(scene.source)
     sources = [
         Source(
             name=f"source[{number}] ({source.shape})",
@@ -459,7 +459,7 @@ def make_sources(
             velocity=np.array(_vector(source.velocity)),
             start=source.begin,
             stop=np.inf if source.stop is None else source.stop,
-            kept=None if kept is None else kept[number],
+            kept=None if carried is None else carried[number],
         )
         for number, source in enumerate(scene.source)
     ]

@@ -201,17 +201,17 @@ class Sources:
         for number in running:
             start = self.sources[number].start
             starts = before is None or start > before + NOW
-            found = self._entered(
+            swept = self._entered(
                 number, min(max(since, start), now) if starts else since, now, starts=starts
             )
-            if len(found[-1]):
-                entered.append((number, found))
+            if len(swept[-1]):
+                entered.append((number, swept))
         if not entered and not self.grid.part.shared:  # ranks count together
             return 0
         held = self._occupants(particles) / self.per_axis**self.grid.dimension
         emitted = 0
-        for number, found in entered:
-            source, points = self.sources[number], self._new(held, *found)
+        for number, swept in entered:
+            source, points = self.sources[number], self._new(held, *swept)
             particles.append(
                 points,
                 np.broadcast_to(source.velocity.astype(np.float32), points.shape),

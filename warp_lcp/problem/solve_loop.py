@@ -480,13 +480,13 @@ def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
     Raises:
         ValueError: it does not.
     """
-    name, made = type(solver).__name__, _workspaces_of(type(solver))
-    if isinstance(work, type) or not (type(work) in made or isinstance(work, Workspace)):
+    name, expected = type(solver).__name__, _workspaces_of(type(solver))
+    if isinstance(work, type) or not (type(work) in expected or isinstance(work, Workspace)):
         kind = (
             f"the class {work.__name__}" if isinstance(work, type) else f"a {type(work).__name__}"
         )
         raise ValueError(f"workspace is {kind}: expected what {name}.init(problem) returned")
-    if made and type(work) not in made:
+    if expected and type(work) not in expected:
         raise ValueError(
             f"workspace is a {type(work).__name__}, made by another method: expected what "
             f"{name}.init(problem) returned"

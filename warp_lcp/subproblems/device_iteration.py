@@ -115,7 +115,9 @@ def keep_row_kernel(scalars: f64, rows: f64, n: int):
 
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
-def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others: f64, unusual: f64):
+def join_unusual_kernel(
+    floating: wp.array(dtype=wp.int32), faults: f64, other_bounds: f64, unusual: f64
+):
     """Join the flags of an unusual start, so that ranks exchange them together.
 
     Floating components, faults of the guess, and bounds of another code.
@@ -123,8 +125,8 @@ def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others:
     unusual[0] = wp.float64(floating[0])
     unusual[1] = faults[0]
     unusual[2] = wp.float64(0.0)
-    if others:
-        unusual[2] = others[0]
+    if other_bounds:
+        unusual[2] = other_bounds[0]
 
 
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
