@@ -8,7 +8,7 @@ from the fields included.
 
 import ctypes
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,7 +59,7 @@ class ListMemory:
         self.touched = wp.empty(2, dtype=wp.int32, device=device)
         self.slot("touched of").point_to(self.touched)
 
-    def take(self, count: int, arrays: Mapping[str, DeviceArray]) -> None:
+    def set_list(self, count: int, arrays: Mapping[str, DeviceArray]) -> None:
         """Use a list of this length and these arrays.
 
         Recorded launches refer to the arrays by name.
@@ -82,9 +82,9 @@ class ListMemory:
             return
         self.count.value = self._entries.value = count
         if self.device.is_cuda:
-            self.rows.take(chunks(count, self.device).single)
+            self.rows.set_layout(chunks(count, self.device).single)
         else:
-            self.rows.take_entries(count, CPU_GRAIN)
+            self.rows.set_entries(count, CPU_GRAIN)
         least = 2 * -(-max(count, 1) // CPU_GRAIN)
         if len(self.touched) < least:
             self.touched = wp.empty(2 * least, dtype=wp.int32, device=self.device)
@@ -210,7 +210,7 @@ def launch(
     """
     rows, listed = chunks(count, grid.device), None
     if is_recording():
-        members = [member for s in structs for member in vars(s).values()]
+        members = [getattr(s, f.name) for s in structs for f in fields(s)]
         memories = (list_of(a) for a in (*kernel_args.values(), *members))
         listed = next((memory for memory in memories if memory is not None), None)
     if listed is not None:

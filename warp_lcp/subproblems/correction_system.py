@@ -222,7 +222,7 @@ class CorrectionSystem:
             x if whole else self.start_of_step,
             self.principal.e,
             length * self.size,
-            saved_x=self.start_of_step if whole else None,
+            saved_base=self.start_of_step if whole else None,
         )
         self.settle()
         return self.iterate.residual.evaluate(x)
