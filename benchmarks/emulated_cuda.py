@@ -332,7 +332,7 @@ def checked_by_cells(invoke):
         arrays, (_, rows, kernel_args), columns, twin = (
             {},
             params,
-            form.declared.found,
+            form.declared.reductions,
             form.by_cells,
         )
         arrays_of(kernel_args, kernel.adj.args[1].type, arrays)

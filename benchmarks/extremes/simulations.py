@@ -368,9 +368,8 @@ def particles_anywhere() -> Iterator[ExtremeCase]:
             )
         yield case(f"{CROWD:.0e} of {name} in one cell", prepare=crowd(CROWD), steps=2)
     more = {"prepare": crowd(CROWDED), "steps": 1, "budget": 90.0, "precisions": ("mixed",)}
-    yield RunCase(
-        "particles", f"{CROWDED:.0e} of liquid in one cell", simulation_maker(liquid), **more
-    )  # type: ignore[arg-type]
+    crowded = simulation_maker(liquid)
+    yield RunCase("particles", f"{CROWDED:.0e} of liquid in one cell", crowded, **more)  # type: ignore[arg-type]
     weightless = simulation_maker(liquid, **gravity(0.0, 0.0))
     yield RunCase(
         "particles",

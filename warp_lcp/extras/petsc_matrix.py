@@ -214,7 +214,7 @@ class PetscGrid:
     Args:
         A: the operator, of one process or distributed over ranks.
         hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all
-            unknowns until `hold` is called.
+            unknowns until `set_free_set` is called.
         real: type in which its cycles work.
         cycle: settings of the cycles.
 
@@ -253,7 +253,7 @@ class PetscGrid:
         self.matrix = self._keep(StencilMatrix(finest, self.copies).as_mat())
         self.cycle = CyclePreconditioner(self.hierarchy, self.copies)
         if hierarchy is None:
-            self.hold(A.layout.load(np.ones(A.shape), wp.uint8))
+            self.set_free_set(A.layout.load(np.ones(A.shape), wp.uint8))
 
     @cached_property
     def operator(self) -> PETSc.Mat:
@@ -273,9 +273,9 @@ class PetscGrid:
         """Return the values of a vector as a field of A's shape, a copy."""
         return v.getArray(readonly=True).reshape(self._A.shape).copy()
 
-    def hold(self, free: DeviceArray) -> None:
+    def set_free_set(self, free: DeviceArray) -> None:
         """Set another free set, a stored uint8 field; other unknowns are held fixed."""
-        self.hierarchy.hold(self._A.stencil.d, free)
+        self.hierarchy.mask_diagonal(self._A.stencil.d, free)
         self.hierarchy.rebuild_changed()
         self.matrix.stateIncrease()
 

@@ -199,7 +199,7 @@ class Particles:
             *(f"affine_{c}" for c in range(grid.dimension if affine else 0)),
         ]
         self._names += ["kept"] * (kept is not None)
-        self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
+        self._tally, columns, device = None, len(kernels.TOTAL.reductions), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
         self._totals, self._numbering, self._sorting = (
             LaunchGraph(device, launch) for launch in launches
@@ -316,7 +316,7 @@ class Particles:
         if self._marks[0] != memory:
             self._marks = memory, self._order[self._capacity : self._capacity + self.count]
             self._stays = self._order[: self.count]
-            self._memory.take(self.count, {"marks": self._marks[1], "stays": self._stays})
+            self._memory.set_list(self.count, {"marks": self._marks[1], "stays": self._stays})
         return self._marks[1]
 
     def remove(self, marks: wp.array) -> int:
@@ -432,7 +432,7 @@ class Particles:
     def set_runs(self, runs: wp.array) -> None:
         """Let sums take the particles in the order of `runs`."""
         self.runs = runs
-        self._memory.take(self.count, {"runs": runs})
+        self._memory.set_list(self.count, {"runs": runs})
 
     def resize(self, count: int) -> None:
         """Set the number of particles; new ones have undefined values."""
@@ -452,16 +452,16 @@ class Particles:
         """Publish the number and the arrays of the particles to recorded launches."""
         count, memory = self.count, self._memory
         if count != memory.count.value and self._tally is not None:
-            self._total_rows.take(self._rows_of_totals().summed)
+            self._total_rows.set_layout(self._rows_of_totals().summed)
         elif count != memory.count.value:
-            self._places.value = self._total_rows.take_entries(
+            self._places.value = self._total_rows.set_entries(
                 count, _chunk_of_totals(count, self.grid.device)
             )
-            self._sort_pieces.value = self._sort_rows.take_entries(count, _piece_of_sort(count))
+            self._sort_pieces.value = self._sort_rows.set_entries(count, _piece_of_sort(count))
         for name, column in self._columns.items():
             column.publish(memory, name)
         self._spare.publish(memory, "spare")
-        memory.take(count, {"key": self.key})
+        memory.set_list(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
         """Enlarge the storage to at least `count` particles; keep the first `before`."""
@@ -651,7 +651,7 @@ class Particles:
             velocity=self.velocity,
             out=self._partials,
         ).launch()
-        columns = Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True)
+        columns = Rows.flat(len(kernels.TOTAL.reductions), self.grid.device, serial=True)
         kernels.ADD_IN_ORDER.bind(
             columns,
             partials=self._partials,

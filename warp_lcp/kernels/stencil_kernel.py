@@ -188,7 +188,7 @@ class StencilKernel:
             *fields,
             numbers,
             self.constants,
-            self.found and ("out", *(self.found if self.box else ())),
+            self.reductions and ("out", *(self.reductions if self.box else ())),
         )
         names = [name for group in groups for name in group]
         wrong = {
@@ -238,7 +238,7 @@ class StencilKernel:
         )
 
     @functools.cached_property
-    def found(self) -> tuple[str, ...]:
+    def reductions(self) -> tuple[str, ...]:
         """Names of the sums, then of the maxima."""
         return (*self.sums, *self.largest)
 
@@ -257,7 +257,7 @@ class StencilKernel:
 
         `out` receives the sums and maxima, a column each.
         """
-        out = {"out": wp.float64} if self.found else {}
+        out = {"out": wp.float64} if self.reductions else {}
         return {
             **self.reads,
             **self.writes,
@@ -526,7 +526,7 @@ class StencilKernel:
         )
         groups = (
             *sized,
-            (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.found))}),
+            (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.reductions))}),
         )
         return [(length, tuple(names)) for length, names in groups if names]
 
@@ -550,9 +550,10 @@ class StencilKernel:
                 rows,
                 {tuple(kernel_args[n].shape[-3:]) for n in self.box if kernel_args[n] is not None},
             )
-        if self.found and kernel_args["out"].size < len(self.found) * rows.places:
+        if self.reductions and kernel_args["out"].size < len(self.reductions) * rows.places:
             least = (
-                f"fewer than {len(self.found) * rows.places}: {rows.places} threads for each sum"
+                f"fewer than {len(self.reductions) * rows.places}: {rows.places} threads for each "
+                "sum"
             )
             raise ValueError(f"{self.label}: out has {kernel_args['out'].size} elements, {least}")
 
@@ -616,7 +617,7 @@ class BoundKernel(NamedTuple):
         """Layout of the rows, for a kernel that sums or one that does not."""
         return (
             self.rows.summed
-            if self.form.declared.found
+            if self.form.declared.reductions
             else self.rows.quads
             if self.form.quads
             else self.rows.single

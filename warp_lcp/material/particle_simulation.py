@@ -479,7 +479,7 @@ class ParticleSimulation(ParticleCheckpoints):
     ) -> None:
         self._continue(window, known, kind, contact, self._layer_filled())
         if self.sources is not None:
-            self.sources.hold(self.velocity, [])
+            self.sources.impose_velocity(self.velocity, [])
         self.grid.part.fill(*self.velocity)
 
     def _continue(

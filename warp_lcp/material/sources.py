@@ -166,7 +166,7 @@ class Sources:
             self._running = running
         self._imposing.run(velocity, [], kind, True, variant=(velocity[0].ptr, 0, kind.ptr, True))
 
-    def hold(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
+    def impose_velocity(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
         """Set the velocity of the running sources again.
 
         Of those that `supply` found.
@@ -355,7 +355,7 @@ class Sources:
                     device=self.grid.device,
                 )
             self._memory = memory
-            self._lattice.take(count, self._points)
+            self._lattice.set_list(count, self._points)
             if self.grid.device.is_cpu:
                 self._found = [array.numpy() for array in self._points.values()]  # the same memory
         self._lattice.resize(count)

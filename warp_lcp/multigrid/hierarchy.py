@@ -236,7 +236,7 @@ class Hierarchy:
             self.finest.mark_changes_kernel(self._signs).launch(program.launch)
         return program
 
-    def hold(self, d: DeviceArray, free: DeviceArray) -> None:
+    def mask_diagonal(self, d: DeviceArray, free: DeviceArray) -> None:
         """Set the finest diagonal for a free set: d where `free`, else 0.
 
         `free` is a stored uint8 field. Changed rows are marked.

@@ -603,7 +603,7 @@ class StoredStencil(GridOperator):
         self._made, self._unit = (d, weights, pattern, strength), unit
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
-    def take(self, cells: np.ndarray, d: np.ndarray, weights: DeviceArray) -> None:
+    def set_fields(self, cells: np.ndarray, d: np.ndarray, weights: DeviceArray) -> None:
         """Set other cells of the same shape, another diagonal, and weights, in place.
 
         `weights` has one field after another.

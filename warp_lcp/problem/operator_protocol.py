@@ -276,7 +276,7 @@ class HasReplica(Operator, Protocol):
     def replica(self) -> Operator:
         """Return a copy in its own memory."""
 
-    def take(self, other: Operator) -> None:
+    def copy_from(self, other: Operator) -> None:
         """Copy the data of an operator of the same form."""
 
 

@@ -795,7 +795,7 @@ class _BoxSolveLoop(_SolveLoop):
             else residual.unattainable()
         )
         if guess is not None:
-            self._take(guess)
+            self._start_at(guess)
         if floating is not None or residual.row_sizes is not None:
             residual.settle_isolated(self.work.x)
             residual.evaluate(self.work.x)
@@ -868,7 +868,7 @@ class _BoxSolveLoop(_SolveLoop):
             )
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
-    def _take(self, guess: DeviceArray) -> None:
+    def _start_at(self, guess: DeviceArray) -> None:
         self.problem.layout.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
         self.work.round_iterate()

@@ -65,7 +65,7 @@ class WorkspaceCache:
         self.workspace: CachedWorkspace | None = None
         self.last: Hashable = None
 
-    def take(self, form: Hashable) -> tuple[CachedWorkspace | None, bool]:
+    def pop(self, form: Hashable) -> tuple[CachedWorkspace | None, bool]:
         """Remove and return the workspace of a form, None if another is kept.
 
         Also returns whether the last solve had the same form.
@@ -97,9 +97,9 @@ def cached_or_new_workspace(problem: LCP, solver: Solver) -> CachedWorkspace | N
     if form is None or team() is None:
         return None
     form = form, type(solver), solver, get_threads()
-    found, again = CACHE.take(form)
+    found, again = CACHE.pop(form)
     if found is not None:
-        found.work.problem.take(problem)
+        found.work.problem.copy_from(problem)
         return found
     return CachedWorkspace(form, solver.init(problem.replica())) if again else None
 

@@ -574,7 +574,7 @@ class FallbackWorkspace(WorkspaceDefaults):
         given = {"floating": self._floating} if takes_floating(work) else {}
         work.start(warm=not restart, tolerance=self._progress.tolerance, **given)
         if work is not self._first:
-            self._take(work)
+            self._copy_iterate(work)
             self.residual.evaluate(self.x)
         self._progress.record(self.residual.norm)
 
@@ -584,10 +584,10 @@ class FallbackWorkspace(WorkspaceDefaults):
         self._since += 1
         done = self._one_step(entry.method, work) if entry.batch == 1 else self._batch(entry, work)
         if work is not first:
-            self._take(work)
+            self._copy_iterate(work)
         return done
 
-    def _take(self, work: Workspace) -> None:
+    def _copy_iterate(self, work: Workspace) -> None:
         """Copy the iterate of the current method to x."""
         wp.copy(self.x, work.x)
         self._first.round_iterate()

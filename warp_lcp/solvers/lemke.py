@@ -482,7 +482,7 @@ class LemkeWorkspace(DenseWorkspace):
         """Begin at z = 0 with the covering vector of ones."""
         super().start(warm=warm, tolerance=tolerance)
         self.rays, self._random, self._keeps_far = 0, np.random.default_rng(5381), False
-        self._take()
+        self._begin_scaled()
 
     def read(self) -> DenseProblem:
         """Copy the problem to the host; a narrow one stays sparse."""
@@ -494,9 +494,9 @@ class LemkeWorkspace(DenseWorkspace):
         The banded factors are singular, which the basis need not be.
         """
         self.data = super().read()
-        self._take()
+        self._begin_scaled()
 
-    def _take(self) -> None:
+    def _begin_scaled(self) -> None:
         """Scale the problem, and begin at z = 0 with the covering vector of ones."""
         scaled, self.units = self.data.scaled()
         lower, upper = without_far(scaled.lower, scaled.upper, BEYOND if self._keeps_far else FAR)
@@ -511,7 +511,7 @@ class LemkeWorkspace(DenseWorkspace):
                 self._widen()
             else:
                 self._keeps_far = True
-                self._take()
+                self._begin_scaled()
             return
         scaled = replace(scaled, lower=lower, upper=upper)
         self.form = LemkeForm.of(scaled)
@@ -586,6 +586,6 @@ class LemkeWorkspace(DenseWorkspace):
             return
         if self._has_far and not self._keeps_far:  # a solution may lie beyond the omitted bounds
             self.rays, self._keeps_far = 0, True
-            self._take()
+            self._begin_scaled()
             return
         self.ended = SolveStatus.INFEASIBLE if inconsistent(self.data) else SolveStatus.STAGNATED

@@ -53,7 +53,7 @@ class MinimumMapResidual(ResidualAndActiveSet):
         found, comm = bool(self._away.numpy().any()), self.problem.layout.comm
         return found if comm is None else comm.any(found)
 
-    def hold(self, x: DeviceArray) -> None:
+    def project_held(self, x: DeviceArray) -> None:
         """Move held unknowns onto their bounds, and update the right-hand side.
 
         Only in flagged rows and those beside them: g = -(A x + b) / size on the free set.
@@ -150,7 +150,7 @@ class FusedGridSystem:
         assert isinstance(residual, MinimumMapResidual)
         if residual.away:
             passes.store_best()
-            residual.hold(passes.x)
+            residual.project_held(passes.x)
         return True
 
     def solve(self) -> int:
