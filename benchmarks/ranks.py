@@ -44,7 +44,7 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.kernels.thread_pool import VARIABLE
-from warp_lcp.problem.solve_loop import Workspace
+from warp_lcp.problem.method_protocol import Workspace
 from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"

@@ -20,7 +20,7 @@ from warp_lcp.files import Tables, TableView
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.problem.solve_loop import Solver, Workspace
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators

@@ -31,7 +31,7 @@ from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 
 CONSTANTS = {

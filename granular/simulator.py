@@ -42,7 +42,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
 from warp_lcp.material.velocity_extrapolation import LayerCallback, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.problem.solve_loop import Solver, Workspace
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.scene.scene import Scene

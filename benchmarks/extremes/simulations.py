@@ -30,7 +30,7 @@ from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.granular import SIMULATOR as GRANULAR
 from warp_lcp.granular.simulator import SandSimulation
-from warp_lcp.grid.particles import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.scene.simulator import Simulator
 from warp_lcp.simulation import SimulationFailed, StepFailed
 

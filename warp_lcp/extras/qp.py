@@ -15,6 +15,7 @@ from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.data_types import Matrix, Values, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.program_optimality import (
     PROVABLE,
     ProgramPoint,
@@ -29,7 +30,6 @@ from warp_lcp.problem.program_optimality import (
 )
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.quadratic_program import is_convex_program

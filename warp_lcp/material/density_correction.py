@@ -25,7 +25,7 @@ from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 

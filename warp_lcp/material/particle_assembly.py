@@ -18,7 +18,8 @@ from warp_lcp.grid.barriers import BARRIER, Barriers
 from warp_lcp.grid.cut_cells import DEEP, CutCells
 from warp_lcp.grid.domain_sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.grid_part import subdomain_of
-from warp_lcp.grid.particles import Particles, seed
+from warp_lcp.grid.particle_seeding import seed
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import SurfaceMesh, SurfaceObstacles

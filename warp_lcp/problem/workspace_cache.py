@@ -12,8 +12,8 @@ from typing import Protocol
 
 from warp_lcp.kernels.thread_pool import get_threads, team
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import Solver, Workspace
 
 # Largest workspace that is kept, in cells with ghost cells: 45 bytes each, 140 in float64 with
 # fields of faces and bounds.

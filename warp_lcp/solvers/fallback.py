@@ -13,17 +13,11 @@ import warp as wp
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.operator_protocol import MethodChain, declared, takes
-from warp_lcp.problem.pickling import Reduced
-from warp_lcp.problem.residual import EPS
-from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import (
-    FLOOR_MARGIN,
+from warp_lcp.problem.method_protocol import (
     Precision,
     ReusableWorkspace,
     Solver,
     Step,
-    VariationalInequality,
     Workspace,
     WorkspaceDefaults,
     cached_workspace_of,
@@ -31,9 +25,13 @@ from warp_lcp.problem.solve_loop import (
     is_method,
     method_name,
     method_step,
-    refusal,
     takes_floating,
 )
+from warp_lcp.problem.operator_protocol import MethodChain, declared, takes
+from warp_lcp.problem.pickling import Reduced
+from warp_lcp.problem.residual import EPS
+from warp_lcp.problem.result import SolveResult, SolveStatus
+from warp_lcp.problem.solve_loop import FLOOR_MARGIN, VariationalInequality, refusal
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 
 WINDOW = 10  # steps over which the fall of the residual is measured

@@ -20,10 +20,10 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITY, without_far
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.residual_scaling import NoTranspose
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.subproblems.dense_problem import DenseWorkspace

@@ -28,8 +28,8 @@ from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step, WorkspaceBase
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.settings import Count, Positive, Share
 from warp_lcp.subproblems.equilibration import EquilibratedWorkspace
 from warp_lcp.subproblems.grid_system import GridSystem

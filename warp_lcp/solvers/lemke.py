@@ -20,9 +20,9 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.settings import Count, Settings
 from warp_lcp.subproblems.dense_problem import (
     DenseProblem,

@@ -22,10 +22,16 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import (
+    Precision,
+    PrecisionName,
+    Step,
+    Workspace,
+    WorkspaceBase,
+)
 from warp_lcp.problem.operator_protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Precision, PrecisionName, Step, Workspace, WorkspaceBase
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
 from warp_lcp.subproblems import grid_step_kernels as engine
 from warp_lcp.subproblems.active_set_kernels import projected_move

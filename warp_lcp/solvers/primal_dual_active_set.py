@@ -18,9 +18,9 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.operator_protocol import HasRows, HasScale, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.settings import Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.subproblems.active_set_kernels import projected_move

@@ -17,9 +17,9 @@ from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import HasStencil, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.subproblems.active_set_kernels import CLASSIFY, ON_FREE, projected_move
 from warp_lcp.subproblems.coarse_problem import CoarseStencilProblem, FullApproximationCorrection
 from warp_lcp.subproblems.dense_system import DampedSteps, DenseSystem

@@ -33,8 +33,8 @@ from warp_lcp.kernels.vectors import CONVERT, sum_over_ranks
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem.method_protocol import Precision
 from warp_lcp.problem.operator_protocol import Scratch
-from warp_lcp.problem.solve_loop import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.subproblems.energy_monitor import CREEP, STALL
 from warp_lcp.subproblems.grid_step_kernels import (

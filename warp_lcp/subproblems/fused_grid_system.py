@@ -16,8 +16,8 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, Step
 from warp_lcp.problem.operator_protocol import HasStencil
-from warp_lcp.problem.solve_loop import Precision, Step
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.subproblems import grid_step_kernels as engine
 from warp_lcp.subproblems.multigrid_workspace import MultigridWorkspace

@@ -10,7 +10,7 @@ from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
+from warp_lcp.problem.method_protocol import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.subproblems.correction_system import CorrectionSystem
 from warp_lcp.subproblems.fused_grid_system import FusedGridSystem
