@@ -358,7 +358,9 @@ class Hierarchy:
     def _coarser(self, fine: StencilLevel, *, bounded: bool) -> StencilLevel:
         """Return the next level: aggregates of two cells along some axes.
 
-        All axes are coarsened, or only the strong ones where axes differ much.
+        All axes are coarsened, or only the strong ones where axes differ much. The coarse operator
+        is Galerkin's P'A P with piecewise constant P: a coarse face's weight is the sum of
+        prod(factors) / factors[axis] finer ones, by which the mean strength of an axis grows.
         """
         s, counts = fine.stencil, fine.stencil.padding.counts
         total_counts = whole_counts(s)

@@ -521,7 +521,17 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _searched(
         self, x: np.ndarray, dx: np.ndarray, slope: float, merit: float, *, projected: bool
     ) -> SolveStatus | None:
-        """Search along a direction; return the failure, None if the merit falls."""
+        """Search along a direction; return the failure, None if the merit falls.
+
+        The merit is |f(x + t dx)|^2 / 2, at a point clipped to the bounds if `projected`.
+
+        Args:
+            x: the iterate, of the dense problem.
+            dx: the direction.
+            slope: of the merit along dx at t = 0; the search needs slope < 0.
+            merit: at t = 0.
+            projected: whether trial points are clipped.
+        """
         if not (np.isfinite(slope) and slope < 0):
             return SolveStatus.NON_DESCENT
         data, moved = self.map.data, x

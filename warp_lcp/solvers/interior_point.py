@@ -294,7 +294,9 @@ class InteriorPointWorkspace(WorkspaceBase):
         """Move x inside its bounds, and choose the multipliers.
 
         Far from the path their size follows from b and the residual, near it from the residual
-        alone: s and t are at least `least`, and so are w A_ii and v A_ii.
+        alone: s and t are at least `least`, and so are w A_ii and v A_ii [units of y]. With n
+        multipliers `least` = NEAR ||r|| / sqrt(n) near the path, else start max(||b||, ||r||) /
+        sqrt(unknowns), ||b|| limited to LARGEST_START ||r||. mu = (w's + v't) / n.
         """
         p = self.problem
         self._inside(x, 0.0)

@@ -466,9 +466,10 @@ class MPRGPWorkspace(WorkspaceBase):
         return True
 
     def _projected_step(self, direction: DeviceArray, gain: float, curvature: float) -> bool:
-        """Move x to the energy's minimum along a direction, projected.
+        """Move x to the energy's minimum along a direction p, projected.
 
-        The step is halved where the projection raises the energy.
+        x <- clip(x + t p, l, u) with t = gain / curvature: the energy's decrease per length of p,
+        and p'A p. The step is halved where the projection raises the energy x'A x / 2 + b'x.
         """
         residual = self.residual
         if curvature > 0:

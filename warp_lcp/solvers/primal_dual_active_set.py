@@ -200,7 +200,9 @@ class ActiveSetWorkspace(NewtonWorkspace):
     def least_index_step(self, x: DeviceArray) -> Step:
         """Take least-index pivots: the first violating unknown changes its place.
 
-        The step is interim until no condition is violated.
+        An unknown's place is l, u, or F for free: y_F = 0, x = l or u elsewhere. It is violated by
+        x_F beyond a bound, by y < 0 at l and y > 0 at u. On a P-matrix the sequence is finite. The
+        step is interim until no condition is violated.
         """
         problem = DenseProblem.read(self.problem)
         data, units = problem.scaled()

@@ -229,6 +229,9 @@ def judge_kernel(
     It goes on if the residual and, with bounds, the energy are the least so far, the tolerance is
     missed, and the free set does not creep. The free set must not change either, unless the device
     rebuilds what depends on it; `calm`: whether that is sufficient.
+
+    norm = sqrt(sum r^2), energy E = x'A x / 2 + b'x; E has fallen if E_lowest - E > noise
+    (|E_last| + |E|). SAFELY widens the limits, so that the host decides all close cases.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])
